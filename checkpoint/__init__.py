@@ -1,4 +1,4 @@
-"""One machine, one process, its memory: capture, keep, restore. No peers, no roles, no network.
+"""Capture, store and restore the state of one process tree on one machine; no peers, no roles, no network.
 
 Each name is loaded when it is first used, so that `import checkpoint` costs nothing:
 

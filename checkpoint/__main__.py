@@ -1,4 +1,4 @@
-"""The entry of the keeper: ``python -m checkpoint keeper``, see `checkpoint.keeper.server`."""
+"""Entry point of the keeper: ``python -m checkpoint keeper``, see `checkpoint.keeper.server`."""
 
 from __future__ import annotations
 

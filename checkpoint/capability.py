@@ -1,8 +1,8 @@
-"""One row of the table of what comes back: each file of ``resources`` carries its own, `checkpoint.engines.capability_table`
-gathers them.
+"""One row of the capability table, which lists the kinds of state that a restore brings back.
 
-A row is about one kind of thing that a program may hold. The table in docs/capabilities.md is written from these rows
-(``./run table``), and tests hold it and every refusal in the code against them.
+A row describes one kind of thing that a program may hold. Each file of `checkpoint.resources` carries its own rows;
+`checkpoint.engines.capability_table` collects them. ``./run table`` writes the table in docs/capabilities.md from these rows, and
+tests compare the rows with the table and with every refusal in the code.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What an operator wants to become of the devices that a component has open."""
+"""The operator's rules for the devices that a component has open."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The contract of an engine: a way to capture a process and to bring it back.
+"""The contract of an engine: how to capture a process and how to restore it.
 
-An engine finds out (`Engine.probe`), protects (`Engine.protect` opens a `Session`) and restores. Whoever uses one needs nothing
-from below this file.
+An engine finds out what it can preserve (`Engine.probe`), protects a process (`Engine.protect` opens a `Session`) and restores
+it. A user of an engine needs nothing from the packages below this file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Everything that floor 1 can refuse or fail at: one family, one sentence per class."""
+"""Errors of the package `checkpoint`: one family of classes for everything that it can refuse or fail at."""
 
 from __future__ import annotations
 

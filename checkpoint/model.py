@@ -1,10 +1,10 @@
-"""The values that floor 1 speaks in: a process at one instant, as frozen data.
+"""The values of the package `checkpoint`: a process at one instant, as frozen data.
 
-Read this file first. Nothing here opens, reads or asks; every type is immutable, so a value that was
-captured can be handed between threads, processes and machines without anybody changing it.
+Read this file first. This module opens, reads and asks nothing. Every type is immutable, so a captured value can move between
+threads, processes and machines and no code changes it.
 
-Words: a *VMA* is one mapping ``[start, end)``; a *page* is ``page_size`` bytes; a *run* is consecutive pages.
-Addresses are absolute, in bytes. Instants are integer nanoseconds.
+Words: a *VMA* is one mapping ``[start, end)``; a *page* is ``page_size`` bytes; a *run* is consecutive pages. Addresses are
+absolute, in bytes. Instants are integer nanoseconds.
 """
 
 from __future__ import annotations

@@ -22,7 +22,9 @@ from failover.cli import parser
 from failover.config.team import Robot
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted(path for floor in ("", "*/", "*/*/", "*/*/*/") for path in ROOT.glob(f"{floor}*.md") if ".venv" not in path.parts)
+DOCUMENTS = sorted(
+    path for floor in ("", "*/", "*/*/", "*/*/*/") for path in ROOT.glob(f"{floor}*.md") if ".venv" not in path.parts
+)
 
 named = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 

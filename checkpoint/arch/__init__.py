@@ -1,7 +1,8 @@
-"""Processors as data: files of the same names in the same order; this machine's are `cpu`, `stubs`, `extended` and `levels`.
+"""Processor descriptions as data; `cpu`, `stubs`, `extended` and `levels` are the modules of this machine's processor.
 
-docs/processors.md says how to add one. On a machine whose processor has no files here, those of x86-64 are what `cpu` and the
-others are: nothing of them is used there, as `why_unsupported` and `number_of` see to.
+Each processor has files with the same names in the same order. docs/processors.md says how to add a processor. On a machine whose
+processor has no files here, `cpu` and the others are the modules of x86-64. The package does not use them there:
+`why_unsupported` and `number_of` prevent it.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""aarch64 as data: registers, system call numbers, and the machine code that a borrowed page is filled with.
+"""aarch64 as data: registers, system call numbers, and the machine code for the borrowed pages.
 
-Sections as in ``x86_64``; see ``checkpoint.arch``. What differs in kind:
+The sections are those of `checkpoint.arch.x86_64`; see `checkpoint.arch`. Two things differ in kind:
 
-* A stop inside a system call shows nothing of it: the kernel has set the program counter back to the ``svc`` and the first
-  argument into x0 before a tracer sees them (do_signal() in arch/arm64/kernel/signal.c), and forgets the call's number. So a
-  thread is never told as standing in a call: whoever goes on from its registers makes the call again.
-* No instruction jumps through memory without a register. What gives everything back by itself does so by rt_sigreturn(2), from
+* A stop inside a system call does not show the call. Before a tracer sees the registers, the kernel has set the program counter
+  back to the ``svc``, restored the first argument in x0 (do_signal() in arch/arm64/kernel/signal.c), and forgotten the number of
+  the call. So a thread is never reported as inside a call: a thread that resumes from its registers makes the call again.
+* No instruction jumps through memory without a register. Code that must restore all registers by itself uses rt_sigreturn(2) with
   a frame of its own.
 
 Sources: struct user_pt_regs of asm/ptrace.h; asm-generic/unistd.h; asm/sigcontext.h; Arm Architecture Reference Manual, C6.

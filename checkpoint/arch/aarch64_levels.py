@@ -1,7 +1,8 @@
-"""Levels of aarch64 that a fleet of different processors can agree on, and how libraries are told to choose nothing beyond.
+"""Feature levels of aarch64 for fleets with different processors, and the variables that limit libraries to a level.
 
-Data only. A library that asks the processor by itself (getauxval) and has no variable for it is not told. What the C library
-and the run-time of the compiler choose so is a program's for good (`_CHOSEN_BY_ALL`), and a level cannot do without.
+Data only. The levels cannot limit a library that asks the processor itself (getauxval) and has no variable for it. What the C
+library and the compiler's run-time choose in this way stays chosen for the life of the program (`_CHOSEN_BY_ALL`); a level cannot
+exclude it.
 
 Source: Arm Architecture Reference Manual; numpy's "CPU dispatcher"; OpenBLAS, driver/others/dynamic_arm64.c; OPENSSL_armcap;
 libgcc, config/aarch64/lse-init.c; glibc, sysdeps/aarch64/multiarch/memcpy.c.

@@ -1,4 +1,4 @@
-"""aarch64 machine code that a restore runs: what a vessel waits in, and the loop that makes many system calls at once.
+"""aarch64 machine code for a restore: the wait loop of a vessel, and the loop that makes many system calls at once.
 
 Data only, each with its assembly beside it. Sources: Procedure Call Standard for the Arm 64-bit Architecture, elf(5), syscall(2).
 """

@@ -1,9 +1,9 @@
-"""The state of a thread beyond its general registers: several register sets, one after the other, and how it gets elsewhere.
+"""Extended register state of an aarch64 thread: several register sets one after the other, and their transfer to another machine.
 
-Vector registers (NT_PRFPREG) come first, the thread pointer next, then what signs return addresses: a program's pointers are
-valid with its own keys only. Scalable vectors come last, for they are as long as the thread uses them: after a system call,
-which forgets what of them is more than the vector registers, these once more. The layout says which sets there are, by their
-numbers in linux/elf.h.
+The vector registers (NT_PRFPREG) come first, then the thread pointer, then the keys that sign return addresses: a program's
+pointers are valid only with its own keys. The scalable vectors come last, because their length is the one that the thread uses. A
+system call drops every part of them beyond the vector registers, so after a system call the vector registers follow once more.
+The layout lists the sets that exist by their numbers in linux/elf.h.
 
 Source: linux/elf.h; arch/arm64/kernel/ptrace.c; Documentation/arch/arm64/pointer-authentication.rst, sve.rst.
 """

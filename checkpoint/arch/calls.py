@@ -1,4 +1,4 @@
-"""What every processor's file speaks of: registers by name, calls to be made inside a tracee, calls that a stop ends."""
+"""Types that all processor files share: registers by name, calls to make inside a tracee, calls that a stop ends."""
 
 from __future__ import annotations
 

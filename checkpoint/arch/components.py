@@ -1,4 +1,4 @@
-"""How a snapshot tells where the components of a thread's extended state lie; each processor's own file says what they are."""
+"""How a snapshot describes the components of a thread's extended state; each processor's own file defines the components."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""x86-64 as data: registers, system call numbers, and the machine code that a borrowed page is filled with.
+"""x86-64 as data: registers, system call numbers, and the machine code for the borrowed pages.
 
 Sections: registers · system calls · interrupted system calls · code of a borrowed page. A second processor is a second file with
-the same names in the same order, see ``checkpoint.arch``.
+the same names in the same order, see `checkpoint.arch`.
 
 Sources: struct user_regs_struct of sys/user.h; arch/x86/entry/syscalls/syscall_64.tbl; Intel SDM volume 2.
 """

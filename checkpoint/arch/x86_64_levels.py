@@ -1,9 +1,9 @@
-"""Levels of x86-64 that a fleet of different processors can agree on, and how libraries are told to choose nothing beyond.
+"""Feature levels of x86-64 for fleets with different processors, and the variables that limit libraries to a level.
 
-Data only. A library that asks the processor by itself (CPUID) and has no variable for it is not told.
+Data only. The levels cannot limit a library that asks the processor itself (CPUID) and has no variable for it.
 
 Source: System V ABI (AMD64 supplement), "micro-architecture levels"; glibc manual, "Hardware Capability Tunables", and
-sysdeps/x86/cpu-tunables.c, whose names changed with 2.33 (those that a glibc does not know it passes over); numpy's "CPU
+sysdeps/x86/cpu-tunables.c, whose names changed with 2.33 (a glibc ignores the names that it does not know); numpy's "CPU
 dispatcher"; OpenBLAS, driver/others/dynamic.c; OPENSSL_ia32cap(3); Go's internal/cpu.
 """
 

@@ -1,4 +1,4 @@
-"""x86-64 machine code that a restore runs: what a vessel waits in, and the loop that makes many system calls at once.
+"""x86-64 machine code for a restore: the wait loop of a vessel, and the loop that makes many system calls at once.
 
 Data only, each with its assembly beside it. Sources: System V ABI (AMD64 supplement), elf(5), syscall(2).
 """

@@ -1,8 +1,8 @@
-"""The extended state of a thread (XSAVE), and how it gets from one processor to another that lays it out differently or has less.
+"""Extended register state of a thread (XSAVE), and its conversion for a processor with another layout or fewer components.
 
-The kernel tells it in the standard form: a legacy region, a header that says which components are in use, and each component at
-its place. That place is the processor's own: PKRU lies at 2,688 with Intel and at 2,432 with AMD. A component that is not in use,
-or holds what it holds at first, need not be carried over.
+The kernel reports the state in the standard form: a legacy region, a header that lists the components in use, and each component
+at its offset. The offsets depend on the processor: PKRU is at 2,688 with Intel and at 2,432 with AMD. The conversion can omit a
+component that is not in use or holds its initial value.
 
 Source: Intel SDM volume 1, chapter 13; volume 2, CPUID leaf 0DH; AMD APM volume 3, CPUID Fn0000_000D; pkeys(7).
 """

@@ -1,1 +1,1 @@
-"""Ways to capture and restore a process; each keeps the contract of ``checkpoint.engine``."""
+"""Engines that capture and restore processes; each fulfils the contract of `checkpoint.engine`."""

@@ -1,4 +1,4 @@
-"""The table of what comes back: the rows of all files that carry some."""
+"""The whole capability table: the rows of all files that carry rows."""
 
 from __future__ import annotations
 

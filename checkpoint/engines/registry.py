@@ -1,4 +1,4 @@
-"""The engines by their names."""
+"""Look an engine up by its name."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The tracer's own process, ``python -m checkpoint``, and the messages that it takes and answers."""
+"""The keeper, the tracer's own process (``python -m checkpoint``), and its messages."""

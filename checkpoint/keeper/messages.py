@@ -1,8 +1,8 @@
-"""Messages and descriptors between two processes of one robot, and the keeper's own vocabulary.
+"""Messages and descriptors between two processes of one robot, and the keeper's own requests and answers.
 
 A channel is one end of a ``SOCK_SEQPACKET`` unix socket pair. Every packet is one byte of form and then msgpack of a tagged
-struct (`INLINE`), or nothing, the struct lying in a memfd that travels as the first descriptor (`IN_MEMFD`; hidden here).
-Both ends belong to one user; what comes is still decoded strictly, and a wrong message is an error, never a guess.
+struct (`INLINE`), or nothing more, with the struct in a memfd that travels as the first descriptor (`IN_MEMFD`; hidden here).
+Both ends belong to one user. Packets are still decoded strictly, and a wrong message is an error, never a guess.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The keeper: the tracer's own process, ``python -m checkpoint keeper FD``, or ``keeper PATH``: it listens there.
+"""The keeper, the tracer's own process: ``python -m checkpoint keeper FD``, or ``keeper PATH``, where it listens.
 
-One thread serves one channel; requests and answers stand in `checkpoint.keeper.messages`. It follows at most one process. When
-its peer has gone it lets go of that process, which runs on, and ends; a restore that was not resumed by then ends with it.
+One thread serves one channel; `checkpoint.keeper.messages` defines the requests and answers. The keeper follows at most one
+process. When its peer has gone, it releases that process, which runs on, and ends. A restore that was not resumed by then ends
+with it.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The kernel's doors: each way into another process has one file here."""
+"""Kernel interfaces: each way to access another process has one file here."""

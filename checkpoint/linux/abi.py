@@ -1,6 +1,6 @@
-"""The kernel's interface in numbers: constants, structures and the few C calls that Python does not offer.
+"""Kernel interface definitions: constants, structures and the few C calls that Python does not offer.
 
-Nothing here decides anything. Numbers that differ between processors live in ``checkpoint.arch``.
+This module makes no decisions. Numbers that differ between processors are in `checkpoint.arch`.
 
 Source: the uapi headers of Linux 6.18; each group names its own.
 """

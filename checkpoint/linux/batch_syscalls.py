@@ -1,8 +1,8 @@
-"""Many system calls of our own in one go, without the interpreter between them: what is asked while a program stands still.
+"""Make many system calls of our own process at once, without the interpreter between them, for queries during a freeze.
 
-The interpreter takes longer to make a short system call than the kernel to answer it. So calls stand in a table, which a few
-instructions of machine code go through. Where the system does not let us have instructions in memory the calls are made one by
-one, with the same results.
+The interpreter takes longer to make a short system call than the kernel takes to answer it. So the calls are in a table, which a
+few instructions of machine code execute. Where the system does not allow instructions in memory, the calls are made one by one,
+with the same results.
 """
 
 from __future__ import annotations

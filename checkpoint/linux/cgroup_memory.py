@@ -1,7 +1,7 @@
-"""How much memory the control groups that this process is in leave it: the least that any of them, up to the outermost, allows.
+"""How much memory the control groups of this process leave to it: the smallest remainder in any of them, up to the outermost.
 
-Both versions are read, for machines mix them. A group that sets no limit says nothing; nor does one that cannot be read. What
-the kernel holds of files counts as free: it is let go before anybody is ended.
+The module reads both versions, because machines mix them. A group that sets no limit, or that cannot be read, does not count.
+Memory that the kernel uses for files counts as free: the kernel releases it before it kills a process.
 
 Source: cgroups(7), cgroup-v2.rst ("Memory Interface Files") and cgroup-v1/memory.rst of the kernel, proc_pid_mountinfo(5).
 """

@@ -1,10 +1,11 @@
-"""Takes note of the dead while the thread that traces them waits in the kernel for something that waits for this very note.
+"""Reap dead threads from a second thread while the tracing thread waits in the kernel, so that the two waits do not deadlock.
 
-A thread that executes another program holds cred_guard_mutex until all other threads of its process are gone; of those that are
-traced, until their tracer has taken note of their end. Whoever seizes the next thread of that process waits for the same mutex
-(PTRACE_SEIZE), and no signal ends that: the kernel makes the call again by itself. So both would wait for ever. But a tracer may
-take note with any of its threads: one more of ours sleeps beside the one that seizes, and is woken by a timer only when that
-takes so long that something must be wrong. Setting the timer costs less than a microsecond, and nothing wakes anybody in between.
+A thread that executes another program holds cred_guard_mutex until all other threads of its process are gone. A traced thread is
+gone only when its tracer has reaped it. A tracer that seizes the next thread of that process (PTRACE_SEIZE) waits for the same
+mutex, and no signal ends this wait: the kernel makes the call again by itself. So both would wait for ever. But a tracer may reap
+with any of its threads. So one more thread of the tracer sleeps beside the one that seizes, and a timer wakes it only when the
+seizing takes so long that something must be wrong. Setting the timer costs less than a microsecond, and nothing wakes a thread in
+between.
 
 Source: ptrace_attach() in kernel/ptrace.c, de_thread() in fs/exec.c, __exit_signal() in kernel/exit.c; waitpid(2), __WALL.
 """

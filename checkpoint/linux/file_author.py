@@ -1,8 +1,9 @@
-"""Who may have written a snapshot's file: whoever that is decides with which rights it may come back.
+"""Find which user may have written a snapshot's file: that user's rights bound the rights with which it may be restored.
 
-A snapshot says itself which user it runs as. Root would give it that, so root must know whose word it is. The opened file is
-judged, never its name alone: its owner, its mode, its links, who else has it open for writing, and whether its mount tells true
-owners. A file of root's is root's word only where nobody else chose which file stands at that path.
+A snapshot itself says which user it runs as. Root could grant that, so root must know which user wrote the file. The check judges
+the opened file, never its name alone: its owner, its mode, its links, the other processes that have it open for writing, and
+whether its mount shows true owners. A file of root counts as written by root only where no other user chose which file is at that
+path.
 
 Sources: path_resolution(7), symlink(7), inode(7) (sticky bit), fcntl(2) (leases), mount(8) (nosuid).
 """

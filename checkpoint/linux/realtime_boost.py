@@ -1,8 +1,9 @@
-"""Our thread before all ordinary ones while a program stands still for it: whoever takes the processor from us prolongs that.
+"""Give our thread precedence over ordinary threads while a program is frozen, because losing the processor prolongs the freeze.
 
-What others wait for must be short: after a look that used the processor for long the next one is made at ordinary priority, and
-so is the first, of which nobody knows. Nothing may wait without sleeping meanwhile (`checkpoint.linux.trace.tracee.rest`): the
-program, which has an ordinary priority, makes calls for us, perhaps on the same processor.
+Work at this priority must be short, because other threads wait for it. After a capture that used the processor for long, the next
+one runs at ordinary priority. So does the first one, whose length is unknown. Every wait must sleep meanwhile
+(`checkpoint.linux.trace.tracee.rest`): the program, which has an ordinary priority, makes calls for us, perhaps on the same
+processor.
 
 Source: sched(7), sched_setscheduler(2).
 """

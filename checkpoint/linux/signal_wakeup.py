@@ -1,8 +1,9 @@
-"""Waits for a peer, and for signals with it: none comes too early, and none to the wrong thread.
+"""Wait for a peer and for signals together, so that no signal comes too early or reaches the wrong thread.
 
 A handler in Python runs between two instructions of Python, in the first thread. A signal that comes after the last of them and
-before the kernel sleeps wakes nobody, nor does one that the kernel hands to another thread of ours: what it told would be heard
-when the peer has something to say, or never. So each signal leaves a byte in a socket as well, which is waited for, too.
+before the kernel sleeps does not wake the thread. Nor does one that the kernel hands to another thread of ours: the handler would
+run only when the peer sends something, or never. So each signal also leaves a byte in a socket, and the wait covers this socket,
+too.
 
 Source: signal(7), "Execution of signal handlers"; complete_signal() in kernel/signal.c; set_wakeup_fd in Python's signal module.
 """

@@ -1,11 +1,11 @@
-"""A second thread of ours, which makes calls of a table while the first makes others: half of what takes long in a freeze.
+"""Make system calls of a table in a second thread while the first makes others: halves the long queries of a freeze.
 
-It makes system calls and nothing else, in machine code: it needs the interpreter's lock to be born and to end, and never
-between, so nobody waits for it, and it waits for nobody. Two tables that are worked at the same time share no memory: what the
-second thread has finished is taken over, what it has not is asked by the first in a table of its own. So it may be late, or gone
-(after a fork), and the answers are the same.
+The second thread makes system calls in machine code and does nothing else. It needs the interpreter's lock only when it starts
+and ends, so neither thread waits for the other in between. Two tables that are worked at the same time share no memory. The first
+thread takes over the finished calls of the second, and makes the unfinished ones in a table of its own. So the second thread may
+be late, or gone (after a fork), and the answers are the same.
 
-The first thread alone traces: the calls must be of those that any thread may make.
+Only the first thread traces: the calls must be ones that any thread may make.
 
 Source: futex(2), sched(7).
 """

@@ -1,4 +1,4 @@
-"""System V shared memory of this machine's IPC namespace, which is ours and that of every program we restore.
+"""System V shared memory of this machine's IPC namespace, which we share with every program that we restore.
 
 Source: shmget(2), shmctl(2), proc_sysvipc_shm(5); /proc/sys/kernel/shm_next_id of Documentation/admin-guide/sysctl/kernel.rst.
 """

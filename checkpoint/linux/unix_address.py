@@ -1,4 +1,4 @@
-"""Where a unix socket lies: an address for a path of any length."""
+"""Address a unix socket by a path of any length."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Open files with a user's rights instead of our own: what he may not read he shall not have carried for him, and what he may not
-write shall not be written for him.
+"""Open files with a user's rights instead of our own, so that a user gets no access to a file that he may not read or write.
 
-Only files are meant: the process stays who it is, so it can go on tracing. Source: setfsuid(2), which takes the rights of the
-superuser over files away, too, and gives them back (capabilities(7)); it is about the calling thread.
+Only file access changes: the process keeps its identity, so it can continue to trace. Source: setfsuid(2), which also takes the
+superuser's rights over files away, and gives them back (capabilities(7)); it affects the calling thread.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Sets of pages and what is computed with them: differences, merges, caches of hot pages, sources of a restore."""
+"""Sets of pages and operations on them: differences, merges, and the source of pages for a restore."""

@@ -1,4 +1,4 @@
-"""One buffer out of several copies of pages: each page once, from the newest copy that has it. Arithmetic, no system call."""
+"""Merge several copies of pages into one buffer: each page once, from its newest copy. Pure, no system call."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
 """Sets of pages, zero pages and page sums: arithmetic over arrays, no system call.
 
-A *set of pages* here is a numpy array of shape ``(count, 2)`` and type uint64: extents ``[start, end)`` in address
-order that neither touch nor overlap. Every function below returns such arrays; ``extents`` makes one from anything.
+A *set of pages* here is a numpy array of shape ``(count, 2)`` and type uint64: extents ``[start, end)`` in address order that
+neither touch nor overlap. Every function below returns such arrays; ``extents`` makes one from any input.
 
-The *page sum* is the sum, in two lanes modulo 2⁶⁴, of the digests of all pages that a state holds. It does not depend on
-the order of the pages, so writing, adding or dropping a page changes it by that page's digest alone. It finds
-accidents and diverged histories; it is no guard against a stranger (the file's blake3 digests are).
+The *page sum* is the sum, in two words modulo 2⁶⁴, of the digests of all pages that a state holds. It does not depend on the
+order of the pages, so writing, adding or dropping a page changes it by that page's digest alone. It finds accidents and diverged
+histories; it does not protect against an attacker (the file's blake3 digests do).
 """
 
 from __future__ import annotations

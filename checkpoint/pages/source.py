@@ -1,4 +1,4 @@
-"""What a restore asks for a program's pages where they do not lie one after the other in memory."""
+"""The interface by which a restore asks for a program's pages, where these are not consecutive in memory."""
 
 from __future__ import annotations
 

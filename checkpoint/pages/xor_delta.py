@@ -1,8 +1,8 @@
-"""Pages that a delta tells as their difference from what the parent's state holds there: the XOR of the two. Pure.
+"""Store a changed page in a delta as the XOR of its content with the parent's content. Pure.
 
-A page that a program writes again is mostly what it was, so that the difference is mostly zeros and compresses several times
-better than the page. Who makes a delta must have the parent's content at hand, and so must who takes it in on its own; a whole
-chain (`checkpoint.store.chain.fold`) explains itself.
+A page that a program writes again is mostly unchanged, so the difference is mostly zeros and compresses several times better than
+the page. The maker of a delta must have the parent's content at hand, and so must a reader that takes the delta alone. A whole
+chain (`checkpoint.store.chain.fold`) needs nothing else.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What a program is started with: its fencing token, its level of processor, the name of its scratch memory."""
+"""Settings with which a program is started: its fencing token, its processor level, the name of its scratch memory."""

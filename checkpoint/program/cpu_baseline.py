@@ -1,6 +1,7 @@
-"""Programs that may move between different processors: started so that libraries choose code for a level that all of them have.
+"""Start programs that may move between different processors so that libraries use only code for a common processor level.
 
-`environment` says so to the C library and others; what was agreed stays in the program's environment, where a capture finds it.
+`environment` tells the C library and other libraries. The agreed level stays in the program's environment, where a capture finds
+it.
 """
 
 from __future__ import annotations

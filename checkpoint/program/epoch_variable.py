@@ -1,16 +1,16 @@
-"""The fencing token of a program that nobody prepared: the epoch in its environment, always the one under which this copy runs.
+"""The fencing token of an unmodified program: an environment variable that holds the epoch under which this copy runs.
 
-A program is born with ``FAILOVER_EPOCH=`` and twenty digits. They stand in its memory, where the kernel shows them as
-/proc/self/environ; a restore writes the digits of its own epoch over those of the snapshot, and the first capture of a copy that
-goes on under a later epoch writes them, too. So the token belongs to the copy: the old one keeps what it had, whatever files or
-names the two robots share, and nothing is open while the program is captured.
+A program is started with ``FAILOVER_EPOCH=`` and twenty digits. They are in its memory, where the kernel shows them as
+/proc/self/environ. A restore writes the digits of its own epoch over those of the snapshot. The first capture of a copy that
+continues under a later epoch writes them, too. So the token belongs to the copy: the old copy keeps its token, even if the two
+robots share files or names. Nothing is open while the program is captured.
 
-In C, getenv(3) returns the place itself, so it tells the present epoch each time. Other languages copy their environment at their
-start: `failover.epoch` asks the C library, a shell script reads /proc/$$/environ. A program that writes over its environment, as
-some do to change what ps(1) shows, has no token after that.
+In C, getenv(3) returns the place itself, so it returns the present epoch each time. Other languages copy their environment at
+their start: `failover.epoch` asks the C library, a shell script reads /proc/$$/environ. A program that writes over its
+environment, as some do to change what ps(1) shows, has no token after that.
 
-The copy may be running meanwhile, so the last digit is written first. A reader that reads them in their order sees at most the
-new epoch: the first digits of the old one, the last ones of the new one.
+The copy may be running meanwhile, so the last digit is written first. A reader that reads the digits in their order sees at most
+the new epoch: the first digits of the old one, the last ones of the new one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The name by which memory is told from all other that need not come back: see `failover.task.scratch`."""
+"""The name that marks memory whose content need not be restored: see `failover.task.scratch`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a process holds besides memory, one file for each kind. `kinds` lists them, `survey` asks all of them."""
+"""State that a process holds besides memory, one file for each kind. `registry` lists the kinds, `survey` asks all of them."""

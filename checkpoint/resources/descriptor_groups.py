@@ -1,7 +1,8 @@
-"""Which descriptors of a process lead to the same open file: one call says so of each pair of those that are alike.
+"""Group the descriptors of a process that lead to the same open file, by one call for each pair of similar descriptors.
 
-The kernel has an order of open files. The first look finds that of those that are alike, with a few questions about each; the
-next ones ask whether each is still followed by the same other, which proves that all are what they were to one another.
+The kernel has an order of open files. The first capture finds the order of similar descriptors, with a few questions about each.
+Later captures ask whether each descriptor is still followed by the same other one, which proves that their relations are
+unchanged.
 
 Source: kcmp(2), KCMP_FILE.
 """

@@ -1,4 +1,4 @@
-"""What the kernel lists of all sockets at once, read once for all of a process: a list is as long as the machine has sockets.
+"""Read the kernel's lists of all sockets once for all sockets of a process, because a list covers the whole machine.
 
 Source: proc_pid_net(5), sock_diag(7).
 """

@@ -1,4 +1,4 @@
-"""One open file of a process as the kinds see it, and what they must know besides: values only."""
+"""One open file of a process, and the facts that the resource kinds need besides it: values only."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Whether another process has the same open file, too: then it is not the program's alone, and cannot move with it.
+"""Check whether another program holds the same open file: then it is not the program's alone, and cannot move with it.
 
-Others get hold of one only by a fork, by a message of a unix socket or by being born with it, so an open file that nobody
-else had once is not looked for again under its number.
+Other processes get an open file only by a fork, by a message of a unix socket or by inheriting it when they are created. So an
+open file that was once the program's alone is not checked again under its number.
 
 Source: kcmp(2).
 """

@@ -1,10 +1,11 @@
-"""Every descriptor of a snapshot, put back inside a vessel under its own number.
+"""Restore every descriptor of a snapshot inside a vessel, under its own number.
 
 Every resource stands for one *open file description*: descriptors made by dup share one, with its offset and flags, and share one
-again. Facts that all have: ``descriptors``, a list of [number, 1 if close-on-exec].
+again. Facts that all resources have: ``descriptors``, a list of [number, 1 if close-on-exec].
 
-Order: the vessel's own 0, 1 and 2 move out of the way; then every number in ascending order, so that whatever is opened gets a
-number that is still wanted or free; then what had moved is closed; then what refers to other descriptors is told of them.
+Order: first the vessel's own 0, 1 and 2 move out of the way. Then every number is restored in ascending order, so that each file
+that is opened gets a number that is still wanted or free. Then the moved descriptors are closed. Last, the restore passes other
+descriptors to the files that refer to them.
 
 Sources: open(2), dup(2), fdinfo of proc_pid_fdinfo(5).
 """

@@ -1,7 +1,7 @@
-"""What cannot be kept yet: found by name, with what to do about it. Nothing here touches the process.
+"""Refuse state that cannot be kept yet, with its name and a cure. This module does not touch the process.
 
-This is the table's last row of every kind: an open file that no other kind took, a mapping that cannot be made again, a process
-that is not by itself. What threads must not be is in ``refused_threads``.
+It is the last check of every kind: an open file that no other kind took, a mapping that cannot be made again, a process that is
+not by itself. The limits for threads are in `checkpoint.resources.process.refused_threads`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which kinds of open files there are, in the order in which they are asked."""
+"""The kinds of open files, in the order in which they are asked."""
 
 from __future__ import annotations
 

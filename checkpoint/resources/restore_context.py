@@ -1,4 +1,4 @@
-"""What every kind's ``rebuild`` knows of the restore as a whole."""
+"""Facts about the restore as a whole that the ``rebuild`` of every kind receives."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Which open files several processes of a component have in common.
+"""Find the open files that several processes of a component share.
 
-An open file (its offset, its flags) that several of them share comes back as one that they share; pipes and sockets lead from one
-to the other. All of these get a number, and are made before the processes are (``restore_tree``): those inherit them.
+An open file (its offset, its flags) that several of them share is restored as one that they share; pipes and sockets lead from
+one process to another. All of these get a number, and the restore makes them before it creates the processes
+(`checkpoint.engines.ptrace.restore.tree`): the processes inherit them.
 
 Source: kcmp(2), KCMP_FILE; pipe(7).
 """

@@ -1,4 +1,4 @@
-"""An open file that several processes of a component share: the first of them tells what it is, the others that it is the same.
+"""An open file that several processes share: the first process describes the file, the others only refer to it.
 
 Facts: ``descriptors``; ``description``: the number that it has in all of them; ``path``: the kernel's name for it.
 """

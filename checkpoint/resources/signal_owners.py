@@ -1,9 +1,9 @@
-"""Whom open files send their signals to, and which (fcntl(2)): asked so that it goes with the memory of the same instant.
+"""Read the owner and signal of open files (fcntl(2)) at the same instant as the memory.
 
-To ask costs a few calls for each open file, and hardly any has an owner. So a process that stands still is asked of those alone
-that may well have one: they send signals (O_ASYNC), have a lease, are on their way in a socket, or had an owner at the last look.
-When it runs again all the others are asked. One of them that has an owner got it unseen, perhaps before the freeze, perhaps
-after it: the capture is made again, and that one is asked in time.
+The query costs a few calls for each open file, and hardly any has an owner. So the freeze asks only about files that may well
+have one: they send signals (O_ASYNC), have a lease, are in transit in a socket, or had an owner at the last capture. After the
+process has resumed, all others are asked. If one of them has an owner, the file got it unnoticed, perhaps before the freeze,
+perhaps after it: the capture is made again, and asks about that file in time.
 
 Source: F_GETOWN_EX and F_GETSIG in fcntl(2).
 """

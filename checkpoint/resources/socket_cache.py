@@ -1,10 +1,10 @@
-"""Sockets that are as they were at the last look: all are asked everything again, and looked into where they answer otherwise.
+"""Cache socket descriptions between captures: each capture queries all sockets, and decodes only those with other answers.
 
-To look into a socket takes much longer than to ask it: the answers are many, and have to be understood. So all questions are
-asked by one table of calls (`checkpoint.linux.net.socket_queries`), and where the answers are those of last time, byte by byte,
-so is what they mean. Nothing is taken for granted because of a number, which may have been given to another socket.
+Decoding a socket takes much longer than querying it: the answers are many. So one table of calls asks all questions
+(`checkpoint.linux.net.socket_queries`). Where the answers are equal to the last ones, byte by byte, their meaning is the same,
+too. The cache never relies on a number alone, because the kernel may have given it to another socket.
 
-What waits in a socket is not asked that way, so one in which something waits is always looked into.
+These queries do not cover data that waits in a socket, so a socket with waiting data is always decoded.
 """
 
 from __future__ import annotations

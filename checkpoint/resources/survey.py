@@ -1,4 +1,4 @@
-"""All open files of a process: `gather` reads them while it stands still; `look` sorts what was read into kinds, afterwards."""
+"""Inspect all open files of a process: `gather` reads them during the freeze; `look` sorts the results into kinds afterwards."""
 
 from __future__ import annotations
 

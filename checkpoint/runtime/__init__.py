@@ -1,1 +1,1 @@
-"""How our own processes start fast and stay small: late imports, parallel work, the allocator. Everything may import it."""
+"""Help our own processes start fast and stay small: late imports, parallel work, the allocator. Every package may import it."""

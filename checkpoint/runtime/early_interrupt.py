@@ -1,6 +1,7 @@
-"""Ctrl-C while a command still loads ends it at once and quietly, with exit status 130, as shells say of it.
+"""End a command that is still loading at Ctrl-C, at once and quietly, with exit status 130, as shells report it.
 
-Every entry (`__main__`) begins with this, before the imports that take time; nothing has been done yet that would need an end.
+Every entry point (`__main__`) begins with this, before the imports that take time; nothing has been done yet that would need a
+clean-up.
 """
 
 from __future__ import annotations

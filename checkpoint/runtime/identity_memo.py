@@ -1,7 +1,7 @@
-"""What was worked out last, for as long as it is asked of the very same objects.
+"""Remember the last result of a computation, as long as its inputs are the very same objects.
 
-What is looked at again and again has mostly not changed, and whoever reads it hands out the same objects then. To find that out
-takes nothing; to work out anew what hundreds of mappings mean takes longer than a freeze.
+Most inspected state has not changed since the last capture, and its readers then return the same objects. Comparing identities
+takes no time; computing the meaning of hundreds of mappings again takes longer than a freeze.
 """
 
 from __future__ import annotations

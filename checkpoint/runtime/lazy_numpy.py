@@ -1,7 +1,7 @@
-"""numpy, loaded when it is first used: an agent that holds no snapshot yet does without its 8 MB.
+"""Import numpy at its first use: an agent that holds no snapshot yet saves its 8 MB.
 
-What is imported from here costs nothing more after its first use. Where pages are handled in any case (the keeper), numpy is
-imported as it is.
+A name imported from here costs nothing more after its first use. A process that handles pages in any case (the keeper) imports
+numpy directly.
 """
 
 from __future__ import annotations

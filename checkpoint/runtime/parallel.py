@@ -1,4 +1,4 @@
-"""Pieces of work on several processors at once, their results in order: of work that lets other threads run meanwhile."""
+"""Run pieces of work on several processors at once, with results in order, for work that releases the interpreter's lock."""
 
 from __future__ import annotations
 

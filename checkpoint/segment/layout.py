@@ -1,11 +1,11 @@
-"""The shared segment: where a cooperating program leaves its committed state, and others read it without stopping anybody.
+"""The layout of the shared segment, in which a cooperating program commits its state and readers read it without stopping it.
 
-SEGMENT.md beside this file is normative, to the byte. In short: a table of *regions*, and several *banks*, each a whole copy
-of all regions with a version for every page. A commit writes a bank that is neither the newest nor held by a reader; a reader
-holds the newest bank by a lock that ends with whoever holds it. So nobody waits, and whoever dies at any instant leaves one
-whole bank.
+SEGMENT.md beside this file is normative, to the byte. In short: a table of *regions*, and several *banks*, each a whole copy of
+all regions with a version for every page. A commit writes a bank that is neither the newest nor held by a reader. A reader holds
+the newest bank by a lock that ends with the reader. So no process waits, and a process that dies at any instant leaves one whole
+bank.
 
-This file says what the bytes mean; `segment_writer` writes them, `segment_reader` reads them.
+This file defines what the bytes mean; `checkpoint.segment.writer` writes them, `checkpoint.segment.reader` reads them.
 """
 
 from __future__ import annotations

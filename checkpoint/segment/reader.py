@@ -1,6 +1,6 @@
-"""The reading side of a segment. What is read may come from a hostile program.
+"""Read a segment, whose content may come from a hostile program.
 
-Therefore everything is read with pread(2), so that a file that shrinks is an error and not a signal, and every number is checked.
+Therefore every read uses pread(2), so that a file that shrinks is an error and not a signal, and every number is checked.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""What a guard and a program that keeps its state say to each other, as bytes. TASK.md beside this file is normative.
+"""The messages between a guard and a cooperating program, as bytes. TASK.md beside this file is normative.
 
-The guard listens before the program is born, at a name that it leaves in the program's environment (`VARIABLE`). The program, or
-a child of it, connects when it has a state to keep, says `Hello` and waits for `Begin`. Neither waits for the other afterwards.
+The guard listens before the program is started, at a name that it leaves in the program's environment (`VARIABLE`). The program,
+or a child of it, connects when it has a state to keep, says `Hello` and waits for `Begin`. Neither waits for the other
+afterwards.
 
 Both ends may be hostile to each other: a packet is decoded strictly, or refused as a whole.
 """

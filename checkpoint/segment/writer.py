@@ -1,6 +1,7 @@
-"""The writing side of a segment: a program's commits. One thread at a time; nothing here waits for anybody.
+"""Write a program's commits to a segment: one thread at a time, and no call waits for another process.
 
-A commit that is cut off anywhere leaves the bank that it wrote with the number 0, and the newest word on another, whole one.
+A commit that is interrupted anywhere leaves the bank that it wrote with the number 0. The newest state is then in another, whole
+bank.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""One snapshot as values and as the bytes of a file (FORMAT.md): what must hold in it, with which rights it comes back."""
+"""One snapshot as values and as the bytes of a file (FORMAT.md), with its validity rules and the rights that it gets back."""

@@ -1,4 +1,4 @@
-"""Bytes by offset, from wherever a snapshot file is: a path, a descriptor, memory."""
+"""Read bytes of a snapshot file by offset: from a path, a descriptor or memory."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a snapshot says besides its pages, as canonical bytes: the same state always gives the same bytes.
+"""Encode the state of a snapshot besides its pages as canonical bytes: the same state always gives the same bytes.
 
-The header is what a listing needs; the state is what a restore needs and what the state digest covers. Both are
-msgpack maps in field order with sorted dictionary keys. A reader encodes again what it decoded and refuses bytes that differ,
-so unknown fields, doubled keys and other spellings of the same value do not pass.
+The header is the part that a listing needs; the state is the part that a restore needs and that the state digest covers. Both are
+msgpack maps in field order with sorted dictionary keys. A reader encodes again what it decoded and refuses bytes that differ, so
+unknown fields, doubled keys and other encodings of the same value do not pass.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Carried files (rule ``carry``): how a snapshot tells of them. Their content travels as pages, and is folded as memory is.
+"""How a snapshot describes carried files (rule ``carry``): their content is stored as pages, and folded like memory.
 
-Every file has a *stretch* of addresses that no program can have (`FIRST_ADDRESS` and up), with a mapping of kind CARRIED_FILE
-as long as the file, in whole pages; a page that is not there is a hole. What a file is called, and whose it is, stands in one
-resource for each carried path: its ``name`` is the path, absolute. Its fact ``size`` is what its files hold, in whole pages; its
-fact ``entries`` lists the path itself (its name is b"") and all that lies below it, a directory before what is in it; a path
-where nothing stood has no entries. An entry is a list:
+Every file has a *stretch* of addresses that no program can have (`FIRST_ADDRESS` and up), with a mapping of kind CARRIED_FILE as
+long as the file, in whole pages; a missing page is a hole. One resource for each carried path holds the names and owners of its
+files: its ``name`` is the path, absolute. Its fact ``size`` is the size of its files, in whole pages. Its fact ``entries`` lists
+the path itself (its name is b"") and everything below it, a directory before its content; a path without a file has no entries.
+An entry is a list:
 
     name        relative to the path, bytes
     mode        st_mode; uid; gid; mtime_ns

@@ -1,4 +1,4 @@
-"""How bytes are stored: compressed where that makes them fewer, and as they are where it does not."""
+"""Store bytes compressed where that makes them fewer, and unchanged where it does not."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a snapshot may when it comes back: what each of its threads asks for, and how much of that its owner has.
+"""The rights that a snapshot gets when it is restored: what its threads ask for, limited to the rights of its owner.
 
-`bounded` is the one bound: a snapshot goes through it wherever it comes back for an owner who is not root, `excess` says what it
-takes, and `beyond` what no owner but root can have (an agent refuses that). Threads that may something else than their first one
-stand in a resource of their own kind, which `checkpoint.resources.process.thread_credentials` makes.
+`bounded` is the only limit: a snapshot goes through it wherever it is restored for an owner who is not root. `excess` lists the
+rights that it takes away, and `beyond` lists rights that only root can have (an agent refuses that). Threads with other rights
+than their first one are in a resource of their own kind, which `checkpoint.resources.process.thread_credentials` makes.
 
 Sources: credentials(7); capabilities(7), on securebits; sched(7); getrlimit(2).
 """

@@ -1,8 +1,8 @@
-"""Snapshot ⇄ bytes of one file. FORMAT.md describes the file to the byte; ``layout`` holds its fixed parts.
+"""Encode and decode a snapshot ⇄ the bytes of one file. FORMAT.md describes the file to the byte.
 
-Writing streams: contents are compressed frame by frame and never copied as a whole. Reading verifies: every byte of the
-file is covered by a digest that is checked before the byte is used, sizes are checked before anything is allocated,
-and what does not hold together is refused with FormatError, whatever the bytes.
+`checkpoint.snapshot.layout` holds its fixed parts. Writing streams: contents are compressed frame by frame and never copied as a
+whole. Reading verifies: every byte of the file is covered by a digest that is checked before the byte is used, sizes are checked
+before anything is allocated, and inconsistent bytes of any kind are refused with FormatError.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""The frames of a snapshot file: its contents, piece by piece, each with its own digest.
+"""The frames of a snapshot file: its contents in pieces, each with its own digest.
 
-A frame is verified before anything is made of it, and stays in a processor's cache from the first to the last thing that is done
-to it.
+A frame is verified before it is used, and stays in a processor's cache from the first to the last step of its processing.
 """
 
 from __future__ import annotations

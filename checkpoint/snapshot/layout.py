@@ -1,7 +1,7 @@
-"""The fixed parts of a snapshot file, byte for byte: numbers, sizes, limits. FORMAT.md tells the same in words.
+"""The fixed parts of a snapshot file, byte for byte: numbers, sizes, limits. FORMAT.md describes the same in words.
 
-All integers are little-endian. Parsing checks everything that can be said about a part on its own; it raises
-FormatError and never reads beyond the bytes it was given.
+All integers are little-endian. Parsing checks everything that can be checked in one part alone; it raises FormatError and never
+reads beyond the bytes it was given.
 """
 
 from __future__ import annotations

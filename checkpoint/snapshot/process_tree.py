@@ -1,8 +1,8 @@
-"""A component of several processes as one snapshot, and as a snapshot of each.
+"""Convert between one snapshot of a component of several processes and one snapshot of each process.
 
-Every process has an address space of its own, and the snapshot one set of pages: page ``address`` of the process in slot ``n``
-stands there as ``address + n × 2⁴⁸``. The first process has slot 0, so that a snapshot of one process is as it always was, and
-what is known of chains, sums and frames holds for trees as it stands.
+Every process has an address space of its own, and the snapshot one set of pages: page ``address`` of the process in slot ``n`` is
+stored as ``address + n × 2⁴⁸``. The first process has slot 0, so a snapshot of one process keeps its earlier form, and the rules
+of chains, sums and frames hold for trees without change.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Which files a program needs wherever it goes on: its executable and what is mapped, and by choice what it only reads.
+"""List the files that a program needs on every machine: its executable and mapped files, and by choice files that it only reads.
 
-Pure: told by the snapshot alone. What is there of it on a machine, and where the rest comes from, others find out.
+Pure: it uses the snapshot alone. Other modules find out which of them a machine has, and where the rest comes from.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What a snapshot says is another's word: facts of any kind may be missing, of another type, or out of every range.
+"""Turn errors from untrusted snapshot facts into one error class: facts may be missing, of another type, or out of range.
 
-Each kind of resource reads its own facts as they are meant. Where that goes wrong because they are not, the error is of whatever
-class Python has for it; here it becomes one that says so, so that a snapshot is refused and nobody ends because of it.
+Each kind of resource reads its own facts as they should be. Where a fact is wrong, Python raises an error of any class; this
+module turns it into one that says so, so that the snapshot is refused and no process ends because of it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What must hold in every snapshot: checked before one is written and before a decoded one is used."""
+"""The rules that every snapshot must fulfil: checked before one is written and before a decoded one is used."""
 
 from __future__ import annotations
 

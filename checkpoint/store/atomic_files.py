@@ -1,4 +1,4 @@
-"""Files that stand under their names whole, or not at all, whenever the power goes. What is in them is the store's business."""
+"""Write files that appear under their names whole or not at all, at any power loss. The store defines their content."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""A base of a program that stands still, its pages read as they are written to a file: no copy of them all is made.
+"""Write a base directly from a frozen program to a file, without a copy of all its pages.
 
-The counterpart of `checkpoint.store.base_on_disk`. What tells of the pages, their sum and the position's digest, stands before
-them in
-the file, and is known after the last one: so it is written last.
+The counterpart of `checkpoint.store.base_on_disk`. The sum of the pages and the digest of the position come before the pages in
+the file, but are known only after the last page: so they are written last.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""A base that lies in a file, its pages taken out piece by piece: of a large program no copy is made besides the program itself.
+"""Read a base from its file piece by piece, so that restoring a large program needs no second copy of it in memory.
 
-With the deltas that continue it, which are much smaller and are held in memory, it is what they amount to. A base of several
-processes has its pages put together only as a whole, and so has a chain of such.
+The deltas that continue it are much smaller and are held in memory; the module reads the state that base and deltas amount to.
+The pages of a base of several processes are put together only as a whole, and so are those of its chain.
 
-The outline is verified when the files are opened, each frame before anything is made of it, and what the pages add up to after
-the last one: whoever takes pieces undoes everything where that fails.
+The outline is verified when the files are opened, each frame before it is used, and the sum of all pages after the last one: a
+user that takes pieces must undo everything if that last check fails.
 """
 
 from __future__ import annotations

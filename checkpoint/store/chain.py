@@ -1,10 +1,10 @@
-"""Base and deltas: does a delta continue a chain, and what state do they add up to. No file, no clock.
+"""Check whether a delta continues a chain, and fold a base and its deltas into one state. Uses no file and no clock.
 
 A *chain* is a tuple of snapshots of one component: a base, then deltas, each the child of the one before it.
 
-A delta changes the state of its parent in steps: pages outside its own mappings go, pages in ``cleared`` go, pages in
-``runs`` are set (those in ``differences`` to what is there XOR their bytes), pages in ``copies`` as those that they name. A
-position's digest covers the result (``state_digest``), so a fold proves itself.
+A delta changes the state of its parent in steps: pages outside its own mappings go, pages in ``cleared`` go, pages in ``runs``
+are set (those in ``differences`` to the present bytes XOR theirs), pages in ``copies`` as those that they name. A position's
+digest covers the result (``state_digest``), so a fold proves itself.
 """
 
 from __future__ import annotations

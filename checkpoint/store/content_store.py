@@ -1,8 +1,9 @@
-"""Files that a program brought along, by content: ``STORE/contents/HEX``, named by the blake3 digest of what is in them.
+"""Store the files of programs by content: ``STORE/contents/HEX``, named by the blake3 digest of the content.
 
-Invariants: a file stands under its name whole, or not at all (`whole_files`); none is ever changed. All can be read and executed,
-by whoever gets as far (the store is ours alone); what else the originals could, such as lend their owner's rights, they cannot.
-One content is kept once, however many programs, paths and snapshots name it; what no snapshot of the store names goes.
+Invariants: a file stands under its name whole, or not at all (`checkpoint.store.atomic_files`); none is ever changed. Every user
+who can reach the store (it is ours alone) can read and execute all of them. They have none of the other powers of the originals,
+such as lending their owner's rights. One content is kept once, for any number of programs, paths and snapshots that name it; the
+store removes content that no snapshot of the store names.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Digests of files that need not be read again while nobody has touched them.
+"""Cache digests of files that have not changed, so that they need not be read again.
 
-Source: inode(7): ctime is the kernel's own, and every write, also one through a mapping, sets it; only who sets the clock could
-have it stand still.
+Source: inode(7): ctime is the kernel's own, and every write, also one through a mapping, sets it; only a user who sets the clock
+could keep it unchanged.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The store's door to the disk: every operation that changes something, one method each, so that a test can cut anywhere."""
+"""The store's interface to the disk: one method for every operation that changes something, so that a test can interrupt each."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
-"""A chain's files folded into the file of one base, frame by frame: none of them is held whole.
+"""Fold a chain's files into the file of one base, frame by frame, without holding one of them whole.
 
-A frame in which no page was changed, came or went is copied as it is stored. So the work is that of what has changed, and of
-what has moved: a page that comes or goes moves all that follow it.
+A frame in which no page changed, came or went is copied as it is stored. So the work is proportional to the pages that changed or
+moved: a page that comes or goes moves all that follow it.
 
-The result is proved without looking at what was only copied: a page sum is a sum, so that the newest one is the base's, less the
-digests of pages that went or were replaced, and those of what is there now added. The base's own was proved when it came.
+The result is proved without reading the frames that were only copied. A page sum is a sum: the newest one is the base's, minus
+the digests of pages that went or were replaced, plus the digests of the pages that are there now. The base's own was proved when
+it came.
 """
 
 from __future__ import annotations

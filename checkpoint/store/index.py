@@ -1,6 +1,6 @@
-"""What a store holds of one component, as values: which files, which chains they make, which positions can be restored.
+"""The index of a store for one component, as values: the files, the chains that they make, the positions that can be restored.
 
-Pure: ``store`` reads and writes the files, this says what they mean.
+Pure: `checkpoint.store.store` reads and writes the files, this module says what they mean.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The pages of each of several processes, in a snapshot that tells each content once: put together piece by piece.
+"""Assemble the pages of each process, piece by piece, from a snapshot that stores each content once for several processes.
 
-Processes that have forked have most of their memory in common. To give each its own copy of it, only to write that into a vessel,
-would take as much memory besides as all of them will have.
+Processes that have forked have most of their memory in common. A separate copy for each, only to write it into a vessel, would
+take as much additional memory as all of them will have.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a chain of snapshot files holds at some pages: only the frames that have them are read, not the whole state."""
+"""Look up single pages in a chain of snapshot files: reads only the frames that have them, not the whole state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the pages of a chain's newest state come from: told whole by one of its snapshots, changed by differences since. Pure."""
+"""Where the pages of a chain's newest state come from: stored whole in one snapshot, changed by differences since. Pure."""
 
 from __future__ import annotations
 

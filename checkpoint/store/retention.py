@@ -1,7 +1,8 @@
-"""Checkpoints that no robot needs any more and a person may still want: some whole ones of each component, spread over a span.
+"""Keep older checkpoints for people: some whole ones of each component, spread over a span of time. No robot needs them.
 
-They lie in a folder of their own, as files that ``failover inspect`` and ``failover restore`` take. Invariant: nothing in here is
-the newest checkpoint of its component, or one that the rules may go back to; so whatever goes to make room is missed by no robot.
+They lie in a folder of their own, as files that ``failover inspect`` and ``failover restore`` take. Invariant: the folder never
+holds the newest checkpoint of its component, or one that the rules may go back to; so no robot needs a file that is deleted to
+free space.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """A directory of snapshots that survives power loss at any point.
 
 ``ROOT/lock``, and one folder for each component with a file for each snapshot. A file appears under its name only when it is
-whole and on the disk: written aside, synced, renamed, folder synced. What was acknowledged is therefore always
-there, and what did not arrive whole leaves nothing but a temporary that the next opening removes.
+whole and on the disk: written aside, synced, renamed, folder synced. So an acknowledged snapshot is always there, and a snapshot
+that did not arrive whole leaves only a temporary file that the next opening removes.
 
-Two kinds of lock, taken in this order: one a component for whoever changes what is held of it, for as long as that takes (a base
-may be gigabytes), and one for what is known of all, held for moments only. Who reads waits for the second alone: a takeover never
-stands behind a snapshot that is being written, proved or folded.
+There are two kinds of lock, taken in this order. Each component has one for the thread that changes its files, for as long as
+that takes (a base may be gigabytes). The store has one for what is known of all components, held for moments only. Readers wait
+for the second alone: a takeover never waits for a snapshot that is being written, proved or folded.
 """
 
 from __future__ import annotations

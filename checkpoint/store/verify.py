@@ -1,7 +1,7 @@
-"""Whether the newest snapshot of a component leads to the state that its position names, told from its own pages alone.
+"""Verify, from a snapshot's own pages alone, that the newest snapshot of a component leads to the state its position names.
 
-What that takes of the state before it is remembered: the digest of each page, and the content of those that may be told as
-differences. What is not remembered (any more) is counted and read again from the files.
+The check remembers what it needs of the earlier state: the digest of each page, and the content of pages that may come as
+differences. Pages that it does not remember (any more) are counted and read again from the files.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The newest content of pages that change often, in bounded memory: what deltas are told as differences from.
+"""Cache the newest content of pages that change often, in bounded memory: the reference for XOR differences in deltas.
 
-Both sides of a stream keep such pages, each by itself: who makes deltas (`Sender`), to tell less, and who takes them in
-(`checkpoint.store.verify`), to prove them without reading back what it has stored. What is forgotten costs bytes or time, never
-correctness: a sender tells a page whole, a store reads it from its files.
+Both sides of a stream keep such pages, each by itself: the maker of deltas (`Sender`), to send less, and the receiver
+(`checkpoint.store.verify`), to prove them without reading back what it has stored. A forgotten page costs bytes or time, never
+correctness: a sender sends a page whole, a store reads it from its files.
 """
 
 from __future__ import annotations

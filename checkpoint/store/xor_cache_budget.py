@@ -1,7 +1,7 @@
-"""One bound for the memory in which all of a robot's streams remember pages (`checkpoint.store.xor_cache`), shared by need.
+"""Divide one memory limit among the page caches of all streams of a robot (`checkpoint.store.xor_cache`), by need.
 
-Who needs little has all of it; what is left the others share equally. Nobody is given what another one still holds: who is to
-have less gives it up when its next snapshot comes, so that the whole never holds more than the bound.
+A cache that needs little gets all that it needs; the others share the rest equally. No cache is given memory that another one
+still holds: a cache that is to have less gives it up at its next snapshot, so that the total never exceeds the limit.
 """
 
 from __future__ import annotations

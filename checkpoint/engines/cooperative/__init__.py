@@ -1,1 +1,1 @@
-"""Snapshots of what a program has committed to its segment. No thread is stopped or traced."""
+"""The cooperative engine: snapshots of the state that a program has committed to its segment. It stops and traces no thread."""

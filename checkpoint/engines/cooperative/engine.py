@@ -1,7 +1,7 @@
-"""The cooperative engine behind a keeper: a program under a guard, whose segment is looked for whenever a capture is wanted.
+"""The cooperative engine behind a keeper: a program under a guard. Each capture looks up the program's current segment.
 
-A program that has only begun has committed nothing yet, and one whose state grows goes on in another segment: so it is asked for
-nothing, and each capture looks where its commits go now.
+A program that has just started has committed nothing yet, and a program whose state grows continues in another segment. So the
+engine asks the program for nothing, and each capture looks where the commits go now.
 """
 
 from __future__ import annotations

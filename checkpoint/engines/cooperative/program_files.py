@@ -1,13 +1,13 @@
-"""What a program that keeps its state is started again from: the file that its command names, and what lies with it.
+"""Find the files from which a cooperating program is started again: the file that its command names, and the files beside it.
 
-* A script of an interpreter: it, the files of its kind beside it (``*.py`` beside ``main.py``), and the packages there (folders
-  with an ``__init__.py``), whole. The interpreter and what is installed for it do not belong to the program.
-* Any other program: its executable, and what it has mapped from the executable's directory or below.
+* For a script of an interpreter: the script, the files of its kind beside it (``*.py`` beside ``main.py``), and the whole
+  packages there (folders with an ``__init__.py``). The interpreter and its installed packages do not belong to the program.
+* For any other program: its executable, and the files from the executable's directory or below that it has mapped.
 
-What lies in the system's own directories is installed, and belongs to no program.
+Files in the system's own directories are installed, and belong to no program.
 
-They stand in a snapshot as a resource of kind "program": ``files``, a list of [path, size, digest, mode], the first one what is
-started; nothing where there are more than `FILES_MAX`.
+In a snapshot they are a resource of kind "program" with the fact ``files``: a list of [path, size, digest, mode]. The first one
+is the file that is started. The resource is absent where there are more than `FILES_MAX` files.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The cooperative engine: snapshots of what a program has committed to its segment. Nobody is frozen, nobody traced.
+"""A session of the cooperative engine: makes snapshots of a program's committed state. It freezes and traces no process.
 
-A cooperative snapshot is one like any other: its mappings are the segment's regions at made-up addresses, its runs the pages that
-changed. It has no threads; what it says of the process is what ``/proc`` tells everybody. A resource of kind "task" says what
-the pages mean:
+A cooperative snapshot has the ordinary format: its mappings are the segment's regions at made-up addresses, its runs are the
+pages that changed. It has no threads. Its facts about the process are those that ``/proc`` shows to every user. A resource of
+kind "task" says what the pages mean:
 
     arguments   of the program, as it was started
     directory   its working directory
@@ -10,11 +10,12 @@ the pages mean:
     commit      number of the commit, in its lineage
     regions     [kind, size] of each region, in the order of the mappings
 
-The output that a snapshot carries ends where the program stood at its commit, which its record tells: what was printed later is
-printed again after a restore, what was printed before is not. Of a commit that does not tell, it ends where the
-stream stood before the commit was read.
+The output in a snapshot ends at the position that the record of the commit names, which is where the program was at its commit.
+After a restore the program prints later output again, and does not print earlier output again. If a commit names no position, the
+output ends where the stream was before the engine read the commit.
 
-A delta is made against what was acknowledged, as everywhere: pages whose version is later than the acknowledged commit.
+A delta is made against the acknowledged snapshot, as in other engines: it holds the pages whose version is later than the
+acknowledged commit.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Unmodified programs: captured, restored, and kept ready at a standby, through ptrace(2)."""
+"""The ptrace engine for unmodified programs: capture, restore, and copies kept ready at a standby, through ptrace(2)."""

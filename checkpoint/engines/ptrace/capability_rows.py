@@ -1,4 +1,4 @@
-"""What the engines bring back of every program besides what it has open: rows of the table, see `checkpoint.capability`."""
+"""Capability rows for the state that the engines restore of every program besides its open files, see `checkpoint.capability`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The ptrace engine: unmodified programs, through the kernel's own doors.
+"""The ptrace engine: captures and restores unmodified programs through kernel interfaces alone.
 
-Imported by the keeper alone, and at once: a keeper that waits in advance must not import during a takeover.
+Only the keeper imports it, and imports it at its start: a keeper that waits in advance must not import during a takeover.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Memory as the kernel shows it: read and written from outside, its page tables, three ways to find written pages."""
+"""Memory of a process through kernel interfaces: remote reads and writes, page tables, three ways to find written pages."""

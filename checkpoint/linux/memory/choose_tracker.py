@@ -1,8 +1,8 @@
-"""Which pages of a process were written since the last look: three ways, probed by feature.
+"""Choose how to find the pages of a process written since the last scan: three ways, chosen by probing features.
 
-* `write_protection.PagemapTracker`: userfaultfd and PAGEMAP_SCAN. Costs next to nothing.
+* `checkpoint.linux.memory.write_protect.PagemapTracker`: userfaultfd and PAGEMAP_SCAN. Costs next to nothing.
 * `SoftDirtyTracker`: the soft-dirty bit, where the kernel has it.
-* `digests.DigestTracker`: every page is read and compared by digest.
+* `checkpoint.linux.memory.digest_tracker.DigestTracker`: reads every page and compares digests.
 
 Source: Documentation/admin-guide/mm/soft-dirty.rst.
 """

@@ -1,6 +1,6 @@
-"""Changed pages by digest: for private mappings where the kernel tells nothing, and always for shared ones.
+"""Find changed pages by digest: for private mappings where the kernel tracks no writes, and always for shared mappings.
 
-Needs nothing of the kernel, and costs a pass over the memory.
+It needs no kernel feature, and costs a pass over the memory.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Guard pages (MADV_GUARD_INSTALL), followed by what scans name: to look at every page in each freeze costs 1 µs a MB.
+"""Track guard pages (MADV_GUARD_INSTALL) through the results of scans; a look at every page in each freeze would cost 1 µs a MB.
 
-Installing a guard and taking it away both change an entry of the page table, so a scan of a place that is watched names it as
-written (or, where nothing is there to be read, as cleared). A guard among a few written pages is not looked for: reading it
-fails, and whoever reads then has us look everywhere.
+Installing a guard and removing it both change an entry of the page table, so a scan of a tracked place reports it as written (or,
+where there is nothing to read, as cleared). The module does not look for a guard among a few written pages: reading it fails, and
+the reader then makes the module look everywhere.
 
 Source: guard_install_pte_entry() and guard_remove_pte_entry() in mm/madvise.c, pagemap_scan_pmd_entry() in fs/proc/task_mmu.c.
 """

@@ -1,7 +1,8 @@
-"""Memory of our own process whose written pages the kernel tells: for state that lives where it is kept.
+"""Memory of our own process with write tracking by the kernel: for state that a program changes in place.
 
-By asynchronous write protection and one scan (`write_protection`), where the kernel has both; otherwise nobody knows what was
-written, and whoever asks compares. The soft-dirty bit is not used here: clearing it would clear it for the whole process.
+It uses asynchronous write protection and one scan (`checkpoint.linux.memory.write_protect`), where the kernel has both. Elsewhere
+the written pages are unknown, and the caller compares. The soft-dirty bit is not used here: clearing it would clear it for the
+whole process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which pages of a process exist, and which were written: /proc/PID/pagemap, by PAGEMAP_SCAN or read as a file.
+"""Find which pages of a process exist and which were written: /proc/PID/pagemap, by PAGEMAP_SCAN or read as a file.
 
 Source: Documentation/admin-guide/mm/pagemap.rst.
 """

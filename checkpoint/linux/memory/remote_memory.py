@@ -1,4 +1,4 @@
-"""Another process's memory: read and written in long vectors, without stopping it."""
+"""Read and write another process's memory in long vectors, without stopping the process."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What finding written pages means: the contract of every tracker, and which mappings it is about.
+"""The contract of every tracker of written pages, and the mappings that it covers.
 
-Trackers speak of *private* mappings; shared ones can be written by others behind the page tables' back, and those of deleted
-files are carried whole (`digests.SharedPages`).
+Trackers cover *private* mappings. Other processes can write to shared mappings without a trace in the page tables of this
+process, and mappings of deleted files are carried whole: `checkpoint.linux.memory.digest_tracker.SharedPages` covers both.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Written pages by asynchronous write protection (userfaultfd) and one scan that finds and protects again. Costs next to nothing.
+"""Find written pages by asynchronous write protection (userfaultfd) and one scan that finds and protects again. Very cheap.
 
 Source: Documentation/admin-guide/mm/userfaultfd.rst, pagemap.rst.
 """

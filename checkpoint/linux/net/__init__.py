@@ -1,1 +1,1 @@
-"""Sockets as the kernel shows them: sock_diag(7), TCP repair, dropped packets."""
+"""Kernel interfaces for sockets: sock_diag(7), TCP repair, dropped packets."""

@@ -1,4 +1,4 @@
-"""What the kernel tells of sockets of UDP when it is asked by netlink: which were shut down, which nothing else tells.
+"""Read the state of UDP sockets by netlink: it alone tells which directions were shut down.
 
 Source: sock_diag(7), linux/inet_diag.h; inet_sk_diag_fill() in net/ipv4/inet_diag.c.
 """

@@ -1,4 +1,4 @@
-"""What the kernel tells of packet sockets when it is asked by netlink: memberships and rings, which nothing else tells.
+"""Read memberships and rings of packet sockets by netlink, the only interface that reports them.
 
 Source: sock_diag(7), linux/packet_diag.h.
 """

@@ -1,10 +1,11 @@
-"""TCP connections that are kept silent: the kernel drops whatever comes for them and whatever they would send.
+"""Silence TCP connections: the kernel drops all packets to and from them.
 
-While a connection moves, nobody may answer in its place: not a kernel that has no such socket any more (it would reset the
-peer's), nor one whose program was ended with the connection open. The peer hears nothing and sends again, as after a lost packet.
+While a connection moves, no machine may answer in its place: neither a kernel that has no such socket any more (it would reset
+the peer's), nor one whose program was ended with the connection open. The peer receives nothing and sends again, as after a lost
+packet.
 
-Each connection has a table of its own in nf_tables, named by its two ends, so that whoever takes the connection up finds it,
-whichever process that is. It ceases to have an effect by itself after `SILENCE_S`, and is cleared away by the next one.
+Each connection has a table of its own in nf_tables, named by its two ends, so that any process that takes the connection over
+finds it. The table ceases to have an effect by itself after `SILENCE_S`, and the next one removes it.
 
 Source: linux/netfilter/nf_tables.h, linux/netfilter/nfnetlink.h; nf_tables_newrule() in net/netfilter/nf_tables_api.c.
 """

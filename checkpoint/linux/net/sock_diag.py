@@ -1,4 +1,4 @@
-"""Asking the kernel about sockets by netlink, and its answers. Source: sock_diag(7), netlink(7), rtnetlink(7)."""
+"""Query the kernel about sockets by netlink, and decode its answers. Source: sock_diag(7), netlink(7), rtnetlink(7)."""
 
 from __future__ import annotations
 

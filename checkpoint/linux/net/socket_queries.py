@@ -1,7 +1,7 @@
-"""Everything that is asked about one socket as one table of system calls, and its answers as bytes that can be compared.
+"""Query everything about one socket by one table of system calls, with answers as bytes that can be compared.
 
-Nothing of an answer is understood here: the same bytes mean what they meant before. They come in two parts, for a program sets
-one by itself, and the other changes with what comes from outside.
+This module does not decode an answer: the same bytes mean the same state as before. The answers come in two parts, because only
+the program sets one part, and the other changes with what comes from outside.
 
 Source: getsockopt(2), poll(2), tcp(7), udp(7), unix(7).
 """

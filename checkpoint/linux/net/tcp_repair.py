@@ -1,6 +1,6 @@
-"""A TCP connection as values, and a connection made of such values: the kernel's TCP_REPAIR.
+"""Read a TCP connection as values, and make a connection from such values, by the kernel's TCP_REPAIR.
 
-Whoever looks must see to it that nothing comes for the connection meanwhile (`checkpoint.linux.net.packet_drop`).
+The reader must make sure that no packet arrives for the connection meanwhile (`checkpoint.linux.net.packet_drop`).
 
 Source: tcp(7); do_tcp_setsockopt() and tcp_sendmsg_locked() in net/ipv4/tcp.c; linux/tcp.h.
 """

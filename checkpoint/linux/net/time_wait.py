@@ -1,5 +1,7 @@
-"""What the kernel keeps of a TCP connection after its end, which bars the same one from being made: for a minute (TIME_WAIT), or
-while the peer does not answer, as one that is silent (`checkpoint.linux.net.packet_drop`).
+"""Remove kernel state of ended TCP connections that prevents a connection between the same addresses from being made.
+
+The kernel keeps this state for a minute (TIME_WAIT), or as long as the peer does not answer, for example because the connection
+is silent (`checkpoint.linux.net.packet_drop`).
 
 Source: sock_diag(7), linux/inet_diag.h; tcp_diag_destroy() in net/ipv4/tcp_diag.c.
 """

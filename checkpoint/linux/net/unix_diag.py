@@ -1,4 +1,4 @@
-"""What the kernel tells of unix sockets when it is asked by netlink: their peers above all, which nothing else tells.
+"""Read the state of unix sockets by netlink: above all their peers, which no other interface reports.
 
 Source: sock_diag(7), linux/unix_diag.h.
 """

@@ -1,1 +1,1 @@
-"""What /proc says of processes, threads, descriptors, mappings and mounts."""
+"""Read /proc: processes, threads, descriptors, mappings and mounts."""

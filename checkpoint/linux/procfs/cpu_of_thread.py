@@ -1,4 +1,4 @@
-"""On which processor a thread runs, or is to run as soon as it may: on ours it waits for us to sleep, if we have precedence.
+"""Find the processor on which a thread runs or will run: on ours it waits until we sleep, if we have real-time priority.
 
 Source: proc_pid_stat(5), field 39.
 """

@@ -1,9 +1,10 @@
-"""The processes of a component: the first one, its children, theirs, and those whose parent has ended.
+"""Find the processes of a component: the first one, its children, their children, and processes whose parent has ended.
 
-Who has lost its parent is given to the nearest ancestor that asks for such (a *reaper*). That of a component in PIDs of its own,
-or under a guard, has no other children. Elsewhere a *stray* is told from the children of others by its session or process group,
-where one of the component leads it, and no ancestor is in it: programs that somebody else has started together stay apart. Where
-the leader of its session has ended, too, it is told by a standard stream that it has from the first process, and no ancestor has.
+A process that has lost its parent is given to the nearest ancestor that asks for orphans (a *reaper*). The reaper of a component
+with a PID namespace of its own, or under a guard, has no other children. Elsewhere a *stray* process is told from the children of
+other programs by its session or process group, where a process of the component leads it, and no ancestor is in it: programs that
+another process has started together stay apart. Where the leader of its session has ended, too, the stray is recognised by a
+standard stream that it has from the first process, and that no ancestor has.
 
 Source: proc_pid_task(5) (children), credentials(7), pid_namespaces(7), kcmp(2); PR_SET_CHILD_SUBREAPER of prctl(2).
 """

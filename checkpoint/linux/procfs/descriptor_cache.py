@@ -1,6 +1,6 @@
-"""Descriptors of a process that is looked at again and again: the kernel is asked the same of all, in one go.
+"""Cache the descriptors of a process across captures: one batch asks the kernel the same questions about all of them.
 
-What it answers as it did at the last look means what it meant then, and is not understood anew.
+An answer that is the same as at the last capture means the same as then, and is not decoded again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a process has open, as /proc tells it. Source: proc_pid_fd(5), proc_pid_fdinfo(5)."""
+"""Read all open descriptors of a process from /proc. Source: proc_pid_fd(5), proc_pid_fdinfo(5)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""The thread by whose id a process is looked at: its first one, or, where that has ended, another that speaks for it.
+"""Find the thread by whose id a process is inspected: its first one, or a live one where the first one has ended.
 
-A first thread that ends before the others (pthread_exit in main) stays as a zombie that keeps the process's id. It has no
-memory, maps or descriptors any more, cannot be traced, and nothing can be asked of it. But whatever /proc and the kernel's calls
-tell of a process they tell by the id of any of its threads; only the list of /proc does not name those. So who looks at a
-process takes the id of its spokesman, and what others call the process stays its own
+A first thread that ends before the others (pthread_exit in main) stays as a zombie that keeps the process's id. It has no memory,
+maps or descriptors any more, no tracer can trace it, and it can answer no question. But the facts that /proc and the kernel's
+calls report of a process they report by the id of any of its threads; only the list of /proc does not name those. So an
+inspection uses the id of a live thread (its spokesman), and the id that other processes use stays the same
 (`checkpoint.linux.procfs.procfs.Status.tgid`).
 
 Source: proc_pid(5), pid_namespaces(7); proc_pid_lookup() in fs/proc/base.c; PIDFD_THREAD of pidfd_open(2), since Linux 6.9.

@@ -1,5 +1,6 @@
-"""The mappings of one process, read again and again: as a text while it runs, and while it stands still only asked whether they
-are still the same, which takes a third of the time.
+"""Read the mappings of one process repeatedly: as text while it runs, and by a comparison while it is frozen.
+
+During a freeze the reader only asks whether the mappings are still the same, which takes a third of the time.
 
 Source: proc_pid_maps(5); PROCMAP_QUERY, linux/fs.h (Linux 6.11).
 """

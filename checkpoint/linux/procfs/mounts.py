@@ -1,4 +1,4 @@
-"""Which file system a path lies on, as a process sees it. Source: proc_pid_mountinfo(5)."""
+"""Find the file system of a path, as a process sees it. Source: proc_pid_mountinfo(5)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What /proc says about one process: read once, parsed into frozen values.
+"""Read /proc of one process: each file once, parsed into frozen values.
 
-Every reader raises `ProcessGoneError` when the process has ended and `ProbeError` when we may not look.
+Every reader raises `ProcessGoneError` when the process has ended and `ProbeError` when we have no permission to read.
 
 Source: proc(5) and the pages it is split into (proc_pid_maps(5), proc_pid_status(5) …).
 """

@@ -1,4 +1,4 @@
-"""The threads of a process as /proc lists them."""
+"""List the threads of a process from /proc."""
 
 from __future__ import annotations
 

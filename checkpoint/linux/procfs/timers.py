@@ -1,4 +1,4 @@
-"""The timers of timer_create(2) that a process has, as /proc tells them."""
+"""Read the timers of a process (timer_create(2)) from /proc."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What the kernel says of each mapping besides /proc/PID/maps: its two-letter codes (VmFlags), and some that we make alike.
+"""Read the flags of each mapping beyond /proc/PID/maps: the kernel's two-letter codes (VmFlags), and codes of our own.
 
 Ours: ``k1`` to ``kf`` for the protection key that the program chose (pkeys(7)), ``gb`` for huge pages of 1 GiB. Reading smaps
-walks over all pages of a process: never while it stands still.
+walks over all pages of a process, so it must never happen during a freeze.
 
 Source: proc_pid_smaps(5).
 """

@@ -1,1 +1,1 @@
-"""How a process of ours is born: vessel, namespaces, inherited limits, filters, vdso."""
+"""Create processes: vessel, namespaces, inherited limits, filters, vdso."""

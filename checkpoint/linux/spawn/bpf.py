@@ -1,6 +1,6 @@
-"""Classic BPF as seccomp(2) takes it: which verdicts a filter may give, and whether it lets a call through.
+"""Analyse classic BPF filters of seccomp(2): the verdicts that a filter may give, and whether it allows a call.
 
-Source: linux/filter.h, linux/bpf_common.h; seccomp_check_filter() in kernel/seccomp.c, which says what instructions there may be.
+Source: linux/filter.h, linux/bpf_common.h; seccomp_check_filter() in kernel/seccomp.c, which defines the allowed instructions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What this processor says of itself, asked by an instruction of our own (CPUID), for /proc/cpuinfo does not tell it.
+"""Query the processor by an instruction of our own (CPUID), for facts that /proc/cpuinfo does not show.
 
 Source: Intel SDM volume 2, CPUID; mmap(2).
 """

@@ -1,8 +1,8 @@
-"""Show a program files of its own that this machine lacks, where it expects them: in memory, in its own mounts, to nobody else.
+"""Show a program its missing files at their expected paths: in memory, in its own mounts, invisible to other programs.
 
-Called in a child between its birth and its execve. The one thing that others see of it is an empty directory, made with the
-rights of the program's user, over which the files are mounted. Everything but the mount itself is done with those rights: a
-user who puts a link in the way finds nothing written that he could not have written himself.
+A child calls this module between its creation and its execve. Other programs see only an empty directory, which is made with the
+rights of the program's user and over which the files are mounted. Everything but the mount itself is done with those rights: a
+user who puts a link in the way can cause no write that he could not make himself.
 
 Source: mount(2), tmpfs(5), seteuid(2), setgroups(2).
 """

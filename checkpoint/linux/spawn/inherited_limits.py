@@ -1,6 +1,6 @@
-"""What a program inherits from the process that starts it, taken on by a child of another one just before its execve.
+"""Give a child the rights, limits and priorities of the process that asked for it, just before its execve.
 
-A program that a service starts for somebody must not get the service's rights, limits and priorities, but those of whoever asked.
+A program that a service starts on request must not get the service's rights, limits and priorities, but those of the requester.
 
 Sources: execve(2), credentials(7), capabilities(7), setrlimit(2), sched(7), ioprio_set(2), proc_pid_oom_score_adj(5).
 """

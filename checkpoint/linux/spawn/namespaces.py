@@ -1,6 +1,6 @@
-"""Namespaces of its own for one program: PIDs, clocks, mounts; inside a user namespace where we have no rights.
+"""Create namespaces for one program: PIDs, clocks, mounts; inside a user namespace where we have no rights.
 
-Everything here is called in a short-lived child between its birth and the program's, never in a process that lives on.
+Only a short-lived child calls these functions, before the program is started; never a process that lives on.
 
 Sources: namespaces(7), user_namespaces(7), pid_namespaces(7), time_namespaces(7), clone(2), capabilities(7).
 """

@@ -1,4 +1,4 @@
-"""The code that the kernel lends every program (vdso(7)): which functions an image of it has, and where.
+"""Parse an image of the vdso(7), the code that the kernel maps into every program: its functions and their places.
 
 Source: elf(5), vdso(7).
 """

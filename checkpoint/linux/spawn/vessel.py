@@ -1,7 +1,8 @@
-"""Give birth to a process that is still to become a program: a *vessel* for a restore, or a program started afresh.
+"""Create a process that becomes a program: a *vessel* for a restore, or a program that is started afresh.
 
 A vessel runs a few bytes of our own that wait for ever; `checkpoint.engines.ptrace.restore.restore` turns it into the program.
-Used by the guard and by the keeper; needs no ptrace. The caller has one thread, which must not wait for "any child" meanwhile.
+The guard and the keeper use this module; it needs no ptrace. The caller has one thread, which must not wait for "any child"
+meanwhile.
 
 ::
 
@@ -14,7 +15,8 @@ The caller reaps the vessel first, then the first process (``Born.init_pid``), w
 Races, in the order of their steps:
 
 1. The caller dies before the child has asked for PR_SET_PDEATHSIG: the child writes to the report pipe afterwards; EPIPE ends it.
-2. The midwife or the vessel dies before the first process knows whom to watch: its pipe says end of file, and it ends.
+2. The midwife or the vessel dies before the first process knows which process to watch: its pipe reports end of file, and it
+   ends.
 3. The caller dies later: PR_SET_PDEATHSIG ends the vessel, and the first process watches the vessel. A restore that is complete
    takes PR_SET_PDEATHSIG back (it sets the program's own).
 """

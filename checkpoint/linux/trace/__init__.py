@@ -1,1 +1,1 @@
-"""ptrace(2): one thread, all threads of a process, calls that another process makes for us."""
+"""Control of other processes by ptrace(2): one thread, all threads of a process, remote system calls."""

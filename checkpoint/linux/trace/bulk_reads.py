@@ -1,8 +1,8 @@
-"""What the kernel tells of threads that stand still: of many in one go, kept as bytes until somebody has the time to read them.
+"""Read kernel facts about many frozen threads at once, as bytes that are decoded later.
 
-What the table of calls cannot bring (pending signals, more processors than it has room for) is asked once more, singly; so
-is what failed, and that says why. All that is asked while they stand still; what the answers mean is read when somebody wants
-to know, for most of it when they run again.
+Facts that the table of calls cannot read (pending signals, more processors than it has space for) are asked once more, one by
+one. So are questions that failed, and the second answer says why. All questions are asked while the threads are frozen. The
+answers are decoded when a caller needs them, most of them after the threads have resumed.
 
 Source: ptrace(2), seccomp_get_filter() in kernel/seccomp.c, get_robust_list(2), sched_getaffinity(2), proc_pid_stat(5).
 """

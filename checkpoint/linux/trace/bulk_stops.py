@@ -1,7 +1,7 @@
-"""Many threads of one process seized, asked to stop, looked for and let go, each step in one go.
+"""Seize many threads of one process, ask them to stop, check that they did, and release them, each step at once for all.
 
-Only what goes as it should is done here. Whatever does not is left to whoever does the same with one thread after the other
-(`checkpoint.linux.trace.threads`, which tells the races), and says why.
+This module handles only the normal case. It leaves all other cases to the code that does the same with one thread after the other
+(`checkpoint.linux.trace.threads`, which lists the races); that code says why a step failed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Many system calls inside a vessel for the price of one stop: a table of calls, each with the results that it may have.
+"""Run many system calls inside a vessel for the price of one stop: a table of calls, each with its allowed results.
 
-The area that holds loop, table and strings lies in a hole of both address spaces (the vessel's and the program's), so that it
-outlives everything that the calls map and unmap.
+The area for the loop, the table and the strings lies in a hole of both address spaces (the vessel's and the program's), so that
+it outlives everything that the calls map and unmap.
 """
 
 from __future__ import annotations

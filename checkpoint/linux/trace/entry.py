@@ -1,8 +1,8 @@
-"""The first entry into a stopped tracee: where our pages come to lie, and what an earlier tracer has left.
+"""Enter a stopped tracee for the first time: place our borrowed pages, and deal with those of an earlier tracer.
 
-The first entry has no page yet: a stub of constants at the end of the vdso's last page (writing there makes the page private to
-the process) maps the pages and opens a userfaultfd, keeping both results in registers. What was there is put back afterwards:
-zeros, or, where these are too few, also the names and headers of the image's sections, which no program reads.
+The first entry has no page yet. A stub of constants at the end of the vdso's last page (writing there makes the page private to
+the process) maps the pages and opens a userfaultfd, and keeps both results in registers. The entry puts the earlier content back
+afterwards: zeros, or, where these are too few, also the names and headers of the image's sections, which no program reads.
 
 Source: vdso(7), userfaultfd(2), pidfd_getfd(2).
 """

@@ -1,14 +1,15 @@
-"""The call that a stop has just ended with EINTR, where the registers do not say which that was (`FORGETS_CALLS` of a processor).
+"""Find the call that a stop has just ended with EINTR, where the registers do not show it (`FORGETS_CALLS` of a processor).
 
-There the result has taken the place of the first argument, and the kernel tells no number of a call any more. But it still knows
-the argument: it tells that of whatever call it is told the thread stands in. So for a moment it is told the number that the
-program has called by, which is in a register still.
+On such a processor the result has replaced the first argument, and the kernel does not report the number of the call any more.
+But the kernel still knows the argument, and reports it for any call number that the tracer sets for the thread. So for a moment
+the tracer sets the number by which the program made the call; this number is still in a register.
 
-Newer kernels (6.12.117, not 6.12.95) tell the result there instead. So each thread is looked at just before it is stopped, too:
-who waits in a call then, and has come out of the very same one, stack and all other arguments alike, was in that.
+Newer kernels (6.12.117, not 6.12.95) report the result there instead. So the tracer also reads the state of each thread just
+before it stops the thread. A thread was in a call if it was waiting in that call then, and has come out of the same call, with
+the same stack and all other arguments.
 
-What looks alike and is not: a thread that has just come back from the handler of a signal which had ended the call. It is known
-by the argument, which is that of the return from a handler, and hardly ever fits the call.
+One case looks alike and is not: a thread that has just returned from the handler of a signal that had ended the call. The
+argument shows this case: it is that of the return from a handler, and hardly ever fits the call.
 
 Source: syscall_get_arguments() in asm/syscall.h and system_call_set() in ptrace.c of arch/arm64; proc_pid_syscall(5).
 """

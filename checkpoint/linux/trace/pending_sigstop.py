@@ -1,9 +1,10 @@
-"""SIGSTOP that waits for a program that is stopped already: taken away, for whoever is to make a call inside would stop by it.
+"""Remove a pending SIGSTOP from a stopped program, because it would stop a thread that makes a call for us.
 
-It can do nothing any more: a stopped program takes no signal, and SIGCONT forgets every SIGSTOP that waits. It cannot be blocked
-either, as all other signals are while the program makes calls for us. The program is stopped before and afterwards.
+The pending SIGSTOP has no effect any more: a stopped program takes no signal, and SIGCONT drops every pending SIGSTOP. It cannot
+be blocked either, as all other signals are while the program makes calls for us. The program is stopped before and afterwards.
 
-A race: SIGCONT comes when we have seen that one waits. Then it stops for us once more, before anything of its own (TRAP_NOTIFY).
+A race: SIGCONT comes after the tracer has seen a pending SIGSTOP. Then the program stops for the tracer once more, before it runs
+any instruction of its own (TRAP_NOTIFY).
 
 Source: signal(7); prepare_signal(), get_signal() in kernel/signal.c.
 """

@@ -1,27 +1,27 @@
-"""System calls made inside a stopped tracee, by one batch of straight-line code in a few pages that we borrow there.
+"""Make system calls inside a stopped tracee, by one batch of straight-line code in a few borrowed pages.
 
-The pages: ``CODE_SIZE`` bytes r-x, then ``TABLE_SIZE`` bytes rw-. They lie in the middle of the largest hole, are never
-given to a child (MADV_DONTFORK), belong to no snapshot, and stay between captures. In each of both a large *desk* comes first,
-for the batch of the first thread, then `DESK_COUNT` small ones, at which other threads answer all at the same time.
+The pages: ``CODE_SIZE`` bytes r-x, then ``TABLE_SIZE`` bytes rw-. They lie in the middle of the largest hole, are never given to
+a child (MADV_DONTFORK), belong to no snapshot, and stay between captures. Each of the two areas begins with a large call area
+(*desk*) for the batch of the first thread. `DESK_COUNT` small desks follow, at which other threads answer all at the same time.
 
 A batch, and why a SIGKILL of the tracer at any instant leaves the program unharmed (each step is a test):
 
-1. The thread stands; its registers and mask are known. Code and table are written: registers to give back, mask, state ARMED.
+1. The thread is stopped; its registers and mask are known. Code and table are written: registers to give back, mask, state ARMED.
    *Killed here:* nothing leads to the code.
-2. Registers: the instruction pointer leads to the code, and no system call is pending. *Killed here:* the batch runs, gives
-   the mask and registers back by itself, and jumps to where the program stood.
-3. Mask: every signal blocked, so that no handler runs with its return address in a page that a snapshot does not hold.
-   *Killed here:* as before; the batch's last call sets the program's mask.
-4. The thread runs the batch, says done and waits (rt_sigtimedwait of no signal; it leaves a restart block alone): 100 ms at
-   most, of a program that somebody has stopped 10 s (`patience_ns`).
-5. The tracer stops it there: mask back, then registers back, as they were at the first stop, orig_rax and all, so that the
-   kernel itself restarts or ends the interrupted call as signals then demand. *Killed between or before:* the wait ends and
-   the batch goes on as in 2. A signal that comes just then may run its handler on top of the batch; such pages are marked
-   ARMED, and a later tracer leaves them to the program as ordinary memory.
-6. *Late* (a busy machine, a tracer that was stopped): the wait ends as well, and the program makes steps of its own. Giving it
-   the registers of the first stop would make it repeat them: it keeps its own, and the look has failed.
+2. Registers: the instruction pointer leads to the code, and no system call is pending. *Killed here:* the batch runs, gives the
+   mask and registers back by itself, and jumps to where the program was.
+3. Mask: every signal blocked, so that no handler runs with its return address in a page that a snapshot does not hold. *Killed
+   here:* as before; the batch's last call sets the program's mask.
+4. The thread runs the batch, says done and waits (rt_sigtimedwait of no signal; it leaves a restart block alone): 100 ms at most,
+   or 10 s in a program that a signal has stopped (`patience_ns`).
+5. The tracer stops it there: mask back, then registers back, as they were at the first stop, orig_rax and all, so that the kernel
+   itself restarts or ends the interrupted call as signals then demand. *Killed between or before:* the wait ends and the batch
+   continues as in 2. A signal that comes just then may run its handler on top of the batch; such pages are marked ARMED, and a
+   later tracer leaves them to the program as ordinary memory.
+6. *Late* (a busy machine, a tracer that was stopped): the wait ends as well, and the program makes steps of its own. If it got
+   the registers of the first stop, it would repeat those steps: it keeps its own registers, and the query has failed.
 
-How the pages get there at first, and what is done with those of an earlier tracer: `checkpoint.linux.trace.entry`.
+How the pages get there at first, and how a tracer deals with those of an earlier one: `checkpoint.linux.trace.entry`.
 
 No instruction changes a flag or touches the stack. Source: signal(7), ptrace(2), vdso(7); kernel/signal.c, get_signal().
 """

@@ -1,11 +1,12 @@
-"""Calls that the kernel goes on with from what it remembers, where a stop shows nothing of it (`FORGETS_CALLS` of a processor).
+"""Handle calls that the kernel continues from its restart block, if a stop hides them (`FORGETS_CALLS` of a processor).
 
-A thread that was stopped in a relative sleep is about to make the same call there, and only when it runs again does the kernel
-put restart_syscall(2) in its place. Led away meanwhile it would sleep for its whole time once more. So it is brought to where the
-call begins, which shows which one that is; the call is not made, and the thread stands where it stood, about to make that one.
+On such a processor, a thread that was stopped in a relative sleep is about to make the same call. Only when it runs again does
+the kernel put restart_syscall(2) in its place. If a tracer led it away meanwhile, it would sleep for its whole time once more. So
+the tracer brings it to the point where the call begins, which shows which call it is. The call is not made, and the thread is
+again at the point where it is about to make it.
 
-All its signals are blocked on the way: one that came would run its handler before the call. *Killed meanwhile:* the thread goes
-on with every signal blocked; some ten µs, once for each sleep that is looked at, and only then.
+All its signals are blocked on the way, because a signal would run its handler before the call. *Killed meanwhile:* the thread
+continues with every signal blocked. This window is some ten µs, once for each sleep that is inspected, and only then.
 
 Source: do_signal() in arch/arm64/kernel/signal.c; el0_svc_common() in syscall.c: no call is made where its number is -1 by then.
 """

@@ -1,8 +1,9 @@
-"""Programs that have confined themselves by seccomp(2): what a tracer sees of that, and whether it may make calls inside.
+"""Inspect and suspend the seccomp(2) filters of a program, and decide whether a tracer may make calls inside it.
 
-A filter judges the calls that we have a thread make like its own, and kills for them. A tracer with CAP_SYS_ADMIN may suspend
-it for as long as it holds the thread (`Tracee.suspend_filters`). That is asked for when the thread stands still already, and
-ends with the letting go: it never runs a call of its own unjudged.
+A filter judges the calls that a thread makes for the tracer like the thread's own, and kills for them. A tracer with
+CAP_SYS_ADMIN may suspend the filter for as long as it holds the thread (`Tracee.suspend_filters`). The tracer asks for that when
+the thread is already stopped, and the suspension ends when the tracer releases the thread: the filter judges every call of the
+thread's own.
 
 Source: seccomp(2); ptrace(2), PTRACE_O_SUSPEND_SECCOMP, PTRACE_SECCOMP_GET_FILTER; check_ptrace_options() in kernel/ptrace.c,
 seccomp_get_filter() in kernel/seccomp.c.

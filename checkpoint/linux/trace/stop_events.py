@@ -1,11 +1,10 @@
-"""Reports of stops, kept for whoever waits for one: it sleeps, and is woken when a thread of a program has stopped for us.
+"""Sleep until a traced thread stops: keep the signals that report stops for the thread that waits for one.
 
-Looking again and again is not enough. Whoever has precedence (`checkpoint.linux.realtime_boost`) keeps the processor while it
-looks, and the thread that is to stop may be waiting for just that processor; and a sleep for a set time is too long most of the
-time.
+Polling is not enough. A thread with real-time priority (`checkpoint.linux.realtime_boost`) keeps the processor while it polls,
+and the thread that is to stop may be waiting for that processor. A sleep of a fixed time is too long most of the time.
 
-The signal that tells of a stop is one for many, and another thread of ours may take it. A stop of which none has told is found
-by looking again, so all that is lost then is a little time.
+One signal reports many stops, and another thread of ours may take it. Polling finds a stop that no signal has reported, so such a
+case costs only a little time.
 
 Source: do_notify_parent_cldstop() and complete_signal() in kernel/signal.c.
 """

@@ -1,18 +1,18 @@
-"""Letting a thread go inside the call that it stood in, where registers alone do not say that it stands in one.
+"""Release a thread inside the system call in which it was stopped, where registers alone do not show the call.
 
-Where a stop inside a call shows a thread that is about to make it (`FORGETS_CALLS` of a processor), the kernel knows during that
-stop which call it was, and ends it with EINTR if a handler runs. That is forgotten when the thread has been led away and given
-its registers back, and of a restored one it was never known: a signal that is there by then would run its handler before the
-call, which would wait for it for ever afterwards. So such a thread is brought to where the call begins, and let go there: the
-call begins with the signal pending, and the kernel decides again.
+On a processor where a stop inside a call shows a thread that is about to make it (`FORGETS_CALLS`), the kernel knows during that
+stop which call it was, and ends it with EINTR if a handler runs. The kernel forgets this when the tracer has led the thread away
+and given its registers back, and it never knew it of a restored thread. A signal that is pending by then would run its handler
+before the call, and the call would wait for the signal for ever afterwards. So the tracer brings such a thread to the point where
+the call begins, and releases it there: the call begins with the signal pending, and the kernel decides again.
 
-A signal that comes on the way shows itself by a stop of its own. It is put back into its queue, which the kernel does when it is
-blocked by then. *Killed between that and the call:* the thread goes on with every signal blocked; some ten µs, and only then.
+A signal that comes on the way shows itself by a stop of its own. The kernel puts it back into its queue if it is blocked by then.
+*Killed between that and the call:* the thread continues with every signal blocked. This window is some ten µs, and only then.
 
-Whoever is let go where a call begins starts it as if a signal had come. The kernel makes most calls again by itself then; those
-of `ENDED_BY_A_STOP` would end with EINTR, and it goes on with a sleep by restart_syscall(2), which a filter may forbid. Such a
-one is not begun: the thread is brought to its end, with what says that it is to be made again unless a handler runs. Nothing
-but the kernel looks at that.
+A thread that is released where a call begins starts the call as if a signal had come. Then the kernel makes most calls again by
+itself. The calls of `ENDED_BY_A_STOP` would end with EINTR, and the kernel continues a sleep by restart_syscall(2), which a
+filter may forbid. Such a call is not begun: the tracer brings the thread to the end of the call, with a result that says that the
+call is to be made again unless a handler runs. Only the kernel reads that result.
 
 Source: ptrace(2), "Syscall-stops"; kernel/ptrace.c, __ptrace_unlink(); kernel/signal.c, ptrace_signal();
 arch/arm64/kernel/signal.c, do_signal(), and syscall.c, el0_svc_common(): no call is made where its number is -1 by then.

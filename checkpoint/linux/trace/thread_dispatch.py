@@ -1,7 +1,7 @@
-"""Threads sent to the desks of the borrowed pages and fetched from there in one go: steps 2 to 5 of
-`checkpoint.linux.trace.remote_syscalls`.
+"""Send many threads to the desks of the borrowed pages and fetch them back at once.
 
-Whatever does not go as it should is left to whoever does the same with one thread after the other, and says why.
+These are steps 2 to 5 of `checkpoint.linux.trace.remote_syscalls`. This module handles only the normal case. It leaves all other
+cases to the code that does the same with one thread after the other; that code says why a step failed.
 """
 
 from __future__ import annotations

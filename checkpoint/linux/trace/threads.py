@@ -1,20 +1,20 @@
-"""All threads of one process, stopped and let go together.
+"""Stop all threads of one process and release them together.
 
 How none is missed, and none left behind (each step is a race):
 
 1. The listing of /proc/PID/task is older than the seizing: a thread that has ended meanwhile is passed over.
-2. A thread that is seized but still runs gives birth to another: the newborn stands in /proc/PID/task before its mother can
-   stop (copy_process in kernel/fork.c looks for signals before it adds it). So the threads are counted again, and listed, until
-   everybody who is counted stands still; only who runs can give birth.
-3. A thread ends between seizing and stopping: as its tracer we are told, and must take note, or its process could never end.
-4. A thread waits inside the kernel (a disk, a network file system, vfork) and does not stop: everybody else is let go, and it as
-   soon as it stops, which SIGCHLD tells us.
-5. The process is killed while it stands: each thread ends for its tracer first, as in 3.
-6. We die: the kernel lets everybody go.
-7. A thread executes another program while we seize: it waits for our taking note of the others' ends, and we wait for it
-   (`checkpoint.linux.child_reaper`).
-8. A thread that we have seized executes another program: we trace it still, under its process's id, and its own is gone. It runs
-   on unless it has been asked to stop, or is asked once more; what was asked of the first thread, which had that id, is void.
+2. A thread that is seized but still runs creates another: the new one is in /proc/PID/task before its creator can stop
+   (copy_process in kernel/fork.c looks for signals before it adds it). So the threads are counted again, and listed, until every
+   counted thread is stopped; only a running thread can create one.
+3. A thread ends between seizing and stopping: the kernel notifies its tracer, which must reap it, or its process could never end.
+4. A thread waits inside the kernel (a disk, a network file system, vfork) and does not stop: all others are released, and this
+   one as soon as it stops, which SIGCHLD reports.
+5. The process is killed while it is stopped: each thread ends for its tracer first, as in 3.
+6. The tracer dies: the kernel releases all threads.
+7. A thread executes another program during the seizing: it waits until the tracer has reaped the others, and the tracer waits for
+   it (`checkpoint.linux.child_reaper`).
+8. A seized thread executes another program: it is still traced, under its process's id, and its own id is gone. It runs on unless
+   it has been asked to stop, or is asked once more. Requests to the first thread, which had that id, are void.
 
 Source: ptrace(2), "Attaching and detaching", "Death under ptrace"; proc_pid_task(5).
 """

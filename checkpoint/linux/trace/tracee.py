@@ -1,7 +1,7 @@
-"""One traced thread: stopped, looked at, changed, let go. The only door to python-ptrace.
+"""One traced thread: stop, inspect, change, release. The only module that uses python-ptrace.
 
-Every call on one `Tracee` must come from the thread that seized it: the kernel knows tracers by thread. A tracer that
-dies lets go of everything; a thread that was only stopped runs on.
+Every call on one `Tracee` must come from the thread that seized it: the kernel knows tracers by thread. A tracer that dies
+releases everything; a thread that was only stopped runs on.
 
 Source: ptrace(2).
 """

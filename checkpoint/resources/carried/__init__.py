@@ -1,1 +1,1 @@
-"""Files that travel with a program (rule ``carry``): captured, laid down at the other robot, their owners and modes."""
+"""Files that travel with a program (rule ``carry``): capture them, restore them on the other robot, set owners and modes."""

@@ -1,8 +1,8 @@
-"""Owner, mode, attributes and time of a carried file: given to what was opened, for a name can come to lead elsewhere meanwhile.
+"""Set owner, mode, attributes and time of a carried file through an open descriptor, because its name may change meanwhile.
 
-A program of root's may carry what lies below a folder of somebody else, who can put a link in the place of anything there at any
-moment. So each component is opened by itself and no link is followed (O_PATH, O_NOFOLLOW: nothing is read, and no device or pipe
-minds). What stands open is then changed through /proc/self/fd, which leads to that very file (proc_pid_fd(5)).
+A program of root may carry files below a folder of another user, who can replace anything there by a link at any moment. So each
+component of a path is opened by itself and no link is followed (O_PATH, O_NOFOLLOW: nothing is read, and opening affects no
+device or pipe). The open file is then changed through /proc/self/fd, which leads to exactly that file (proc_pid_fd(5)).
 """
 
 from __future__ import annotations

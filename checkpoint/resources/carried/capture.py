@@ -1,15 +1,15 @@
-"""Carried files (rule ``carry``) on the side that captures: what stands below the carried paths, and which pages of it changed.
+"""Capture carried files (rule ``carry``): find the files below the carried paths, and which of their pages changed.
 
-One look, while the program stands still::
+One scan, during the freeze::
 
     names, kinds, sizes, times    of everything below each path: 2 to 3 µs a name
-    content                       of the files alone that changed since they were last read: 0.2 to 0.4 ms for each MiB
+    content                       only of files that changed since they were last read: 0.2 to 0.4 ms for each MiB
 
-A file counts as unchanged when device, inode, size and both times are as they were, unless it had been changed so shortly before
-it was read that a later write could have left the times as they were (`GRAIN_NS`), or the process has it mapped: writes to a
-mapping show late, or never, in its times. What is much is read beforehand, while the program runs (`CarriedTrees.prepare`), and
-read again if it changed meanwhile. A copy of all content stays in our memory, so that only changed pages (4 KiB) are sent, and a
-snapshot that nobody acknowledged forgets nothing.
+A file counts as unchanged when device, inode, size and both times are the same. There are two exceptions: it had been changed so
+shortly before it was read that a later write could have left the times the same (`GRAIN_NS`), or the process has it mapped:
+writes to a mapping show late, or never, in its times. Large amounts are read beforehand, while the program runs
+(`CarriedTrees.prepare`), and read again if they changed meanwhile. A copy of all content stays in our memory, so that the capture
+sends only changed pages (4 KiB), and loses nothing if a snapshot is not acknowledged.
 """
 
 from __future__ import annotations

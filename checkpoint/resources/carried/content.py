@@ -1,4 +1,4 @@
-"""What one carried file held when it was read: its pages, and the digest of each."""
+"""The content of one carried file when it was read: its pages, and the digest of each."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Which file a program remembers to have opened: carried files have other numbers (device and inode) where they are laid down.
+"""Update device and inode numbers in the program's memory: carried files have other numbers after a restore.
 
-Some programs look whether a path still leads to the file that they hold, by the numbers that fstat(2) once told: sqlite refuses
-to write to a database that was "moved" (SQLITE_READONLY_DBMOVED). Such numbers stand in memory as the kernel told them, device
-first and inode next to it (struct stat; unixFileId in sqlite's os_unix.c): eight bytes each, aligned. Where both stand side by
-side, for a file that was carried, they are renewed. Small inodes, as on a fresh tmpfs, could be anybody's numbers: they are left
-alone.
+Some programs check whether a path still leads to the file that they hold, by the numbers that fstat(2) once reported: sqlite
+refuses to write to a database that was "moved" (SQLITE_READONLY_DBMOVED). Such numbers are in memory as the kernel reported them,
+device first and inode next to it (struct stat; unixFileId in sqlite's os_unix.c): eight bytes each, aligned. The restore replaces
+both where they are side by side and belong to a carried file. Small inodes, as on a fresh tmpfs, could be any other numbers: the
+restore leaves them unchanged.
 """
 
 from __future__ import annotations

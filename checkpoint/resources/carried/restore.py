@@ -1,15 +1,15 @@
-"""Carried files (rule ``carry``) on the side that restores: laid down as they were at the checkpoint, before the program runs.
+"""Restore carried files (rule ``carry``) as they were at the checkpoint, before the program runs.
 
-1. Everything of every path is built aside, in ``.failover-new-…`` beside the path, from the snapshot alone. Whatever fails until
-   here has changed nothing.
-2. What stands at a path and is not as the checkpoint has it, whosever it is and however new, is kept: it moves as a whole to
-   ``.failover-kept-NAME/TIME-POSITION`` beside the path, and a note says so. The newest `KEPT_COUNT` of those stay.
-   A file that somebody else holds open for writing is never replaced: the restore is refused, by that process's name.
-3. What was built takes its place in the same instant (RENAME_EXCHANGE of renameat2(2)), also for a whole folder. Where that
-   cannot be, because the folder is a mount point or its parent is not writable, each name in it is moved by itself.
-   When one move fails, all of them, of every path, are taken back (`resources.moves`).
+1. The restore builds everything of every path aside, in ``.failover-new-…`` beside the path, from the snapshot alone. A failure
+   up to here has changed nothing.
+2. If the content at a path differs from the checkpoint, it is kept, with any owner and any age: it moves as a whole to
+   ``.failover-kept-NAME/TIME-POSITION`` beside the path, and a note says so. The newest `KEPT_COUNT` of those stay. A file that
+   another process holds open for writing is never replaced: the restore is refused, and names that process.
+3. The new content takes its place in the same instant (RENAME_EXCHANGE of renameat2(2)), also for a whole folder. Where that is
+   impossible, because the folder is a mount point or its parent is not writable, each name in it is moved by itself. When one
+   move fails, all moves, of every path, are taken back (`checkpoint.resources.carried.reversible_moves`).
 
-Nothing is forced to the disk: should the power go, the checkpoint is still in the store and is laid down again.
+The restore does not force anything to the disk: after a power failure the checkpoint is still in the store and is restored again.
 """
 
 from __future__ import annotations

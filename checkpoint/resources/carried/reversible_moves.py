@@ -1,4 +1,4 @@
-"""Moves of files and folders that can be taken back: none of them replaces anything, so none that fails later loses anything."""
+"""Move files and folders reversibly: no move replaces anything, so a later failure loses nothing."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Devices for which the operator has a rule: opened again, or found hung up by the program, which opens them anew itself.
+"""Devices with a rule of the operator: opened again, or shown to the program as hung up, so that it opens them again itself.
 
-A serial line comes back with its settings (termios) and modem lines; what waited in it to be read or sent is lost, as on
-the line. Of other devices nothing is set again that the program has set by ioctl(2).
+A serial line is restored with its settings (termios) and modem lines. Bytes that waited to be read or sent are lost, as on the
+line. For other devices the restore does not repeat settings that the program has made by ioctl(2).
 
-Facts: ``descriptors``; ``path``: as the rule names it; ``opened``: what was open in truth; ``flags`` of open(2); ``action``,
-and ``optional`` of the rule; ``settings``: struct termios2, b"" where it is no line; ``modem``: lines
-of ioctl_tty(2), -1 where it has none; ``exclusive``: TIOCEXCL.
+Facts: ``descriptors``; ``path``: as the rule names it; ``opened``: the file that was really open; ``flags`` of open(2);
+``action``, and ``optional`` of the rule; ``settings``: struct termios2, b"" if the device is no line; ``modem``: lines of
+ioctl_tty(2), -1 where it has none; ``exclusive``: TIOCEXCL.
 
 Source: ioctl_tty(2), termios(3).
 """

@@ -1,4 +1,4 @@
-"""Devices for which there is no rule: refused by what people call them. Terminals that are streams are taken before."""
+"""Refuse devices that have no rule, with their common names. Terminals that are streams are handled before."""
 
 from __future__ import annotations
 

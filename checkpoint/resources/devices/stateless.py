@@ -1,7 +1,7 @@
-"""Devices without a state: the kernel's null, zero, full and random numbers. They are opened again.
+"""Devices without a state: the kernel's null, zero, full and random devices. The restore opens them again.
 
-Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` is always 0; of a device file that was deleted since,
-``deleted`` true, and ``mode``, ``device_number``, ``uid``, ``gid``.
+Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` is always 0; if the device file was deleted since, ``deleted``
+true, and ``mode``, ``device_number``, ``uid``, ``gid``.
 """
 
 from __future__ import annotations

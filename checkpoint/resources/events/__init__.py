@@ -1,1 +1,1 @@
-"""Descriptors that tell of events: epoll, eventfd, inotify, pidfd, signalfd, timerfd; asynchronous I/O."""
+"""Descriptors that report events: epoll, eventfd, inotify, pidfd, signalfd, timerfd; asynchronous I/O."""

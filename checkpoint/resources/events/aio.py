@@ -1,11 +1,11 @@
-"""Rings of asynchronous I/O (io_setup(2)): made again where they lay, under their numbers, with the events that were not read.
+"""Restore rings of asynchronous I/O (io_setup(2)) at their addresses, under their numbers, with their unread events.
 
-A ring is memory that the program shares with the kernel; its address is what the program knows it by. Its pages travel as those
-of other shared memory do; what is told here is how the kernel comes to own them again. It keeps the place of the next event (the
-ring's tail) for itself, too, so that a new ring is driven there by requests that do nothing.
+A ring is memory that the program shares with the kernel; the program knows it by its address. Its pages travel like those of
+other shared memory; this module describes how the kernel becomes their owner again. The kernel also keeps the position of the
+next event (the ring's tail) for itself, so the restore moves a new ring to this position by requests that do nothing.
 
-Of requests that are under way the kernel says nothing. Those of the page cache are done when io_submit(2) returns; direct
-ones (O_DIRECT) are awaited at the block device; a poll (IOCB_CMD_POLL) is lost.
+The kernel reports nothing about pending requests. Requests through the page cache are done when io_submit(2) returns. The capture
+waits for direct ones (O_DIRECT) at the block device. A poll (IOCB_CMD_POLL) is lost.
 
 Source: fs/aio.c: aio_setup_ring(), ioctx_alloc(), aio_ring_mremap(), aio_complete(); io_setup(2), io_submit(2);
 Documentation/ABI/stable/sysfs-block, "inflight".

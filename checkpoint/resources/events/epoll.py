@@ -1,9 +1,9 @@
-"""Epoll instances of epoll(7): made again, with every descriptor that they watch; one may watch another.
+"""Restore epoll instances of epoll(7) with every descriptor that they watch; an instance may watch another.
 
-A registration belongs to an open file and to the number that it had when it was registered, which may by now be closed or lead to
-another one. As long as the program has the open file under any number, the registration comes back under the old one. What
-was reported once (EPOLLET) is reported once more after a restore; what is reported once only (EPOLLONESHOT) and has been
-stays silent, but for errors and hang-ups.
+A registration belongs to an open file and to the number that it had when it was registered. This number may now be closed or lead
+to another file. As long as the program has the open file under any number, the registration is restored under the old one. An
+event that was reported once (EPOLLET) is reported once more after a restore. A registration that reports only once (EPOLLONESHOT)
+and has reported stays silent, except for errors and hang-ups.
 
 Facts: ``descriptors``; ``flags`` of fcntl(2); ``watched``: a list of [number when it was registered, a descriptor that leads to
 the same open file now, events, data].

@@ -1,10 +1,11 @@
-"""Event counters of eventfd(2): made again with their count.
+"""Restore event counters of eventfd(2) with their count.
 
 Facts: ``descriptors``; ``flags`` of fcntl(2); ``count``; ``semaphore``: whether it was made with EFD_SEMAPHORE.
 
-A kernel before Linux 6.5 does not tell the latter. There it is found out while everybody who has the counter stands still: one
-read tells, of a count of at least two, and what it took is given back. Whoever waits for the counter wakes up from that and finds
-it as it was. *Killed in the middle:* the count is another one for good; that is some ten µs of each capture.
+A kernel before Linux 6.5 does not report ``semaphore``. There the capture finds it out while every process that has the counter
+is frozen: one read of a count of at least two shows it, and the capture gives back what the read took. A process that waits for
+the counter wakes up from that and finds it unchanged. *Killed in the middle:* the count is wrong for good; that window is some
+ten µs of each capture.
 
 Source: eventfd_show_fdinfo(), eventfd_read() in fs/eventfd.c; the line eventfd-semaphore is of Linux 6.5.
 """

@@ -1,9 +1,9 @@
-"""Who gets which signal when a descriptor becomes ready: F_SETOWN and F_SETSIG of fcntl(2), kept of every kind of open file.
+"""Signals of descriptors that become ready: F_SETOWN and F_SETSIG of fcntl(2), kept for every kind of open file.
 
 Facts, added to a resource's own: ``signal`` (0 for SIGIO) and ``owner``: 1 if it is the process itself, 2 if its first thread
-alone (F_OWNER_TID), 0 if nobody; in a component of several processes ``owner_pid``, which of them. Whether signals are sent at
-all is one of its ``flags`` (O_ASYNC). Directory notifications (F_NOTIFY) cannot be asked for; but nothing else gives a directory
-an owner, so one that has an owner is refused.
+alone (F_OWNER_TID), 0 if there is none; in a component of several processes ``owner_pid``, which of them. One of its ``flags``
+says whether signals are sent at all (O_ASYNC). Directory notifications (F_NOTIFY) cannot be queried; but nothing else gives a
+directory an owner, so a directory that has an owner is refused.
 
 Source: fcntl_dirnotify() in fs/notify/dnotify/dnotify.c.
 """

@@ -1,13 +1,13 @@
-"""What a program hears of files by inotify(7): its watches, under the numbers that they had, each again on the same path.
+"""Restore the watches of inotify(7) under the numbers that they had, each on the same path.
 
-Events that it has not read yet are not kept: while there are any, nothing is captured; the next capture comes once it has read
-them. Nobody can see them but by taking them (read(2) is the only way in, and the kernel tells no more than how many bytes there
-are). They could be put back only by making them happen, which would touch its files, and be heard by others who watch them; a
-watch of something else under the same number would have to end, which is an event, too (IN_IGNORED). What happens to the files
-between the capture and the restore it does not hear of.
+Events that the program has not read yet are not kept. While there are any, nothing is captured; the next capture waits until the
+program has read them. Another process can see them only by taking them (read(2) is the only way in, and the kernel reports only
+how many bytes there are). A restore could put them back only by making them happen. That would touch the program's files, and
+other watchers would hear it. A watch of another file under the same number would have to end, which is an event, too
+(IN_IGNORED). The program does not hear of events on the files between the capture and the restore.
 
-Facts: ``descriptors``; ``flags`` of fcntl(2); ``watches``: a list of [number, path, mask]; the path of a file without a
-name that the program has open is /proc/self/fd/N.
+Facts: ``descriptors``; ``flags`` of fcntl(2); ``watches``: a list of [number, path, mask]; the path of a file without a name that
+the program has open is /proc/self/fd/N.
 
 Source: inotify_fdinfo() in fs/notify/fdinfo.c; open_by_handle_at(2).
 """

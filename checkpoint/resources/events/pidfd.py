@@ -1,8 +1,9 @@
-"""Processes by descriptor (pidfd_open(2)): one that stands for a process of the program stands for it again.
+"""Restore descriptors of processes (pidfd_open(2)) so that each leads to the same process of the program.
 
-Facts: ``descriptors``; ``flags`` of fcntl(2); ``pid``: of another process of the component, as the program knows it; 0: its own;
-of one that has ended, and was waited for, ``ended`` (see `departed`); of a single thread of the process that holds it ``thread``,
-its id: nobody stands for it before the threads are born, so the process itself does until then.
+Facts: ``descriptors``; ``flags`` of fcntl(2); ``pid``: of another process of the component, as the program knows it; 0: its own.
+For a process that has ended and was waited for, ``ended`` (see `checkpoint.resources.process.exited_processes`). For a single
+thread of the process that holds the descriptor, ``thread``, its id: the thread does not exist before the threads are created, so
+the descriptor leads to the process itself until then.
 
 Source: pidfd_show_fdinfo() in fs/pidfs.c; pidfd_open(2).
 """

@@ -1,4 +1,4 @@
-"""Descriptors that signals are read from, of signalfd(2): made again. What waits in them are the process's pending signals.
+"""Restore descriptors of signalfd(2), from which signals are read. Signals that wait in them are the process's pending signals.
 
 Facts: ``descriptors``; ``flags`` of fcntl(2); ``mask``: the signals, bit 0 is signal 1.
 

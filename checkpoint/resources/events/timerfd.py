@@ -1,11 +1,11 @@
-"""Timers of timerfd_create(2): armed again with what was left, the outage counted, and with the expirations not read yet.
+"""Restore timers of timerfd_create(2) with the rest of their time, minus the outage, and with their unread expirations.
 
-A periodic one goes on in its own rhythm, and counts the expirations that it missed. One that was set to an hour of the day
+A periodic timer keeps its own rhythm, and counts the expirations that it missed. A timer that was set to an hour of the day
 (TFD_TIMER_ABSTIME of the realtime clock) keeps that hour.
 
 Facts: ``descriptors``; ``flags`` of fcntl(2); ``clock``; ``settings``: flags of timerfd_settime(2); ``value_ns``: until its next
-expiration, 0 if disarmed; ``interval_ns``; ``ticks``: expirations that were not read yet; ``asked_ns``: when all this was so,
-by the realtime clock: a moment after the snapshot's clocks were read.
+expiration, 0 if disarmed; ``interval_ns``; ``ticks``: unread expirations; ``asked_ns``: the time of this reading by the realtime
+clock, a moment after the snapshot's clocks were read.
 
 Source: timerfd_show() in fs/timerfd.c; TFD_IOC_SET_TICKS in timerfd_create(2).
 """

@@ -1,1 +1,1 @@
-"""Files that a process has open or mapped: regular and deleted ones, memfd, locks, /proc and /sys, namespaces."""
+"""Files that a process has open or mapped: regular and deleted files, memfd, locks, /proc and /sys, namespaces."""

@@ -1,11 +1,12 @@
-"""Pages of private mappings of files without a name that the program has not written: what is written to the file shows in them.
+"""Unwritten pages of private mappings of files without a name: later writes to the file still show in such pages.
 
-That matters where somebody may still write to the file: it is open, or mapped to be shared as well. All pages of such a mapping
-are carried; this tells which of them are the file's own, so that a restore leaves them to the file that it makes again.
+That matters where a process may still write to the file: the file is open, or also mapped shared. The snapshot carries all pages
+of such a mapping. This resource says which of them are the file's own, so that a restore leaves these pages to the file that it
+makes again.
 
 Facts: ``descriptors`` (none); ``runs``: a list of [start, end], whole pages in address order.
 
-Source: mmap(2), MAP_PRIVATE; what POSIX leaves open, Linux does.
+Source: mmap(2), MAP_PRIVATE; Linux does what POSIX leaves open.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The name that still leads to a file, of a process that has it by one that is gone: the file is the inode, never the name.
+"""Find a name that still leads to a file whose name of opening is gone: the inode is the file, not the name.
 
-The kernel tells of each mapping and each descriptor the name by which it was opened. sem_open(3) makes a file under a temporary
-name, maps it, links it to the real name and unlinks the temporary one: the mapping of the process that made the semaphore looks
-deleted, those of all others do not. What the other processes of the component call the file counts first; then it is looked for
-beside the name that is gone, above that, and where the process works.
+The kernel reports for each mapping and each descriptor the name by which it was opened. sem_open(3) makes a file under a
+temporary name, maps it, links it to the real name and unlinks the temporary one: the mapping of the process that made the
+semaphore looks deleted, the mappings of all others do not. The names that the other processes of the component have for the file
+count first. Then the search looks beside the lost name, above it, and in the working directory of the process.
 
 Source: d_path() in fs/d_path.c; link(2); sem_open() in nptl/sem_open.c of glibc.
 """

@@ -1,11 +1,12 @@
-"""File locks: flock(2), and the two kinds of fcntl(2), and leases, taken again when everything else is open.
+"""Restore file locks: flock(2), the two kinds of fcntl(2), and leases, taken again when everything else is open.
 
-A lock that somebody else has taken meanwhile stops the restore: the program would believe that it has it.
+If another process has taken a lock meanwhile, the restore stops: otherwise the program would believe that it has the lock.
 
-A lease that is just being broken is broken again, without the signal that the program has had: it has another term to give it up.
+A lease that is being broken at the capture is broken again, without the signal, which the program has had: the program gets
+another term to give it up.
 
-Fact, added to a file's own: ``locks``: a list of [kind, 1 if exclusive, first byte, number of bytes (0: to the end)], of a lease
-["LEASE", what it is, what it is to become, 0], in the numbers of fcntl(2), twice the same where nobody breaks it.
+Fact, added to a file's own: ``locks``: a list of [kind, 1 if exclusive, first byte, number of bytes (0: to the end)]; for a lease
+["LEASE", its type, the type that it is to become, 0], in the numbers of fcntl(2), twice the same where it is not being broken.
 
 Source: show_fd_locks() in fs/locks.c; proc_locks(5); F_SETLEASE in fcntl(2).
 """

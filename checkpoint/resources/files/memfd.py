@@ -1,6 +1,6 @@
-"""Memory files of memfd_create(2), with name, content, size and seals; several open files may be of the same one.
+"""Restore memory files of memfd_create(2) with name, content, size and seals; several open files may lead to the same one.
 
-Memory that was mapped shared without a file, and was opened through /proc/self/map_files, comes back as a memory file, too.
+Memory that was mapped shared without a file, and was opened through /proc/self/map_files, is restored as a memory file, too.
 
 Facts: ``descriptors``; ``name``; ``flags`` of open(2); ``offset``, ``size``; ``mode``; ``device`` and ``inode``, which open files
 and mappings of the same one have in common; ``seals`` of F_ADD_SEALS; ``content``: a list of [offset, bytes], with one of its

@@ -1,6 +1,6 @@
-"""Namespaces by descriptor (/proc/self/ns/net …): one in which the program itself lives stands for that of the restored one.
+"""Restore descriptors of the program's own namespaces (/proc/self/ns/net …): each leads to the restored program's namespace.
 
-Facts: ``descriptors``; ``namespace``: its kind, "net" for one.
+Facts: ``descriptors``; ``namespace``: its kind, for example "net".
 
 Source: namespaces(7), "The /proc/pid/ns/ directory"; nsfs in fs/nsfs.c.
 """

@@ -1,8 +1,8 @@
-"""Who else holds a file open for writing: a program never comes back onto a file that another one writes to.
+"""Find other processes that hold a file open for writing: a program is never restored onto a file that another one writes to.
 
-The kernel is asked first: it grants a read lease only on a file that nobody may write to. That takes microseconds whatever the
-number of processes. Only when it refuses, or the file is not ours to lease or its file system has no leases, are the descriptors
-of all processes looked through, for the names.
+The check asks the kernel first: it grants a read lease only on a file that no process may write to. That takes microseconds for
+any number of processes. Only when the kernel refuses, or the file is not ours to lease or its file system has no leases, does the
+check look through the descriptors of all processes, to find their names.
 
 Source: F_SETLEASE in fcntl(2); fdinfo in proc_pid_fdinfo(5).
 """

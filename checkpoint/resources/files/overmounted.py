@@ -1,6 +1,6 @@
-"""Files and directories whose path leads elsewhere by now, for something was mounted over it: opened again by their handle.
+"""Restore files and directories whose path is hidden by a mount: opened again by their handle.
 
-That is the same file of the same file system, so such a program stays on its machine.
+The handle leads to the same file of the same file system, so such a program stays on its machine.
 
 Facts: ``descriptors``; ``path``, by which it was opened; ``mounted``: where its file system is mounted; ``handle``: struct
 file_handle; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``inode`` and ``mtime_ns`` at the capture.

@@ -1,10 +1,11 @@
-"""Files of /proc and /sys: views of the kernel, opened again where they stood. Those of the process itself lead to itself again.
+"""Restore open files of /proc and /sys at their positions. Files of the process itself lead to the restored process.
 
-What is read from them is what the kernel says then. Whatever acts on the machine when it is written to is refused, and so are
-files of other processes.
+They are views of the kernel: a read returns the kernel's present state. Files that act on the machine when they are written to
+are refused, and so are files of other processes.
 
 Facts: ``descriptors``; ``path``, with ``{pid}`` in place of the process's own number, and numbers of others as the program knows
-them; ``flags`` of open(2); ``offset``; of a process that has ended ``ended`` (see `departed`), and ``{ended}`` for its number.
+them; ``flags`` of open(2); ``offset``; for a process that has ended ``ended`` (see
+`checkpoint.resources.process.exited_processes`), and ``{ended}`` for its number.
 
 Source: proc(5), sysfs(5).
 """

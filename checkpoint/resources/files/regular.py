@@ -1,10 +1,10 @@
-"""Regular files, directories and paths (O_PATH): opened again at the same offset; what was only read must be the same file.
+"""Restore regular files, directories and paths (O_PATH) at the same offset; a file open only for reading must be the same file.
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``offset`` and ``size`` in bytes, ``mode``, ``device``, ``inode`` and
 ``mtime_ns`` at the capture; ``digest``: blake3 of the content of a file that is open for reading only, b"" where it is longer
-than `DIGEST_LIMIT` or cannot be read. Of what no name leads to any more ``deleted`` true, ``uid`` and ``gid``; ``link``: where a
-symbolic link leads; ``attributes``: the extended ones, by name; ``content``: [offset, bytes] of each part that is no hole, with
-one of its open files, [] with the others.
+than `DIGEST_LIMIT` or cannot be read. If no name leads to the file any more, ``deleted`` true, ``uid`` and ``gid``; ``link``:
+where a symbolic link leads; ``attributes``: the extended ones, by name; ``content``: [offset, bytes] of each part that is no
+hole, with one of its open files, [] with the others.
 
 A file that is open for writing and only grew since the capture is cut back to ``size``.
 """

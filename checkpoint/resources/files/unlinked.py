@@ -1,7 +1,7 @@
-"""What no name leads to any more, made again inside a vessel: under a name for a moment, where it had its own.
+"""Make deleted files again inside a vessel, under a temporary name in their own directory where that is possible.
 
-Where that place is gone, or takes nothing by now (a file system that is read-only since), another one serves: a file without a
-name is its content, not its place.
+Where that directory is gone, or cannot be written any more (a file system that has become read-only), another one serves: for a
+file without a name only the content counts, not the place.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Named pipes that nobody else has open: opened again by name, with what is in them; made where they are missing.
+"""Restore named pipes that no other program has open: opened by name, with their content; made where they are missing.
 
 Facts: ``descriptors``; ``path``; ``flags`` of open(2); ``mode``; ``device`` and ``inode`` at the capture; ``capacity`` in bytes;
-``content``: the bytes in it, with one descriptor of each named pipe, b"" with the others; of one whose name was deleted,
-``deleted`` true, and ``uid`` and ``gid``; of one over whose path something was mounted, ``mounted`` and
-``handle`` (`covered_files`).
+``content``: the bytes in it, with one descriptor of each named pipe, b"" with the others. If its name was deleted, ``deleted``
+true, and ``uid`` and ``gid``. If a mount hides its path, ``mounted`` and ``handle`` (`checkpoint.resources.files.overmounted`).
 
 Source: fifo(7), tee(2).
 """

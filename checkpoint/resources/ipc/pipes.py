@@ -1,11 +1,11 @@
-"""Pipes that a process keeps to itself: both ends are its own, so the pipe and what is in it come back whole.
+"""Restore pipes whose two ends both belong to the process, with their content.
 
-Programs wake themselves by such a pipe from a signal handler (xz does). A pipe that somebody else holds an end of is refused
-until that somebody can come along.
+Programs wake themselves by such a pipe from a signal handler (xz does). A pipe with an end in another process is refused until
+that process can move as well.
 
 Facts: ``descriptors``; ``pipe``, a number that both ends have in common; ``end``, 0 to read, 1 to write; ``flags`` of fcntl(2);
-``capacity`` in bytes; ``content``: the bytes in it, with the reading end, b"" with the writing one; ``packets``: how long each
-packet of that is, where there are several (O_DIRECT).
+``capacity`` in bytes; ``content``: the bytes in it, with the reading end, b"" with the writing one; ``packets``: the length of
+each packet of the content, where there are several (O_DIRECT).
 
 Sources: pipe(7), tee(2), fcntl(2) F_SETPIPE_SZ.
 """

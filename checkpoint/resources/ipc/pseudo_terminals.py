@@ -1,13 +1,13 @@
-"""Pseudo-terminals of which the program has the master: made again with both ends, their settings, window size and modes.
+"""Restore pseudo-terminals of which the program has the master: both ends, their settings, window size and modes.
 
-A slave gets the number that it had (`/dev/pts/3`) where that is free, else another, which is said. A session's controlling
-terminal is its own again, with the group in its foreground. Bytes that wait at either end are not kept yet, so such a terminal is
-kept as soon as they are read; of a line that is being typed, and not ended, nobody can be asked: it is lost.
+A slave gets the number that it had (`/dev/pts/3`) where that is free, else another one, and a note says so. A session gets its
+controlling terminal again, with the same group in the foreground. Bytes that wait at either end are not kept yet, so the capture
+keeps such a terminal only after they are read. A line that is being typed, and not ended, cannot be queried: it is lost.
 
-A slave whose master is somebody else's, a login's, is a standard stream or refused.
+A slave whose master belongs to another program, such as a login, is a standard stream or refused.
 
 Facts: ``descriptors``; ``flags`` of open(2); ``terminal``: number of the slave; ``end``: `MASTER` or `SLAVE`; ``waiting``: bytes;
-``hung_up``: nobody has the other end any more; ``exclusive``; ``settings``: struct termios2; ``window``: struct winsize; of a
+``hung_up``: no process has the other end any more; ``exclusive``; ``settings``: struct termios2; ``window``: struct winsize; of a
 slave ``discipline``, and ``mode``, ``uid`` and ``gid`` of its file; of a master ``locked``, ``packets``, ``session`` and
 ``foreground``: as the program itself knows these groups, 0 for none.
 

@@ -1,7 +1,7 @@
-"""Shared memory that other processes have, too: what they write to each other cannot move with one of them.
+"""Refuse shared memory that other programs also have: data that they exchange cannot move with one of them.
 
-Looked at are memory files, files in /dev/shm and files that were deleted; others that are mapped shared lie on a disk, where
-every robot has its own.
+The check covers memory files, files in /dev/shm and deleted files. Other files that are mapped shared lie on a disk, where every
+robot has its own.
 
 Source: proc_pid_maps(5).
 """

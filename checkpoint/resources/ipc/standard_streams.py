@@ -1,8 +1,8 @@
-"""Standard input, output and error: streams of the component, not of a robot.
+"""Restore standard input, output and error: streams of the component, not of a robot.
 
-A terminal, pipe or socket at 0, 1 or 2 becomes the restored side's own stream of that number; what the guard of a component
-holds the other end of is told by its pipes. A regular file or a device there is no stream but itself, and so is a pipe or
-socket of which the program has the other end, too.
+A terminal, pipe or socket at 0, 1 or 2 becomes the restored side's own stream of that number. The guard's pipes show which
+streams lead to the guard of the component. A regular file or a device there is no stream and is restored as itself. The same
+holds for a pipe or socket of which the program also has the other end.
 
 Facts: ``descriptors``; ``stream``, 0, 1 or 2: which of the vessel's own it becomes; ``flags`` of open(2) and fcntl(2).
 """

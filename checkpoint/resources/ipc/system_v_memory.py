@@ -1,12 +1,13 @@
-"""System V shared memory (shmget(2), shmat(2)) that a program has to itself: content, key, size, owner, the id where it is free.
+"""Restore a program's own System V shared memory (shmget(2), shmat(2)): content, key, size, owner, and the id where it is free.
 
-Its processes may have it attached together: then each of them tells of it, and it is made once.
+Its processes may have it attached together: then each of them describes it, and the restore makes it once.
 
-Its pages are those of the mappings; what is told here is how to make it. A segment of which a program knows the id but has
-nothing attached cannot be seen, and stays behind.
+Its pages are those of the mappings; this module describes how to make it. A segment whose id the program knows but which it has
+not attached cannot be seen, and is not restored.
 
-Facts: ``descriptors`` (none); ``id``; ``key``; ``size`` in bytes; ``permissions``, with SHM_DEST where it goes with the last that
-has it attached; ``uid`` and ``gid`` of its owner; ``changed`` in seconds of the wall clock: 0 or missing where it is not known.
+Facts: ``descriptors`` (none); ``id``; ``key``; ``size`` in bytes; ``permissions``, with SHM_DEST where it goes with the last
+process that has it attached; ``uid`` and ``gid`` of its owner; ``changed`` in seconds of the wall clock: 0 or missing where it is
+not known.
 
 Source: shmget(2), shmop(2); ipc/shm.c: the inode number of a mapping is the id.
 """

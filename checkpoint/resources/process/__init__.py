@@ -1,1 +1,1 @@
-"""What belongs to the process or thread itself: credentials, scheduling, job control, seccomp, what it shares with its parent."""
+"""State of the process or thread itself: credentials, scheduling, job control, seccomp, and what it shares with its parent."""

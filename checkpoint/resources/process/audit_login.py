@@ -1,10 +1,11 @@
-"""Whose login a process belongs to, as the kernel's audit knows it: the user (loginuid) and the number of the session.
+"""The login of a process in the kernel's audit system: the user (loginuid) and the number of the session.
 
-A process may say it itself, without a right while nobody has; the number is a new one then, which the kernel chooses. Each
-thread has them for itself, but all are told of as the first is: the vessel says it before they are born.
+A process may set its login itself, and needs no right while it has none; the kernel then chooses a new session number. Each
+thread has its own login, but the snapshot records only the first thread's: the vessel sets it before the other threads are
+created.
 
-Facts: ``descriptors`` (none); ``user`` of the login, ``session`` its number, -1 where that is not set. Nothing is told of a
-process that belongs to no login.
+Facts: ``descriptors`` (none); ``user`` of the login, ``session`` its number, -1 where that is not set. A process without a login
+has no such resource.
 
 Source: proc_pid_loginuid(5), pam_loginuid(8); audit_set_loginuid() in kernel/audit.c, proc_loginuid_write() in fs/proc/base.c.
 """

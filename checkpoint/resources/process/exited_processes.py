@@ -1,9 +1,9 @@
-"""Processes that have ended, and of which the program still has something: a pidfd, a file of /proc, its working directory there.
+"""References of the program to processes that have ended: a pidfd, a file of /proc, its working directory there.
 
-Such a descriptor answers as that of any process does that is gone: who it was nobody can ask any more. So a restore has the
-vessel give birth to a child that never runs, opens what is wanted of it, ends it, and takes note of its end
-(`engines.restore_one`). Nothing is read meanwhile, not even by lseek(2): what that leaves in the kernel's buffer would be
-told of somebody else.
+Such a descriptor answers like that of any ended process; which process it was cannot be queried any more. So a restore makes the
+vessel create a child that never runs, opens the wanted files of it, ends it, and reaps it
+(`checkpoint.engines.ptrace.restore.process`). Nothing is read meanwhile, not even by lseek(2), because that would leave facts
+about another process in the kernel's buffer.
 
 Fact of both kinds: ``ended``: a number that pidfds, or files, of the same process have in common.
 """

@@ -1,12 +1,13 @@
-"""That a process is stopped by a signal (SIGSTOP, job control).
+"""Restore the state of a process that a signal has stopped (SIGSTOP, job control).
 
-It is told of children only, and only while the first process runs, where the component has a guard: that may hold the whole of
-it by SIGSTOP, and is another one when it is brought back.
+If the component has a guard, the state is recorded only for children, and only while the first process runs. The guard may hold
+the whole component by SIGSTOP, and after a restore it is another guard.
 
-That it goes on, which its parent has not been told yet (WCONTINUED), the parent itself is asked; it is told of one child only.
+A child may have resumed without its parent having been told yet (WCONTINUED). The capture asks the parent itself, and so learns
+of one such child only.
 
-Facts: ``descriptors`` (none); ``signal`` by which it is stopped, 0 if it goes on again and its parent is to be told; ``untold``:
-what wait(2) still has to tell its parent of the stop (CLD_STOPPED, 5), 0 if nothing.
+Facts: ``descriptors`` (none); ``signal`` by which it is stopped, 0 if it has resumed and its parent is to be told; ``untold``:
+the code that wait(2) still has to report to its parent for the stop (CLD_STOPPED, 5), 0 if nothing.
 
 Source: wait(2); do_signal_stop() and prepare_signal() in kernel/signal.c; do_task_stat() in fs/proc/array.c.
 """

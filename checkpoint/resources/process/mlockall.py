@@ -1,7 +1,8 @@
-"""That whatever a process maps from now on is locked in memory (mlockall(2) with MCL_FUTURE); single locks are told by VmFlags.
+"""The lock on future mappings of a process (mlockall(2) with MCL_FUTURE); VmFlags report single locks.
 
-Nobody tells of it. It shows by pages that we map in the process ourselves: when they are locked, as everything else is, it is in
-force. A process that has locked only what it had (MCL_CURRENT) after we came looks alike; it then gets both.
+The kernel does not report this lock. Pages that the tracer maps in the process show it: if they are locked, as all other pages
+are, the lock is in force. A process that has locked only its existing pages (MCL_CURRENT) after the tracer mapped its pages looks
+alike; it then gets both.
 
 Facts: ``descriptors`` (none); ``on_fault``: pages are locked when they are first touched (MCL_ONFAULT).
 

@@ -1,7 +1,7 @@
-"""What threads besides the first have asked to be sent when the parent of their process ends (PR_SET_PDEATHSIG).
+"""Signals that threads besides the first asked to receive when the parent of their process ends (PR_SET_PDEATHSIG).
 
-Each thread has one of its own; that of the first stands in `ProcessState`. The kernel looks through all threads of a child whose
-parent ends, and sends what each has asked for to the process as a whole.
+Each thread has one of its own; that of the first thread is in `ProcessState`. When a parent ends, the kernel looks through all
+threads of its child, and sends the signals that they asked for to the process as a whole.
 
 Facts: ``descriptors`` (none); ``threads``: a list of [tid, signal].
 

@@ -1,7 +1,7 @@
-"""Threads that cannot be kept: those that do not share what the threads of a program share. Nothing here touches them.
+"""Refuse threads that do not share what the threads of a program normally share. This module only reads; it changes nothing.
 
-A thread comes back in the namespaces of the first one, so it must be in them now; `thread_tables` tells what else it may have
-for itself.
+A restored thread is in the namespaces of the first one, so it must be in them at the capture.
+`checkpoint.resources.process.unshared_threads` lists what else a thread may have for itself.
 
 Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
 """

@@ -1,8 +1,9 @@
-"""What sched_setattr(2) alone can set of a thread: SCHED_DEADLINE's runtime, deadline and period, and a slice of its own.
+"""Thread settings that only sched_setattr(2) makes: runtime, deadline and period of SCHED_DEADLINE, and a custom slice.
 
-It is asked from outside, when the program runs again: nobody but an administrator changes it from one moment to the next.
+The capture queries them from outside, after the program has resumed: only an administrator changes them from one moment to the
+next.
 
-Facts: ``descriptors`` (none); ``threads``: a list of [tid, policy, nice, runtime, deadline, period], times in nanoseconds; of
+Facts: ``descriptors`` (none); ``threads``: a list of [tid, policy, nice, runtime, deadline, period], times in nanoseconds; for
 other policies than SCHED_DEADLINE the runtime is the slice, and the rest is 0.
 
 Source: sched_setattr(2); Documentation/scheduler/sched-deadline.rst; __setparam_fair() in kernel/sched/syscalls.c.

@@ -1,12 +1,12 @@
-"""What the threads of a process may not call (seccomp(2)): strict mode, and filters.
+"""Restore the seccomp(2) restrictions of a process's threads: strict mode, and filters.
 
-Facts: ``descriptors`` (none); ``filters``: a list of [instructions, flags], each program once; ``threads``: a list of
-[tid, strict, filters], the last a list of places in ``filters``, oldest first.
+Facts: ``descriptors`` (none); ``filters``: a list of [instructions, flags], each program once; ``threads``: a list of [tid,
+strict, filters], the last a list of positions in ``filters``, oldest first.
 
-They are installed while they are suspended (`checkpoint.linux.trace.seccomp`), so that the last calls of a restore are not
-judged; the letting go puts them in force. Filters that all threads have in common are installed before the threads are born, and
-so are
-the same ones in all of them: a filter for all threads (SECCOMP_FILTER_FLAG_TSYNC) can be added afterwards as before.
+The restore installs them while they are suspended (`checkpoint.linux.trace.seccomp`), so that they do not judge the last calls of
+the restore. The release of the threads puts them in force. Filters that all threads have in common are installed before the
+threads are created, and so they are the same filters in all of them: a filter for all threads (SECCOMP_FILTER_FLAG_TSYNC) can be
+added afterwards as before.
 
 Source: seccomp(2).
 """

@@ -1,8 +1,8 @@
-"""What a process has in common with its parent beyond what a fork leaves: its table of descriptors, its directories and umask.
+"""Restore what a process shares with its parent beyond a fork: its table of descriptors, its directories and umask.
 
-So clone(2) with CLONE_FILES or CLONE_FS makes it. Such a process is born so again; its table is filled by its parent.
+clone(2) with CLONE_FILES or CLONE_FS makes such a process. The restore creates it in the same way; its parent fills its table.
 
-Facts: ``descriptors`` (none); ``flags`` of clone(2) by which it was born.
+Facts: ``descriptors`` (none); ``flags`` of clone(2) with which it was created.
 
 Source: clone(2), kcmp(2).
 """

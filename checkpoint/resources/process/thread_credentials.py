@@ -1,10 +1,10 @@
-"""Rights of threads that are not the first one's: the kernel has user, groups and capabilities for each thread.
+"""Credentials of threads that differ from the first one's: the kernel keeps user, groups and capabilities for each thread.
 
-They are read before and after a program stands still, never meanwhile: they cost its freeze nothing, and what has not changed in
-between was the same then. So is whether a thread is confined by seccomp(2), which each may be by itself.
+The capture reads them before and after the freeze, never during it. So they add nothing to the freeze, and values that are equal
+before and after were the same in between. The same holds for the seccomp(2) state, which each thread may have for itself.
 
-Facts: ``descriptors`` (none); ``threads``: a list of [tid, uids, gids, groups, capabilities, no_new_privs] as Credentials of the
-model have them; what the first one's securebits are, theirs are.
+Facts: ``descriptors`` (none); ``threads``: a list of [tid, uids, gids, groups, capabilities, no_new_privs] as in the model's
+Credentials. Their securebits are those of the first thread.
 
 Source: credentials(7); nptl(7) on why programs seldom do that.
 """

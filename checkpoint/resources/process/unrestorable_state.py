@@ -1,7 +1,7 @@
-"""What a process may have had switched for itself alone, and no restore gives back: asked once, when protection begins.
+"""Refuse process settings that no restore brings back: the check asks the process once, when protection begins.
 
-Only the process itself, or a tracer, is told; a question in every freeze would cost all programs for what hardly any has. So what
-one takes on later is not seen.
+The kernel tells them only to the process itself, or to a tracer. A question in every freeze would slow all programs down for
+settings that hardly any program has. So settings that a program makes later are not seen.
 
 Source: modify_ldt(2), arch_prctl(2), ioperm(2), prctl(2).
 """

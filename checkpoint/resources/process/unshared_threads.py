@@ -1,10 +1,10 @@
-"""What a thread has for itself of what threads commonly share: its working directory and umask, its table of descriptors.
+"""Restore what a thread does not share with the others: its working directory and umask, its table of descriptors.
 
-unshare(2) with CLONE_FS or CLONE_FILES gives it these, or clone(2) without. A thread comes back sharing everything with the first
-one, and takes leave of it as it did then. Of a table of its own every open file must be one that the first thread has, too, under
-whatever number: such a table is told as a choice of the first one's.
+A thread gets these by unshare(2) with CLONE_FS or CLONE_FILES, or by clone(2) without them. A restored thread begins by sharing
+everything with the first one, and unshares it as it did then. Every open file in a table of its own must also be open in the
+first thread, under any number: the snapshot records such a table as a choice from the first thread's.
 
-Which threads have any of it is looked up before and after a program stands still; what those have is read while it stands.
+The capture looks up which threads have any of these before and after the freeze; it reads their values during the freeze.
 
 Facts: ``descriptors`` (none); ``threads``: a list of [tid, directory, umask, files]; ``directory`` is "" where it is the first
 thread's; ``files`` is a list of [number, number in the first one's table, 1 if close-on-exec], or 0 where the table is the same.

@@ -1,1 +1,1 @@
-"""Sockets of every family: internet, unix, netlink, packet; queued datagrams and descriptors on their way."""
+"""Sockets of every family: internet, unix, netlink, packet; queued datagrams and descriptors in transit."""

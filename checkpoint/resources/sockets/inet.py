@@ -1,15 +1,15 @@
-"""Sockets of TCP and UDP: listeners, sockets for datagrams with their groups, and those that are not connected yet.
+"""Restore sockets of TCP and UDP: listeners, sockets for datagrams with their groups, and unconnected ones.
 
-A socket is bound to the same address again. Datagrams that wait come back where their sender's address is this machine's own;
-others are lost, as the network may lose them. So are connections that nobody has accepted yet: who asked for one is
-reset. Connections of TCP are in ``tcp_connections``.
+The restore binds a socket to the same address again. Waiting datagrams are restored where their sender's address is this
+machine's own; others are lost, as the network may lose them. Connections that are not accepted yet are lost, too: the client gets
+a reset. `checkpoint.resources.sockets.tcp` handles TCP connections.
 
-Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host,
-port, flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from
-which what is in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a
-socket for datagrams: 1 what it reads, 2 what it sends; ``lost``: something waits in one that is raw or of ICMP; ``failed``: an
-error does; ``corks``: UDP_CORK is set; ``unfinished``: a datagram was begun, and is not sent yet; ``foreign``: the machine does
-not have its address (any more).
+Facts besides those of every socket: ``state`` of tcp(7), `CLOSED` for UDP; ``address`` and ``peer``: [host, port] or [host, port,
+flow, scope], empty if there is none; ``backlog``; ``waiting``: connections not accepted yet; ``sources``: addresses from which
+the data in the queue came; ``groups``: a list of [interface, group, filter as MCAST_MSFILTER takes it]; ``shutdown`` of a socket
+for datagrams: 1 for reading, 2 for sending; ``lost``: data waits in a raw or ICMP socket; ``failed``: an error waits; ``corks``:
+UDP_CORK is set; ``unfinished``: a datagram was begun, and is not sent yet; ``foreign``: the machine does not have its address
+(any more).
 
 Source: tcp(7), udp(7), ip(7); linux/in.h for group_filter.
 """

@@ -1,4 +1,4 @@
-"""Addresses of the internet families as facts ([host, port], of IPv6 [host, port, flow, scope]) and as the kernel takes them."""
+"""Convert internet addresses between facts ([host, port], for IPv6 [host, port, flow, scope]) and the kernel's form."""
 
 from __future__ import annotations
 

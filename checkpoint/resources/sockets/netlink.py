@@ -1,10 +1,10 @@
-"""Netlink sockets, by which a program asks the kernel and hears of changes: bound to their number again, in their groups.
+"""Restore netlink sockets: bound to their number again, in their groups.
 
-What waits in one is the kernel's answer or report of that moment, which nobody else can send: it is read first.
+Data that waits in one is the kernel's answer or report of that moment, which no other source can send again: the program must
+read it first.
 
 Facts besides those of every socket: ``port``: the number that it is bound to, 0 for none; ``groups``: those that it has joined;
-``peer``: number and mask of groups that it is connected to, empty if it is not; ``busy``: something waits in it, or is still to
-come.
+``peer``: number and mask of groups that it is connected to, empty if it is not; ``busy``: data waits in it, or is still to come.
 
 Source: netlink(7); net/netlink/af_netlink.c.
 """

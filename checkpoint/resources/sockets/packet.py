@@ -1,10 +1,10 @@
-"""Packet sockets, by which a program sees and sends whole frames: bound to their interface again, with memberships and fanout.
+"""Restore packet sockets, which receive and send whole frames: bound to their interface, with memberships and fanout.
 
-Frames that wait are lost, as the network may lose them.
+Waiting frames are lost, as the network may lose them.
 
 Facts besides those of every socket: ``interface``: the name of the one that it is bound to, "" for all; ``ether_type``: the
-protocol that it hears, as bind(2) takes it; ``memberships``: a list of [interface, type, address]; ``rings``: the option
-that makes each, and what it was told; ``fanout``: group and kind, 0 for none; ``lost``: frames wait.
+protocol that it receives, as bind(2) takes it; ``memberships``: a list of [interface, type, address]; ``rings``: the option that
+makes each, and its argument; ``fanout``: group and kind, 0 for none; ``lost``: frames wait.
 
 Source: packet(7).
 """

@@ -1,7 +1,7 @@
-"""Who a unix socket says is at its other end (SO_PEERCRED): the process that made or connected it, as it was at that time.
+"""Restore the peer identity of unix sockets (SO_PEERCRED): the process that made or connected the socket, as it was then.
 
-Facts of unix sockets that are told here: ``maker``: [pid, uid, gid], the pid as that process itself knows it; empty of a socket
-that tells nobody.
+Facts that this module adds to unix sockets: ``maker``: [pid, uid, gid], the pid as that process itself knows it; empty for a
+socket that reports no peer.
 
 Source: unix(7), SO_PEERCRED; init_peercred() in net/unix/af_unix.c; credentials(7).
 """

@@ -1,4 +1,4 @@
-"""Datagrams that wait in sockets of UDP, sent again: each from where it came, as far as that is to be had here."""
+"""Send datagrams again that wait in UDP sockets, each from its original address, as far as this machine has it."""
 
 from __future__ import annotations
 

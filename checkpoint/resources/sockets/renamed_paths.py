@@ -1,9 +1,9 @@
-"""Unix sockets whose file got another name beside the one that bind(2) was told: by rename(2), or link(2) and unlink(2).
+"""Find unix sockets whose file has another name beside the one given to bind(2): by rename(2), or link(2) and unlink(2).
 
-So a program puts its listener where clients look for it, ready and with its rights, at one stroke (supervisord, OpenSSH). The
-kernel follows a file that is renamed; of one that was linked it tells the name that is gone, and the other is looked for beside
-that. Who may not ask it for the file, but for its number, looks beside the name for both. A restore binds the old name, links
-the file to the other one, and removes the old one.
+In this way programs put a listener where clients look for it, ready and with its rights, in one step (supervisord, OpenSSH). The
+kernel follows a file that is renamed. For a file that was linked it reports the lost name, and the search looks for the other one
+beside it. A caller that may not ask the kernel for the file, but only for its number, looks beside the name for both. A restore
+binds the old name, links the file to the other one, and removes the old one.
 
 Source: unix(7), rename(2), link(2); d_path() in fs/d_path.c.
 """

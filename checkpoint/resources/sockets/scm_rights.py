@@ -1,7 +1,7 @@
-"""Open files that are on their way in a unix socket (SCM_RIGHTS), and that the program has closed itself since.
+"""Open files in transit in a unix socket (SCM_RIGHTS) that the program itself has closed since.
 
-They are looked at through descriptors of ours, with numbers above all of the program's, and come back under these numbers until
-they have been sent again. Fact of such a resource: ``travelling``, true.
+The capture reads them through descriptors of our own, with numbers above all of the program's. The restore opens them under these
+numbers until they have been sent again. Fact of such a resource: ``travelling``, true.
 
 Source: unix(7), SCM_RIGHTS.
 """

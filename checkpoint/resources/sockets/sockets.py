@@ -1,12 +1,12 @@
-"""What all sockets have in common: their family and kind, options, and what waits in them to be read.
+"""Facts that all sockets have in common: their family and kind, options, and data that waits to be read.
 
 Facts of every socket: ``descriptors``; ``flags`` of fcntl(2); ``socket``: its inode number, by which others refer to it;
-``family``, ``type`` and ``protocol`` of socket(2); ``user``: uid and gid of who made it, as fstat(2) tells them; ``options``: a
-list of [level, number, value] of those that are not as in a fresh socket; ``filter``, where there is one: the classic BPF
-program that sifts what comes, and ``filter_locked``; ``queue``: what waits to be read, a list of messages, of a stream the
+``family``, ``type`` and ``protocol`` of socket(2); ``user``: uid and gid of its creator, as fstat(2) reports them; ``options``: a
+list of [level, number, value] of those that are not as in a fresh socket; ``filter``, where there is one: the classic BPF program
+that filters incoming data, and ``filter_locked``; ``queue``: data that waits to be read, a list of messages, for a stream the
 pieces in which it was found.
 
-A datagram of no bytes that waits is lost by the second capture after it came: it cannot be looked at twice.
+A waiting datagram of no bytes is lost by the second capture after it came: it cannot be read twice.
 
 Source: socket(7), ip(7), ipv6(7), tcp(7), udp(7).
 """

@@ -1,21 +1,21 @@
-"""TCP connections: those of the program with itself come back; every other one ends, and the program sees a reset.
+"""Restore TCP connections: those between the program's own sockets; every other one ends, and the program sees a reset.
 
-The other end of a connection to somebody else has gone on since the capture: it has been told things, or has told some, that
-the program which comes back knows nothing of. So the program finds what it would find had its peer crashed: ECONNRESET,
-EPOLLHUP and EPOLLERR; what had waited to be read is gone. Where the peer had ended its side and all of it was read, it reads the
-end of file again. A connection that was being asked for (SYN_SENT) is asked for anew.
+The other end of a connection to another program has continued since the capture. It has received data, or has sent some, that the
+restored program does not know. So the program finds the same as after a crash of its peer: ECONNRESET, EPOLLHUP and EPOLLERR;
+data that waited to be read is gone. Where the peer had ended its side and all of it was read, the program reads the end of file
+again. A connection that was being opened (SYN_SENT) is opened anew.
 
-A connection of which both ends are the program's is made again between the same addresses, where those can be had, with what
-waits at both ends. It is made as any other is, without TCP_REPAIR: no right is needed, and no capture may leave a
-socket in repair.
+A connection with both ends in the program is made again between the same addresses, where those are available, with the data that
+waits at both ends. It is made like any other, without TCP_REPAIR: this needs no right, and no capture can leave a socket in
+repair.
 
-What a program takes along when it moves, as its operator may have it, is in ``carried_connections``; facts of such connections
-are `TAKEN`, `LEFT` and `MAY_MOVE`.
+With the operator's permission a program takes connections along when it moves: `checkpoint.resources.sockets.tcp_handover`. Facts
+of such connections are `TAKEN`, `LEFT` and `MAY_MOVE`.
 
-Facts besides those of ``internet_sockets``: ``local``: both addresses are one machine's; ``queue``: what waits to be read in a
-local one, one message; ``unread``: bytes that wait; ``urgent``: an out-of-band one does; ``encrypted``: the kernel does so;
-``deaf``: its program wants to read no more of it; ``sent`` and ``received``: bytes that went over it; ``unsent``: bytes still
-to be sent; ``ends``: what poll(2) says of its end, `READ_ENDED` and `FAILED`.
+Facts besides those of `checkpoint.resources.sockets.inet`: ``local``: both addresses are one machine's; ``queue``: data that
+waits to be read in a local one, one message; ``unread``: bytes that wait; ``urgent``: an out-of-band byte waits; ``encrypted``:
+the kernel encrypts; ``deaf``: its program wants to read no more of it; ``sent`` and ``received``: bytes that went over it;
+``unsent``: bytes still to be sent; ``ends``: the state of its end that poll(2) reports, `READ_ENDED` and `FAILED`.
 
 Source: tcp(7), tcp_ioctl() and tcp_poll() in net/ipv4/tcp.c; linux/tcp.h for struct tcp_info.
 """

@@ -1,14 +1,15 @@
-"""TCP connections with others that a program takes along when it moves (rule ``carry``): the peer notices a pause, and no more.
+"""Hand over TCP connections with other machines when a program moves (rule ``carry``): the peer notices only a pause.
 
-That holds only where the program goes on from the very state in which it stood still for good: of a handover, of a failback, of
-``failover capture`` that ends it. After a crash the peer has heard things, and was told that others have arrived, of which the
-checkpoint knows nothing, and no kernel sends twice what has arrived: the connection would stand still for ever, or go on with
-bytes missing. So only a snapshot that is *held* takes connections along, and only who knows that nothing ran since takes them
-up; otherwise they are reset, as ``tcp_connections`` says.
+That holds only where the program continues from the very state in which it was frozen for the last time: after a handover, after
+a failback, after a ``failover capture`` that ends it. After a crash, the peer has received data, and was told that its own data
+has arrived, and the checkpoint knows nothing of both. No kernel sends again what has arrived, so the connection would hang for
+ever, or continue with bytes missing. So only a *held* snapshot takes connections along, and only a restore that knows that
+nothing ran since takes them over. In all other cases they are reset, as `checkpoint.resources.sockets.tcp` says.
 
-From the look on until it is taken up a connection is silent (`checkpoint.linux.net.packet_drop`), on both machines.
+From the capture until it is taken over, a connection is silent (`checkpoint.linux.net.packet_drop`), on both machines.
 
-One more fact of those of ``tcp_connections``: ``carried``, a map with the fields of `checkpoint.linux.net.tcp_repair.Kept`.
+One more fact besides those of `checkpoint.resources.sockets.tcp`: ``carried``, a map with the fields of
+`checkpoint.linux.net.tcp_repair.Kept`.
 """
 
 from __future__ import annotations

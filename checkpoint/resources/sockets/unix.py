@@ -1,16 +1,17 @@
-"""Unix sockets: pairs of which the program has both ends, its connections with itself, listeners, and sockets for datagrams.
+"""Restore unix sockets: pairs with both ends in the program, its connections with itself, listeners, sockets for datagrams.
 
-What waits in them comes back, in the same messages, from the same names; so do connections that wait to be accepted. A socket for
-datagrams that was connected to a name outside (``/dev/log``) is connected to that name again. How they are made again stands in
-``unix_rebuild``.
+Waiting data is restored, in the same messages, from the same names; so are connections that wait to be accepted. A socket for
+datagrams that was connected to a name outside (``/dev/log``) is connected to that name again.
+`checkpoint.resources.sockets.unix_rebuild` says how they are made again.
 
-Facts besides those of every socket, of ``unix_names`` and of ``unix_makers``: ``state`` of `checkpoint.linux.net.unix_diag`;
-``name``; ``peer``: inode number of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``:
-whose connections wait to be accepted, inode numbers in their order; ``passed``: of each message in the queue the descriptors
-that came with it, as numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue;
-``urgent``: an out-of-band byte waits; ``reset``: its peer has gone without reading all, of which it has not been told yet
-(ECONNRESET); ``sources``: of each message in the queue the name of its sender; no list if none has
-any; ``not_accepted``: of one whose connection waits itself, how much of what it sent is unread, -1 of any other.
+Facts besides those of every socket, of `checkpoint.resources.sockets.unix_names` and of
+`checkpoint.resources.sockets.peer_credentials`: ``state`` of `checkpoint.linux.net.unix_diag`; ``name``; ``peer``: inode number
+of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``: the sockets whose connections wait
+to be accepted, inode numbers in their order; ``passed``: for each message in the queue the descriptors that came with it, as
+numbers of the program's own, or of ``travelling``; no list if none has any; ``too_long``: the queue is; ``urgent``: an
+out-of-band byte waits; ``reset``: its peer has gone without reading all, and the program has not been told yet (ECONNRESET);
+``sources``: for each message in the queue the name of its sender; no list if none has any; ``not_accepted``: for a socket whose
+own connection waits, how much of what it sent is unread, -1 for any other.
 
 Source: unix(7).
 """

@@ -1,15 +1,16 @@
-"""Names of unix sockets that are files: where they lie, and how a socket gets such a name again.
+"""Restore names of unix sockets that are files: where they lie, and how a socket gets such a name again.
 
-A name is what bind(2) was told, and stays so when the directory has changed or the file has another name or none. The file that
-its predecessor has left is replaced, one that somebody listens to is not. A socket whose file is gone (a *ghost*) is bound, and
-its file removed again; where it was bound by a relative name, in a directory that is made for it. So is one by a whole name that
-leads to something else by now, or that began at a root directory of its own: that directory is its root for the while.
+A name is the one that bind(2) was given, and stays so when the directory has changed or the file has another name or none. The
+restore replaces the file that the socket's predecessor has left, but not one on which a process listens. A socket whose file is
+gone (a *ghost*) is bound, and its file removed again; where it was bound by a relative name, this happens in a directory that is
+made for it. The same holds for an absolute name that leads to another file by now, or that began at a root directory of its own:
+that directory is its root for this time.
 
-Facts of unix sockets that are told here: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that file,
-mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's own;
-``root``: the root directory from which its whole name leads, "" for the machine's; ``covered`` true where the file is there,
-but a mount hides it (mode -1, too), or it was moved to another directory (``away``); ``moved`` true where it has another name
-beside the one that it was bound to (`moved_names`).
+Facts that this module adds to unix sockets: ``path`` of its name, "" if that is no file's; ``mode`` and ``file_owner`` of that
+file, mode -1 if it is gone; ``directory`` in which it was bound by a relative name, "" if it was not, or if that is the program's
+own; ``root``: the root directory from which its absolute name leads, "" for the machine's; ``covered`` true where the file is
+there, but a mount hides it (mode -1, too), or it was moved to another directory (``away``); ``moved`` true where it has another
+name beside the one that it was bound to (`checkpoint.resources.sockets.renamed_paths`).
 
 Source: unix(7), bind(2).
 """

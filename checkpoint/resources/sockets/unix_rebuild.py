@@ -1,7 +1,9 @@
-"""Unix sockets made again: those with a name first, ghosts before all (see ``unix_names``), then connections, those that wait to
-be accepted in their order, and last what waits in them.
+"""Rebuild unix sockets in order: named ones, connections, connections that wait to be accepted, and then the waiting data.
 
-Whatever is made is made as who made it (``unix_makers``).
+The named sockets come first, ghosts before all others (see `checkpoint.resources.sockets.unix_names`). Connections that wait to
+be accepted keep their order.
+
+Each socket is made with the identity of its maker (`checkpoint.resources.sockets.peer_credentials`).
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""From a running program to a snapshot: enter, freeze, look, copy, describe. Imports facts, resources, linux; no restore."""
+"""Make a snapshot of a running program: enter, freeze, inspect, copy, describe. Imports facts, resources, linux; no restore."""

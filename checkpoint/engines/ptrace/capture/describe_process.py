@@ -1,4 +1,4 @@
-"""A captured process and its threads in the model's words: from what it told while it stood still, and /proc while it runs on."""
+"""Describe a captured process and its threads as model values, from answers of the freeze and from /proc after it resumes."""
 
 from __future__ import annotations
 

@@ -1,25 +1,25 @@
-"""Calls that the kernel ends with EINTR at every stop: the live program does not notice, and a timeout stays one.
+"""Make calls again that the kernel ends with EINTR at every stop, so that the live program does not notice and timeouts hold.
 
-Of such a call (epoll_wait and its like, sigtimedwait, semtimedop, a socket with a timeout) the kernel does not say how much of
-its time was left, and its arguments are the program's own. So it is made again with its whole timeout, and we remember when that
-is over. At a stop inside such a call::
+Such calls are epoll_wait and its like, sigtimedwait, semtimedop, and calls on a socket with a timeout. The kernel does not say
+how much of their time was left, and their arguments belong to the program. So the capture makes the call again with its whole
+timeout, and remembers when that timeout ends. At a stop inside such a call::
 
-    marked as we left it, its time not over    made again, with the same mark
-    marked as we left it, its time over        it has timed out: that is its result
-    any other                                  seen for the first time: its time begins now; made again, with a mark of its own
+    marked as the capture left it, its time not over   made again, with the same mark
+    marked as the capture left it, its time over       it has timed out: that is its result
+    any other                                          first seen: its time begins now; made again, with a mark of its own
 
-The mark lies where a call's number has room, or its first argument (`arch.CALL_NUMBER_BITS`), and nobody but the kernel and we
-can see it: the program sets the whole register for each call that it makes, and finds the result there. So a mark that is found
-proves that this is the very call that was made again, without having come back between. No call times out too early: it began
-before we saw it. It may do so late, by less than its timeout and by less than the time between three captures. A signal handler
-that runs ends it with EINTR, as ever. If we die, a system call is left that times out by itself; only in the middle of a stop,
-before it was made again, the EINTR of that stop is left.
+The mark is in unused bits of the call's number or of its first argument (`arch.CALL_NUMBER_BITS`). Only the kernel and the tracer
+can see it: the program sets the whole register for each call that it makes, and finds the result there. So a mark proves that
+this is the same call that the tracer made again, and that it has not returned since. No call times out too early, because it
+began before the tracer saw it. It may time out late, by less than its timeout and by less than the time between three captures. A
+signal handler that runs ends the call with EINTR, as usual. If the tracer dies, it leaves a system call that times out by itself.
+Only if it dies in the middle of a stop, before it has made the call again, does the EINTR of that stop remain.
 
-Programs that make such a call again themselves, with what is left of its time, do that more exactly than we can: of theirs only
-those without a timeout are made again here (`makes_calls_again`).
+Programs that make such a call again themselves, with the rest of its time, are more exact than the tracer. Of their calls this
+module makes only those without a timeout again (`makes_calls_again`).
 
-Where there is no room for a mark a call is known by the registers that the program cannot have lost, and nothing proves that it
-has not come back and been made once more: when its time is over it ends with EINTR, once.
+Where there is no space for a mark, the tracer recognises a call by the registers that the program cannot have lost. This does not
+prove that the call has not returned and been made once more. So when its time is over, it ends with EINTR, once.
 
 Source: signal(7), "Interruption of system calls and library functions by stop signals"; arch/x86/entry/entry_64.S, which takes
 the lower half of a call's number, sign-extended (since Linux 5.14; probed).

@@ -1,4 +1,4 @@
-"""The way into a process: pages borrowed from it, a tracker of what it writes, and where it stands when it is stopped."""
+"""Enter a process: borrow pages from it, track the pages that it writes, and find where it is when it is stopped."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""A first thread that has ended while others live on: a snapshot tells it as one that is just about to.
+"""Represent a first thread that has ended while others live: the snapshot shows it as a thread that is about to exit.
 
-It stands before exit(2) with the status that it ended with, every signal blocked, and nothing is done at its end: no address is
-cleared, no lock given back, for that has happened. So a restore needs no rule of its own: everything is built by the first
-thread, as always, and the first thing that it does when it is let go is to end again. The others, their parent and wait(2) find
-what they would have: where threads end one by one, older kernels tell of the process the status of its first one.
+In the snapshot it is before exit(2) with the status that it ended with, and every signal is blocked. Nothing happens at its end:
+no address is cleared and no lock released, because that has already happened. So a restore needs no special rule: the first
+thread builds everything, as always, and its first act when it resumes is to end again. The other threads, the parent and wait(2)
+see the same as before. Where threads end one by one, older kernels report the status of the first thread as that of the process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How many pages a freeze may copy to keep within its budget, learned from the freezes before it."""
+"""Learn from earlier freezes how many pages a freeze may copy within its time budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a process is asked while it stands still, besides its memory: read unparsed as far as that can wait until it runs."""
+"""Query a frozen process for everything besides its memory; parsing waits until the process runs again where that is possible."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""What the threads besides the first one are asked while all stand still.
+"""Query the threads besides the first one while all threads are frozen.
 
-Most of it the kernel tells us; three things only the thread itself can be asked, by a batch of its own: they all answer at the
-same time, at the small desks of the borrowed pages. What cannot change in a thread's life is looked up before the freeze.
+The kernel reports most of the facts. Three facts only the thread itself can report, through a batch of its own: all threads
+answer at the same time, at the small call areas (desks) of the borrowed pages. Facts that cannot change in a thread's life are
+looked up before the freeze.
 """
 
 from __future__ import annotations

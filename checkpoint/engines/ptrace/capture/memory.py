@@ -1,15 +1,15 @@
-"""The memory of one captured process: which pages a snapshot must carry, and their bytes.
+"""Capture the memory of one process: find the pages that a snapshot must carry, and copy their bytes.
 
-Most of them are copied while the program runs (`MemoryCapture.copy_running`): for a base everything that exists, then, as long as
-much has been written meanwhile, what has. A pass *first* renews the protection and *then* reads, so that a page which is written
-while it is read, or later, is named by the next pass. The last pass is `MemoryCapture.take`, while the program stands still: it
-reads what was named since. A page's newest copy is its content.
+The capture copies most pages while the program runs (`MemoryCapture.copy_running`): for a base every page that exists, then, as
+long as the program has written much meanwhile, the written pages. A pass *first* renews the protection and *then* reads, so that
+the next pass names every page that is written during the read or later. The last pass is `MemoryCapture.take`, while the program
+is frozen: it reads the pages that were named since. The newest copy of a page is its content.
 
-What a scan has found is remembered until a snapshot that holds it is acknowledged, whoever scanned and whatever became of the
-capture: its protection is renewed, so that nobody else will name it.
+The capture remembers the result of a scan until a snapshot that holds it is acknowledged, whichever pass scanned, and even if the
+capture failed. The scan has renewed the protection, so no later scan names these pages again.
 
-While the program stands still sets of pages are worked with as little as can be: each step takes tens of µs.
-What is still to be copied is known before (`RunningCopy.owed`), and what a snapshot carries is worked out afterwards
+While the program is frozen, the capture computes with sets of pages as little as possible: each step takes tens of µs. The pages
+still to be copied are known before the freeze (`RunningCopy.owed`), and the content of the snapshot is worked out after it
 (`checkpoint.engines.ptrace.capture.memory_result`).
 """
 

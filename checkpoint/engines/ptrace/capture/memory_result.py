@@ -1,4 +1,4 @@
-"""What scans have named, put together when the program runs again: what a snapshot carries, and the bytes of it."""
+"""Combine the results of scans after the program resumes: the pages that a snapshot carries, and their bytes."""
 
 from __future__ import annotations
 

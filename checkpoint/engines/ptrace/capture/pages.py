@@ -1,4 +1,4 @@
-"""The pages of all processes of a component, as one snapshot has them (see ``checkpoint.snapshot.process_tree``)."""
+"""Combine the pages of all processes of a component for one snapshot (see `checkpoint.snapshot.process_tree`)."""
 
 from __future__ import annotations
 

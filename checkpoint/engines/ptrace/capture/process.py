@@ -1,6 +1,6 @@
-"""One process of a component under protection: how it is entered, stopped, looked at and described.
+"""Capture one process of a protected component: enter, stop, inspect and describe it.
 
-`ptrace_capture.PtraceSession` has one of these for each process of its component.
+`checkpoint.engines.ptrace.capture.session.PtraceSession` has one of these for each process of its component.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What the threads of one process are confined to (seccomp), over many freezes; and how they go on in spite of ours.
+"""Track the seccomp filters of one process's threads over many freezes, and how these threads resume after a stop.
 
-Filters are only ever added, so of a thread that was seen before one question is enough. They cost the freeze of a program that
-has none nothing.
+A program can only add filters, so one question is enough for a thread that was seen before. A program without filters pays
+nothing for this in its freeze.
 
-A thread that we have stopped in a call with a timeout goes on by restart_syscall(2). A filter that does not know that call would
-end it: such a thread makes its own call again instead (`Interruption.begins_anew`), which was let through before.
+A thread that was stopped in a call with a timeout continues through restart_syscall(2). A filter that does not know that call
+would kill it. Such a thread makes its own call again instead (`Interruption.begins_anew`), which the filter allowed before.
 """
 
 from __future__ import annotations

@@ -1,18 +1,20 @@
-"""Capture by ptrace: one protected component, from `PtraceSession.open` to `PtraceSession.close`.
+"""Capture one protected component through ptrace, from `PtraceSession.open` to `PtraceSession.close`.
 
 One capture::
 
-    copy         what is much, while it runs (`capture_memory`)                   the program runs
-    freeze       stop its threads; registers, mask, pending signals                        it stands still
+    copy         most pages, while it runs (`capture.memory`)                     the program runs
+    freeze       stop its threads; registers, mask, pending signals               it is frozen
     scan, copy   which pages were written since, and their bytes
-    ask          a batch of system calls inside it (`standing`); descriptors; output counts
+    ask          a batch of system calls inside it (`capture.frozen_process`); descriptors; output counts
     thaw         everything as it was
     describe     zero pages dropped, digests, files identified, refusals          it runs
 
-What is copied while it runs is copied again if it is written meanwhile, so that a freeze does not grow with the memory's size,
-nor, as long as we copy faster than the program writes, with the time since the last one.
+If the program writes a page after the capture has copied it, the capture copies it again. So the freeze does not grow with the
+size of the memory. As long as the capture copies faster than the program writes, the freeze does not grow with the time since the
+last capture either.
 
-A component of several processes (`captured_tree`) goes the same way, all of its processes at the same time.
+A component of several processes (`checkpoint.engines.ptrace.capture.tree`) takes the same steps, with all of its processes at the
+same time.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Interrupted system calls: how a snapshot goes on from a stop inside one.
+"""Prepare interrupted system calls in a snapshot, so that the restored program makes them again.
 
-The live program needs nothing of this: it gets its registers back as they were and the kernel decides (but for the calls of
-`checkpoint.engines.ptrace.capture.eintr_syscalls`). A snapshot has no kernel that remembers, so the call is set to be made
-again, with what is left of its time where the program can be told.
+The live program needs none of this: it gets its registers back unchanged and the kernel decides (except for the calls of
+`checkpoint.engines.ptrace.capture.eintr_syscalls`). After a restore no kernel remembers the call, so the snapshot is prepared to
+make it again, with the rest of its time where the program can be given it.
 
 Source: signal(7), restart_syscall(2), nanosleep(2).
 """

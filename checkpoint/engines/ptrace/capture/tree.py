@@ -1,16 +1,17 @@
-"""The processes of a component besides the first: all of them stand still together, and each is captured as the first one is.
+"""Capture the processes of a component besides the first: freeze all of them together, then capture each like the first one.
 
-How none is missed (each step is a race):
+How the capture misses no process (each step is a race):
 
-1. Parents are stopped before their children are listed; who stands still gives birth to nobody. Listing and stopping go on until
-   everybody who is listed stands, or has ended, so that nobody comes or goes any more.
-2. A parent that waits for a child of vfork(2) does not stop before that has executed its program: the child, which nobody has
-   stopped yet, goes on. One that takes long makes the capture begin anew.
-3. A child that is met for the first time is entered while it stands; one that has executed another program since, anew.
-4. A child that ends before it stands is a zombie from then on: its parent, which stands, cannot ask for it.
-5. A child may end, or execute another program, as soon as it runs on. What is said of one that no snapshot tells of yet is looked
-   up before: many do little else. One that has been there longer is described when it runs on; if it is gone by then, the capture
-   is made anew.
+1. Parents are stopped before their children are listed; a stopped process creates no child. Listing and stopping repeat until
+   every listed process is stopped or has ended, so that no process appears or ends any more.
+2. A parent that waits for a child of vfork(2) does not stop before the child has executed its program. The child is not stopped
+   yet and continues. If the child takes long, the capture starts again.
+3. A child that is found for the first time is entered while it is stopped. A child that has executed another program since is
+   entered again.
+4. A child that ends before it is stopped stays a zombie: its parent is stopped and cannot wait for it.
+5. A child may end, or execute another program, as soon as it resumes. The facts about a child that is in no snapshot yet are
+   looked up before it resumes, because many children live only for a moment. A child that has been there longer is described
+   after it resumes; if it is gone by then, the capture starts again.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What capture and restore both ask of a process, and how both tell it."""
+"""Facts about a process that both capture and restore need, and their common form."""

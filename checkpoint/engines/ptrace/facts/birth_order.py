@@ -1,13 +1,15 @@
-"""In which order the processes of a component are born again, so that parents, sessions and process groups are what they were.
+"""Plan the order in which a restore creates the processes of a component, so that parents, sessions and process groups match.
 
-A child is born into the session of its parent, and into its group; a session cannot be joined, a group only within its session.
-So a leader makes its session when those of its children are born that have an older one, and before the others. Whoever has lost
-its parent, and whoever lives in a session or group whose leader has ended, is born with the help of a *stand-in*: a process that
-ends again when it has done its part, as the one that it stands for has. So is whoever was given to another parent, one that asks
-for orphans: it is born below that one and given to it once more. Where that leads nowhere, places are searched for all of them
-(`birth_places`): everybody is born first, and all that have stand-ins are given to their parents then, the deepest first.
+A child is created in the session and the process group of its parent. A process cannot join a session, and can join a group only
+within its session. So a leader makes its session after the creation of its children that have an older session, and before that
+of its other children. Some processes are created with the help of a *stand-in*, a process that ends when it has done its part, as
+the process that it replaces has ended. These are: processes that have lost their parent; processes in a session or group whose
+leader has ended; and processes that were given to another parent, one that asks for orphans. The last kind is created below that
+parent and given to it once more. Where this finds no order, the plan searches places for all of them
+(`checkpoint.engines.ptrace.facts.birth_parents`): first it creates all processes, then it gives those with stand-ins to their
+parents, the deepest first.
 
-Pure: no process is touched here. Sources: fork(2), setsid(2), setpgid(2), credentials(7); PR_SET_CHILD_SUBREAPER of prctl(2).
+Pure: it touches no process. Sources: fork(2), setsid(2), setpgid(2), credentials(7); PR_SET_CHILD_SUBREAPER of prctl(2).
 """
 
 from __future__ import annotations

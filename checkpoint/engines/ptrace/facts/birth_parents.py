@@ -1,12 +1,13 @@
-"""Below whom each process must be born where it cannot be born by its parent: sessions that their leaders took along.
+"""Find the process below which to create each process that its own parent cannot create: sessions that their leaders took along.
 
-A process has its session from whoever bears it, and may be given to any process above that one later: whoever bears it then is a
-stand-in that ends, and the parent asks for orphans meanwhile. So two things must hold of a *place*: whoever lies there is in the
-session that is wanted, and the parent lies on the way up from it. Leaders alone may be born in any session, so they, with all
-that is theirs, are what is moved: below the parents of those of their session (who saw them leave), and given back at the end;
-or a leader is born in the session of its children, and leaves it after them.
+A process gets its session from the process that creates it. Later it may be given to any process above that one: the creator is
+then a stand-in that ends, and the parent asks for orphans meanwhile. So two conditions hold for a *place*: a process at this
+place is in the wanted session, and the parent is on the way up from it. Only leaders can be created in any session, so the search
+moves leaders, together with all processes below them. It moves a leader below the parents of members of its session (these
+parents were there when the leader left), and the restore gives it back at the end. Or the search creates a leader in the session
+of its children, and the leader leaves that session after them.
 
-Places are searched, those first by which the fewest are wrong. Pure. Sources: setsid(2), PR_SET_CHILD_SUBREAPER of prctl(2).
+The search continues from the plan with the fewest wrong places. Pure. Sources: setsid(2), PR_SET_CHILD_SUBREAPER of prctl(2).
 """
 
 from __future__ import annotations

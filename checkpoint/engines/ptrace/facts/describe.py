@@ -1,4 +1,4 @@
-"""What a snapshot says of a process besides its pages, read from /proc and from what the process told: while it runs on."""
+"""Collect the facts about a running process besides its pages, from /proc and from the answers of the process."""
 
 from __future__ import annotations
 

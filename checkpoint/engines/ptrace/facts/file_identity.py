@@ -1,4 +1,4 @@
-"""Which files stand behind a process's mappings, told so that another machine can tell whether it has the same."""
+"""Identify the files behind a process's mappings, so that another machine can tell whether it has the same files."""
 
 from __future__ import annotations
 

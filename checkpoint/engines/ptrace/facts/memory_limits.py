@@ -1,10 +1,10 @@
-"""Whether this machine has room for what the processes of a component hold together.
+"""Check whether this machine has enough memory for all processes of a component together.
 
-What they have in common since a fork is there once while it runs, and once in a snapshot; but a keeper that takes a whole
-snapshot, or brings it back, has it once for each of them for a moment. Where that is more than the machine can give, the kernel
-would end somebody; so it is refused beforehand.
+Memory that the processes have in common since a fork exists once while the component runs, and once in a snapshot. But a keeper
+that makes or restores a whole snapshot holds it once for each process for a moment. Where that is more than the machine can give,
+the kernel would kill a process; so the keeper refuses in advance.
 
-What a control group around this process allows (memory.max) counts as the machine's own.
+The limit of a control group around this process (memory.max) counts as the machine's own.
 
 Source: proc_meminfo(5), proc_pid_status(5).
 """

@@ -1,4 +1,4 @@
-"""What stands against a process for an instant only: one that executes a program hardly has a mapping for a moment, nor a vdso.
+"""Tell lasting refusal reasons from momentary ones: a process inside execve has hardly a mapping for a moment, and no vdso.
 
 Source: begin_new_exec() in fs/exec.c; exec_mmap() comes before the program's own mappings and the vdso.
 """

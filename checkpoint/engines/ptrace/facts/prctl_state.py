@@ -1,7 +1,7 @@
-"""What a process has switched by prctl(2) and keeps for good: asked in the inquiry, set again by the last calls of a restore.
+"""Lasting prctl(2) settings of a process: the query of a capture reads them, the last calls of a restore set them again.
 
-A switch is kept as the call that sets it: (option, second argument, third argument). A registration for membarrier(2) is kept
-like one, as (`MEMBARRIER`, command, 0); kernels before 6.3 do not tell it. Sources: prctl(2), linux/prctl.h, membarrier(2).
+A setting is stored as the call that sets it: (option, second argument, third argument). A registration for membarrier(2) has the
+same form, (`MEMBARRIER`, command, 0); kernels before 6.3 do not report it. Sources: prctl(2), linux/prctl.h, membarrier(2).
 """
 
 from __future__ import annotations

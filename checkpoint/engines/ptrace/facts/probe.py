@@ -1,4 +1,4 @@
-"""What a capture of a process would preserve, found without touching it."""
+"""Find out what a capture of a process would preserve, without touching the process."""
 
 from __future__ import annotations
 

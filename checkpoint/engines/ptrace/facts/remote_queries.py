@@ -1,4 +1,4 @@
-"""What only the process itself can be asked: one batch of system calls made inside it, and the reading of their answers."""
+"""Ask the process for facts that only it knows: one batch of system calls made inside it, and the decoding of the answers."""
 
 from __future__ import annotations
 

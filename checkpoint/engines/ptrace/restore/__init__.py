@@ -1,1 +1,1 @@
-"""From a snapshot to a running program: check, lay memory, rebuild, let go. Imports facts, resources, linux; no capture."""
+"""Turn a snapshot into a running program: check, lay memory, rebuild, resume. Imports facts, resources, linux; no capture."""

@@ -1,6 +1,6 @@
-"""Whether this machine has what a snapshot needs, found before anything is started.
+"""Check, before anything is started, that this machine has what a snapshot needs.
 
-Everything that is wrong is found at once, so that it can be put right at once.
+The check reports all problems at once, so that the operator can cure them at once.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Which bases may go into their vessel before all of their pages were proved.
+"""Decide which bases may be written into their vessel before all of their pages are verified.
 
-A base that lies in files is written into its vessel frame by frame (`checkpoint.store.base_on_disk`), and only the last frame
-tells whether all were what was captured. A vessel that got others is given up: nothing may be left of it then.
+The restore writes a base that lies in files into its vessel frame by frame (`checkpoint.store.base_on_disk`). Only after the last
+frame does it know whether all frames were those that were captured. If not, it gives the vessel up, and nothing of the vessel may
+remain.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Private memory that processes of a component have had in common since a fork, so that it is there once, and not once for each.
+"""Restore private memory that processes share since a fork, so that it exists once and not once for each process.
 
-What is equal at the same address in several processes is put into the vessel of the first one before the others are born: they
-are born with it, and the kernel keeps one copy until somebody writes (copy-on-write). Each keeps of it what lies in mappings of
-its own, and is given the rest as ever.
+The restore puts content that is equal at the same address in several processes into the vessel of the first process, before it
+creates the others. They inherit it, and the kernel keeps one copy until a process writes (copy-on-write). Each process keeps the
+part that lies in mappings of its own, and gets the rest as usual.
 
-Only plain memory counts: private, to be read and written, anonymous or of a file that has a name. What is anonymous, and what is
-of each file, is compared apart. Pure but for the methods of `Inheritance`.
+Only plain memory counts: private, readable and writable, anonymous or of a file that has a name. Anonymous memory and the memory
+of each file are compared separately. Pure except for the methods of `Inheritance`.
 
 Source: fork(2); mmap(2).
 """

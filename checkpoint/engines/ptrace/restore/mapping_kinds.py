@@ -1,6 +1,6 @@
-"""Mappings that mmap(2) alone does not make: huge and droppable pages, protection keys, seals.
+"""Restore mappings that mmap(2) alone does not make: huge and droppable pages, protection keys, seals.
 
-Huge pages and droppable ones are tried first, and ordinary pages take their place where the kernel has none; that is noted.
+The restore tries huge pages and droppable pages first. Where the kernel has none, it uses ordinary pages and adds a note.
 
 Source: mmap(2), pkeys(7), mseal(2); Documentation/admin-guide/mm/hugetlbpage.rst.
 """

@@ -1,8 +1,8 @@
-"""The program's address space inside a vessel: cleared, mapped, filled, settled.
+"""Build the program's address space inside a vessel: clear, map, fill, settle.
 
-Four steps, because the pages are written from outside in between: `clear` and `map_program` go into the first table of calls,
-`fill` writes every page that the snapshot carries, `settle` (second table) takes away the write permission that filling
-needed and gives the advice back.
+There are four steps, because the restore writes the pages from outside in between: `clear` and `map_program` go into the first
+table of calls, `fill` writes every page that the snapshot carries, `settle` (second table) removes the write permission that
+filling needed and gives the advice back.
 
 Sources: mmap(2), mremap(2), madvise(2), process_vm_writev(2).
 """

@@ -1,12 +1,12 @@
-"""One process of a base: what a waiting vessel, or one that was born of it, becomes.
+"""Restore one process: turn a waiting vessel, or a child of one, into a process of the base.
 
 ::
 
-    seize, stand in a hole       the vessel is ours and dies with us; loop and tables lie where neither has a mapping
+    seize, stand in a hole       the tracer owns the vessel, which dies with it; loop and tables lie where neither has a mapping
     first table                  its own mappings go, the vdso moves, everything the program had is mapped
     pages                        written from outside
     second table                 protections, descriptors, marks, signals
-    threads                      each born with its own id, and a table of its own (`restore_threads`); they share the descriptors
+    threads                      each created with its own id, and a table of its own (`restore.threads`); descriptors are shared
     third table                  timers, rights, file locks, watches
     registers                    SIGTRAP's action, the area unmapped by the vdso's own syscall instruction, then the program's own
 

@@ -1,7 +1,7 @@
-"""What belongs to the process besides memory and files, put back by system calls inside the vessel.
+"""Restore process attributes other than memory and files, by system calls inside the vessel.
 
-Each function adds its calls to a table; `restore_one` says in which order. What the vessel has no right to do becomes a note,
-except where the program would go wrong without it.
+Each function adds its calls to a table; `checkpoint.engines.ptrace.restore.process` defines the order. If the vessel has no right
+to restore an attribute, the restore adds a note, except where the program would go wrong without the attribute.
 
 Sources: prctl(2), rt_sigaction(2), timer_create(2), sched(7), credentials(7), capabilities(7), rseq(2).
 """

@@ -2,12 +2,13 @@
 
 ::
 
-    checks           this machine has what the snapshot needs (`restore_checks`); nothing is touched before
-    carried files    laid down at their paths (`resources.laying`)
-    processes        the vessel becomes the program: one (`restore_one`) or several, which are born of it (`restore_tree`)
-    connections      made again, unheard (`resources.carried_connections`)
+    checks           this machine has what the snapshot needs (`restore.checks`); nothing is touched before
+    carried files    laid down at their paths (`checkpoint.resources.carried.restore`)
+    processes        the vessel becomes the program: one process (`restore.process`) or several, its children (`restore.tree`)
+    connections      made again while they stay silent (`checkpoint.resources.sockets.tcp_handover`)
 
-Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished one leaves nothing.
+Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished restore leaves
+nothing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Files without a name (deleted ones, memory files) and named pipes that several processes of a component have opened themselves.
+"""Restore files without a name (deleted files, memfds) and named pipes that several processes of a component opened separately.
 
-Each process tells of such a file as if it were its own, with its whole content. Files are made once, before the processes are
-born, filled and sealed there, and what the processes tell of content and seals is left out. Where one is mapped its pages come
-with the mappings: it is sealed when all have mapped it. A named pipe is filled by one of them, when that opens it; one whose name
-is gone is made before they are born, too.
+Each process describes such a file as its own, with its whole content. The restore makes each file once, before it creates the
+processes, fills and seals it there, and leaves out the content and seals that the processes describe. Where such a file is
+mapped, its pages come with the mappings: it is sealed when all processes have mapped it. One process fills a named pipe when it
+opens it. A named pipe whose name is gone is also made before the processes are created.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""A child that was stopped is stopped again, before it is given anything: the kernel keeps that while we trace it.
+"""Stop a child again that was stopped at the capture, before it is given anything: the kernel keeps the stop while we trace it.
 
-It goes through the stop as it once did, so that its parent, which stands still, is sent what it was sent then; that is forgotten
-when the parent is given what waits for it (`restore_process.begin_member`).
+The child goes through the stop as it once did. So its parent, which stands still, is sent the signal that it was sent then. The
+restore drops this signal when it begins the parent (`checkpoint.engines.ptrace.restore.process_state.begin_member`), before it
+gives the parent its own pending signals.
 
 Source: ptrace(2), "Group-stop"; ptrace_signal(), do_signal_stop(), prepare_signal() in kernel/signal.c.
 """

@@ -1,7 +1,7 @@
-"""The threads of a program besides its first: born inside the vessel, each with the id that the others know it by.
+"""Restore the threads of a program besides its first: created inside the vessel, each with the id that the others know.
 
-They are traced from their birth (PTRACE_O_TRACECLONE), so none runs before it is what it was. All share what the threads of a
-process share; each says for itself what is its own, by a table of calls like the first one's.
+The restore traces them from their creation (PTRACE_O_TRACECLONE), so none runs before its state is complete. They share
+everything that the threads of a process share; each sets its own state by a table of calls like the first thread's.
 
 Source: clone(2) (clone3, set_tid), ptrace(2).
 """

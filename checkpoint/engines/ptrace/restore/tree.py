@@ -1,15 +1,15 @@
-"""The restore of a component of several processes: born in order, then each restored as one process is, then let go together.
+"""Restore a component of several processes: create them in order, restore each like one process, then resume them together.
 
 ::
 
-    estate       the first vessel makes what several of them share: open files, files without a name, shared memory, and
-                 what of their private memory is equal since a fork (`forked_memory`)
-    births       processes, sessions, groups, in the order of `births`; they inherit the estate, and are vessels themselves
-    ends         zombies end as they had ended, stand-ins without a trace; who was stopped is stopped
-    each         as `restore_one.ProcessRestore` does it, up to the registers
-    registers    of all; nobody runs before everybody is what it was
+    estate       the first vessel makes the objects that several processes share: open files, files without a name, shared
+                 memory, and private memory that is equal since a fork (`restore.forked_memory`)
+    births       processes, sessions, groups, in the order of `facts.birth_order`; they inherit the estate, and are vessels too
+    ends         zombies end as they had ended, stand-ins without a trace; processes that were stopped are stopped
+    each         as `restore.process.ProcessRestore` does it, up to the registers
+    registers    of all; no process runs before the state of every process is complete
 
-They are traced from their birth, and end with us (PTRACE_O_EXITKILL) until `RestoredProgram.resume`.
+All are traced from their creation, and end with the tracer (PTRACE_O_EXITKILL) until `RestoredProgram.resume`.
 
 Source: ptrace(2) (PTRACE_O_TRACEFORK), clone(2), wait(2), setsid(2), setpgid(2).
 """

@@ -1,16 +1,17 @@
-"""A program of another kernel: its calls to that kernel's vdso are led to this one's.
+"""Restore a program of another kernel: redirect its calls to that kernel's vdso to this kernel's vdso.
 
-The program has addresses of functions in the image that it was born with, for the C library looks them up at the start. Where
-this kernel's image differs, the old one stays where it was, as ordinary memory, and each function that `arch` names begins with a
-jump into this kernel's, which lies in a hole. So whoever looks functions up later, by the auxiliary vector, finds them as well.
-The data that the old image read are gone. Zeros in their place make what is left of it ask the kernel by a system call.
+The program holds addresses of functions in the vdso image that it was started with, because the C library looks them up at the
+start. Where this kernel's image differs, the old image stays at its place as ordinary memory, and each function that `arch` names
+begins with a jump into this kernel's image, which lies in a hole. So later look-ups by the auxiliary vector find the functions as
+well. The data that the old image read are gone. Zeros in their place make the rest of the image ask the kernel by a system call.
 
-When such a program moves on, the image that it was born with is an ordinary mapping, and only its jumps are renewed: a program
-that went to and fro a hundred times carries one old image.
+When such a program moves again, its first image is an ordinary mapping, and only the jumps are renewed: a program that moved back
+and forth a hundred times carries one old image.
 
-A thread that stood in the middle of the old image is led out of it before the jumps are written (`run_out`): here, where nobody
-waits and the program can come to no harm, not while the live one stands still. It goes on with what it had read, or by a system
-call; only where it would take zeros for the time (a coarse clock, time(2)) its snapshot is refused.
+A thread that was in the middle of the old image is led out of it before the jumps are written (`run_out`). The restore does this,
+not the freeze of the live program, because here no program waits and the program can come to no harm. The thread continues with
+the data that it had read, or by a system call. Only where it would take zeros for the time (a coarse clock, time(2)) its snapshot
+is refused.
 
 A limit: a signal handler that interrupted a function of the old image returns into it, and the coarse clocks answer 0 that once.
 

@@ -1,4 +1,4 @@
-"""System calls by the vdso's own instruction: made inside a vessel without anything of ours mapped there.
+"""Make system calls inside a vessel through the vdso's own instruction, without mapping anything of the tracer there.
 
 Source: vdso(7), execve(2); ptrace(2), PTRACE_O_TRACEEXEC, PTRACE_O_TRACESYSGOOD.
 """

@@ -1,1 +1,1 @@
-"""A restore up to its pages, kept current by deltas until it is needed. Imports restore."""
+"""Standby copies: a restore up to the pages, kept current by deltas until a takeover needs it. Imports restore."""

@@ -1,6 +1,6 @@
-"""Which programs can have no ready copy: others would see what is made in advance, or it is not covered yet.
+"""Find the programs that can have no standby copy: other programs would see the advance work, or it is not implemented yet.
 
-They come back from their chains, as ever.
+Such programs are restored from their chains, as usual.
 """
 
 from __future__ import annotations

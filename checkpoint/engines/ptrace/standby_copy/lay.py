@@ -1,4 +1,4 @@
-"""Lay the ready copy of a component: of one process, or of several."""
+"""Make the standby copy of a component, of one process or of several."""
 
 from __future__ import annotations
 

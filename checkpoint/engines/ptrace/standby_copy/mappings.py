@@ -1,11 +1,12 @@
-"""What a delta changes in the mappings and pages of a ready copy, and the calls that do it.
+"""Work out what a delta changes in the mappings and pages of a standby copy, and the calls that apply it.
 
-A page that a state does not hold is as its mapping is made: zeros, or what the file has. So whatever a delta takes away is
-dropped (madvise), and what it maps otherwise is mapped afresh. Mappings count as the same where the same thing lies at the
-same place; protection and advice may differ, they are set at the end.
+A page that a state does not hold has the content that its mapping gives it: zeros, or the file's bytes. So the copy drops
+everything that a delta removes (madvise), and maps afresh what the delta maps in another way. Two mappings are the same if the
+same object lies at the same place. Their protection and advice may differ; these are set at the end.
 
-Memory that several processes share is not their mappings': it is there as long as any of them, and its content with it. What of
-that a delta takes away is told by `held_of_objects` of all of them together (`family_copy`).
+Memory that several processes share does not belong to their mappings: it lives, with its content, as long as any of these
+processes. `held_of_objects` of all of them together says what a delta removes from it
+(`checkpoint.engines.ptrace.standby_copy.tree`).
 
 Sources: madvise(2), mmap(2).
 """

@@ -1,18 +1,19 @@
-"""The ready copy: a vessel that has a program's mappings and memory already, kept current delta by delta.
+"""The standby copy of one process: a vessel that already has the program's mappings and memory, updated by each delta.
 
 ::
 
     lay        a base: the vessel is seized, everything is mapped and filled; there it stands still
     advance    a delta, verified whole before: it is torn from here; mappings, then pages; whole again
-    finish     descriptors, threads, timers, rights, registers, as in any restore: nothing that grows with memory
+    finish     descriptors, threads, timers, rights, registers, as in any restore: no step grows with the memory
 
-Nothing of the program runs before `RestoredProgram.resume`: the vessel stands in a stop of ours, and dies with us
-(PTRACE_O_EXITKILL), so that what was cut off in the middle of a delta is not left behind. An error in the middle leaves it
-*torn*, and all further use is refused: it is to be ended, and laid again from the chain.
+No code of the program runs before `RestoredProgram.resume`: the vessel is in a ptrace stop of the tracer and dies with it
+(PTRACE_O_EXITKILL), so that a copy that was interrupted in the middle of a delta does not remain. An error in the middle leaves
+the copy *torn*, and it refuses all further use: the user must end it and lay it again from the chain.
 
-Nothing is folded: each position of a store was proved when it was stored. Pages go from the decoded snapshot into the vessel.
+The copy folds nothing: each position of a store was verified when it was stored. Pages go from the decoded snapshot into the
+vessel.
 
-What is not covered (`copy_hindrances`) comes back from its chain, as ever.
+Programs that are not covered (`checkpoint.engines.ptrace.standby_copy.eligibility`) are restored from their chain, as usual.
 """
 
 from __future__ import annotations

@@ -1,20 +1,20 @@
-"""The ready copy of a component of several processes: all of them born, each with its mappings and memory, kept current together.
+"""The standby copy of a component of several processes: all created, each with its mappings and memory, updated together.
 
 ::
 
-    lay        what `restore_tree` does first: shared memory, births, sessions, groups, ends; then each as `ready_copy` does one
+    lay        the first steps of `restore.tree`: shared memory, births, sessions, groups, ends; then each as in `single`
     advance    a delta: worked out for all before anything is done; torn from here; mappings of all, pages of all; whole again
-    finish     the open files that they share; then, for each, what comes after the pages; registers of all
+    finish     the open files that they share; then, for each, the steps after the pages; registers of all
 
-Open files come with the takeover, and what several processes share of them must lead to the same one. So all are born with one
-table of descriptors (CLONE_FILES): the first one makes there what is shared, then everybody parts with the common table and has
-inherited it, as those have who are born later.
+Open files come with the takeover, and a file that several processes share must lead to the same open file. So all processes are
+created with one table of descriptors (CLONE_FILES). The first process makes the shared files there. Then every process leaves the
+common table and has inherited the files, like processes that are created later.
 
-Shared memory is there once: in each of them mapped whole beside its tables (anonymous), or open in the common table. Its content
-is that of whichever process tells of a page, so that what no process holds any more is emptied for all of them.
+Shared memory exists once: each process has it mapped whole beside its tables (anonymous), or it is open in the common table. Any
+process may provide the content of a page of it. A part that no process holds any more is emptied for all of them.
 
-Who has been born or has ended since, and shared memory that has come, gone or changed in size, is not followed: the copy is to be
-laid again.
+A copy does not follow processes that were created or have ended since, nor shared memory that was added, removed or changed in
+size: the copy must then be laid again.
 
 Sources: clone(2), unshare(2) (CLONE_FILES), madvise(2) (MADV_REMOVE), fallocate(2) (FALLOC_FL_PUNCH_HOLE).
 """
