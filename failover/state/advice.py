@@ -1,4 +1,4 @@
-"""What to do instead of keeping something that is no data: by the name of its class, so that nothing is imported for it."""
+"""What to keep instead of an object that is no data: chosen by the name of its class, so that nothing is imported for it."""
 
 from __future__ import annotations
 

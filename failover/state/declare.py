@@ -1,4 +1,4 @@
-"""What a declaration can say besides a type.
+"""Marks that a declaration can carry besides a type: a former name, pickle.
 
 class Pose:
     heading: Annotated[float, Formerly("theta")] = 0.0     # was stored as theta

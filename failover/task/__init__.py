@@ -1,1 +1,1 @@
-"""What a program imports to keep its state: the decorator API, loops at their times, commits."""
+"""What a program imports to keep its state: the decorator API, timed loops, commits."""
