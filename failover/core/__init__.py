@@ -1,1 +1,1 @@
-"""The pure rules: no socket, clock, thread, random number, file. Start with `failover.core.node`; terms: `failover.core.types`."""
+"""The pure rules: no socket, clock, thread, random number, file. Start at `failover.core.node`; terms: `failover.core.types`."""
