@@ -1,4 +1,4 @@
-"""A keeper for one command: starts the tracer's process, asks it, and ends it with the command.
+"""Keeper for one command: starts the tracer's process, asks it, and ends it with the command.
 
 The one-shot verbs use the same program as the agent, so that python-ptrace is never in this process.
 """

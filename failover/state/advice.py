@@ -1,4 +1,4 @@
-"""What to keep instead of an object that is no data: chosen by the name of its class, so that nothing is imported for it."""
+"""Advice on an object that is no data: what to keep instead, by the name of its class, so that nothing is imported for it."""
 
 from __future__ import annotations
 

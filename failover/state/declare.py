@@ -2,7 +2,7 @@
 
 class Pose:
     heading: Annotated[float, Formerly("theta")] = 0.0     # was stored as theta
-    solver: Annotated[Solver, Pickled()] = Solver()        # runs code when it is read: see ``pickled``
+    solver: Annotated[Solver, Pickled()] = Solver()        # runs code when it is read: see `failover.state.pickled`
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The contract of ``checkpoint.linux.tracking.Tracker``, on every implementation that this kernel has.
+"""The contract of `checkpoint.linux.memory.tracker.Tracker`, on every implementation that this kernel has.
 
 A child of ours obeys one-letter orders about one mapping; we follow it from outside. It stands still at each look, because it
 waits for the next order.

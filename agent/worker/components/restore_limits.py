@@ -1,8 +1,7 @@
 """Limits the rights of a restored snapshot to those of its owner (`checkpoint.snapshot.credentials`).
 
-An agent of root restores with root's rights, and sets what a snapshot asks for. Priorities and limits come back as they were:
-root gives them to ordinary programs while they run (chrt, prlimit, RealtimeKit), and a caller who hands snapshots in counts as
-root.
+An agent of root restores with root's rights: it sets what a snapshot asks for. Priorities and limits come back as they were: root
+gives them to ordinary programs while they run (chrt, prlimit, RealtimeKit), and a client that hands snapshots in counts as root.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a robot notices of its peers and of itself, for ``failover why``: a peer silent, a peer heard again, a stall of its own.
+"""Observations of a robot about its peers and itself, for ``failover why``: a peer silent, a peer heard again, a stall of its own.
 
 Nothing is decided here: `failover.core.membership` judges, this module only reports.
 """
