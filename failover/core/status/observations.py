@@ -1,4 +1,4 @@
-"""Observations of a robot about its peers and itself, for ``failover why``: a peer silent, a peer heard again, a stall of its own.
+"""Observations of a robot about its peers and itself, for ``failover why``: silent peers, peers heard again, stalls of its own.
 
 Nothing is decided here: `failover.core.membership` judges, this module only reports.
 """
