@@ -1,4 +1,4 @@
-"""Snapshots of one component on this robot: taken, stored, kept aside, deleted."""
+"""Snapshots of one component on this robot: taken, stored, kept aside, pruned or dropped."""
 
 from __future__ import annotations
 
