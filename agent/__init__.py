@@ -1,1 +1,1 @@
-"""The daemon: beats, lanes, guards and keepers. It acts on what `failover.core` decides; nobody imports it."""
+"""The daemon: heartbeats, links, guards, keepers. It carries out what `failover.core` decides; no other package imports it."""

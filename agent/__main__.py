@@ -1,4 +1,4 @@
-"""The entry of ``failover-agent``, see `agent.main`. Ctrl-C ends it quietly until the heart takes it for an orderly end."""
+"""Entry point of ``failover-agent`` (see `agent.main`). Until the main loop handles Ctrl-C as an orderly end, it ends quietly."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The agent's configuration: one TOML file, read once into frozen values.
+"""Reads the agent's configuration, one TOML file, once into frozen values.
 
-Every key and its default stand, commented, in ``systemd/agent.toml``; a test keeps the two equal.
+``systemd/agent.toml`` lists every key with its default, commented out; a test keeps the two equal.
 """
 
 from __future__ import annotations

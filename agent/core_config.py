@@ -1,4 +1,4 @@
-"""From the operator's configuration to the core's: the two speak the same words in different types."""
+"""Translates the operator's configuration into the core's types; both use the same words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that floor 3 can refuse or fail at: one family, one sentence per class."""
+"""All errors of the package `agent`: one family, one sentence per class."""
 
 from __future__ import annotations
 

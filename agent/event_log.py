@@ -1,8 +1,8 @@
-"""The story of this robot's decisions, kept on disk for ``failover why``: a file of lines that only grows, in two halves.
+"""Event log of this robot's decisions on disk, for ``failover why``: an append-only file of lines, in two halves.
 
-A line is eight hexadecimal digits of CRC-32, a space, JSON (`failover.core.event_log.decisions.Line`), a newline. What a power
-cut left of the last line, or of any other, is skipped by its sum. When the newer half is full it takes the place of the older
-one, so the two together stay below twice `HALF_SIZE_MAX`.
+A line is eight hexadecimal digits of CRC-32, a space, JSON (`failover.core.event_log.decisions.Line`), a newline. The reader
+skips a line whose sum does not fit: a last line that a power cut left unfinished, or any other. A full newer half replaces the
+older one, so the two together stay below twice `HALF_SIZE_MAX`.
 """
 
 from __future__ import annotations

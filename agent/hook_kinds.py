@@ -1,7 +1,7 @@
-"""The occasions that a robot's operator may have commands for (`agent.worker.components.hooks` runs them), and the signal that
-stands for one.
+"""Kinds of operator hooks: the occasions at which a robot may run commands, and the signal that can stand for a command.
 
-The configuration is checked by this, in the heart too: what runs commands is not loaded there.
+`agent.worker.components.hooks` runs the commands. The main loop, too, checks the configuration by this module, so the code that
+runs commands is not loaded there.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``failover-agent``: the daemon's command line."""
+"""Command line of the daemon ``failover-agent``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""``failover-agent mend``: set the epoch that this member has on record for a component right, while its agent is stopped.
+"""``failover-agent mend``: corrects the epoch that this member has on record for a component, while its agent is stopped.
 
 A record whose epoch leaves none above it can neither vote nor claim, and a start of the agent does not help: an agent forgets no
-epoch by itself. So a person says it, who has seen that no copy runs.
+epoch by itself. So an operator who has seen that no copy runs gives the epoch.
 """
 
 from __future__ import annotations

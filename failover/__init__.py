@@ -1,4 +1,4 @@
-"""Rules and faces: who runs what, and how people and programs ask.
+"""Rules of the team and interfaces to it: which robot runs a component, and how users and programs ask.
 
 Applications import from here; each name is loaded when it is first used, so that `import failover` costs nothing:
 

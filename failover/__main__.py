@@ -1,4 +1,4 @@
-"""The entry of the command ``failover``, see `failover.cli.main`."""
+"""Entry point of the command ``failover``, see `failover.cli.main`."""
 
 from __future__ import annotations
 

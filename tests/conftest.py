@@ -1,4 +1,4 @@
-"""What every test stands on: skip rules with their reasons, compiled tracees, and no process left behind."""
+"""Base of every test: skip rules with their reasons, compiled tracees, and no process left behind."""
 
 from __future__ import annotations
 

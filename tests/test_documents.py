@@ -1,4 +1,4 @@
-"""What people are told: every link leads somewhere, every command line can be typed, every key and class is told of."""
+"""The documents: every link leads to a target, every command line can be typed, every key and class is documented."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules of the house: which way the arrows point, what stays pure, one door per dependency, the names that are not used."""
+"""Rules of this repository: direction of imports, pure modules, one file per dependency, the names that are not used."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The guard's process, one for each component: parent of the program, its streams, its lease. It outlives the agent."""
+"""The guard process, one per component: parent of the program, owner of its streams and its lease. It outlives the agent."""

@@ -1,8 +1,8 @@
-"""Holding a component still without a tracer: a ptrace stop ends when its tracer dies, so a lease must not rest on one.
+"""Freezes a component without a tracer: a ptrace stop ends when its tracer dies, so a lease must not depend on one.
 
-Two ways, one contract. A cgroup of version 2 holds whatever is in it, also what the program started, and the program cannot
-notice; where we may not make one, SIGSTOP does, sent to every descendant until no new one appears. A program can notice that one:
-its parent sees a stop, and a SIGCONT follows.
+Two ways, one contract. A cgroup of version 2 freezes every process in it, also those that the program started, and the program
+cannot notice. Where the guard may not make a cgroup, it sends SIGSTOP to every descendant until no new one appears. A program can
+notice that: its parent sees a stop, and a SIGCONT follows.
 
 Sources: cgroup-v2.rst of the kernel ("cgroup.freeze", "cgroup.kill"), signal(7), proc_pid_stat(5).
 """

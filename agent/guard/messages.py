@@ -1,4 +1,4 @@
-"""What agent and guard say to each other (docs/internals.md, section 6). Arguments and environment are bytes: programs' are.
+"""Messages between agent and guard (docs/internals.md, section 6). Arguments and environment are bytes, as programs' are.
 
 Stream descriptors travel with `Started`, `VesselReady` and `Described`: counters, read end 1, read end 2, log 1, log 2.
 """

@@ -1,18 +1,18 @@
-"""What a component wrote, as two log files in one directory: on its primary and, rebuilt from snapshots, on each standby.
+"""Output of a component as two log files in one directory: on its primary and, rebuilt from snapshots, on each standby.
 
-A byte's place in a log file is its place in the stream, from the component's first byte; no restart or takeover renumbers it.
-Four numbers bound a stream: ``start <= committed <= size``, and ``safe <= committed``.
+A byte's place in a log file is its place in the stream, counted from the component's first byte. No restart or takeover renumbers
+it. Four numbers bound a stream: ``start <= committed <= size``, and ``safe <= committed``.
 
-* Bytes before ``start`` were given back to the disk (a log keeps `KEEP_LIMIT` bytes); they read as zeros and are never served.
+* Bytes before ``start`` were given back to the disk (a log keeps `KEEP_LIMIT` bytes). They read as zeros and are never served.
 * Bytes before ``committed`` belong to a checkpoint: every robot that has them has the same ones, and no takeover takes them back.
 * Bytes before ``safe`` belong to a checkpoint that another robot holds. A component whose output is held (``--output=committed``)
-  shows these alone: not even a robot that is lost for good, while it was alone, takes back what was seen.
-* Bytes up to ``size`` were written by a program whose newest state is not acknowledged yet; a restore cuts them off.
+  shows only these: even a robot that was alone and is then lost for good takes back no output that a reader has seen.
+* Bytes up to ``size`` were written by a program whose newest state is not acknowledged yet. A restore cuts them off.
 
-They stand in the file ``offsets`` (eight little-endian u64: start 1, committed 1, start 2, committed 2, safe 1, safe 2, held,
-owner). The owner is the user id, plus one, of whose component wrote it: users use a name again, and what one user's component
-wrote is never shown to the next one.
-None needs to survive a power cut by itself: a restore gets its totals from the snapshot, and what is not known to be safe waits.
+The file ``offsets`` holds them (eight little-endian u64: start 1, committed 1, start 2, committed 2, safe 1, safe 2, held,
+owner). The owner is the user id, plus one, of the user whose component wrote the output. Users use a name again: the output of
+one user's component is never shown to the next user. None of the numbers needs to survive a power cut by itself: a restore gets
+its totals from the snapshot, and output that is not known to be safe waits.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""Moves a program's output from its pipes into its logs, counting every byte, and never lets the program die of it.
+"""Moves a program's output from its pipes into its logs, counts every byte, and never lets the program die of it.
 
-The counters are shared with the keeper, so that a snapshot's output is exact without asking anybody during a freeze
-(docs/internals.md, section 5). A byte is counted when it leaves the pipe and written afterwards, outside ``busy``: a slow disk
-never prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
+The pump shares the counters with the keeper, so that a snapshot's output is exact without a question during a freeze
+(docs/internals.md, section 5). The pump counts a byte when it leaves the pipe and writes it afterwards, outside ``busy``: a slow
+disk never prolongs a freeze, and the keeper finds the bytes in the log after the thaw.
 
-Held output (``--output=committed``) that nobody may see yet has a bound: when more of it waits than `HOLD_LIMIT`, the pump leaves
-the pipe as it is, and the program waits in its next write until another robot holds a checkpoint. A snapshot reads the pipe
-without emptying it (`checkpoint.engines.stream_output`), so that checkpoints are made all the same.
+Held output (``--output=committed``) that may not be shown yet has a bound. When more than `HOLD_LIMIT` waits, the pump leaves the
+pipe as it is, and the program waits in its next write until another robot holds a checkpoint. A snapshot reads the pipe without
+emptying it (`checkpoint.engines.stream_output`), so checkpoints are made all the same.
 
-The disk is full: the oldest half of the log is given back to it first. If that does not help, nothing is dropped: the pump tries
-again until there is room, the pipe fills, and the program waits inside its next write: not killed, and later without a gap.
+When the disk is full, the pump first gives the oldest half of the log back to it. If that does not help, it drops nothing: it
+tries again until there is room, the pipe fills, and the program waits inside its next write. The program is not killed, and its
+output continues later without a gap.
 """
 
 from __future__ import annotations

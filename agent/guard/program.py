@@ -1,4 +1,4 @@
-"""The program that a guard looks after: its birth, what holds it still, its lease, and its end.
+"""The program that a guard looks after: its start, what freezes it, its lease, and its end.
 
 ====================  ==================================================================================================
 state                 arrows out of it
@@ -10,7 +10,7 @@ state                 arrows out of it
 ``ended``             none: the status is kept until it is forgotten
 ====================  ==================================================================================================
 
-Invariant: while a lease is over, a committed program is frozen, whatever anybody asks for.
+Invariant: while a lease is over, a committed program is frozen, whichever requests arrive.
 """
 
 from __future__ import annotations

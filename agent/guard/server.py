@@ -1,14 +1,14 @@
-"""The guard of one component: ``python -m agent.guard SOCKET_PATH``. Parent of the program, and nobody's child for long.
+"""The guard of one component: ``python -m agent.guard.server SOCKET_PATH``. It is the program's parent and outlives its own.
 
-It owns what must not die with an agent: the program's exit status, the other ends of its output, and the lease that freezes it
-when nobody renews it. It imports little, locks its memory, and does no tracing and no networking, so that little can end it. If
-it ends all the same, the program ends with it (PR_SET_PDEATHSIG): a program without a lease must not run.
+It owns what must not die with an agent: the program's exit status, the other ends of its output, and the lease that freezes the
+program unless the agent renews it. It imports little, locks its memory, and does no tracing and no networking, so that few faults
+can end it. If it ends all the same, the program ends with it (PR_SET_PDEATHSIG): a program without a lease must not run.
 
-It listens on SOCKET_PATH (0600) for one agent at a time; a new one takes the place of the old. It ends
+It listens on SOCKET_PATH (0600) for one agent at a time; a new agent replaces the old one. It ends
 
 * when the agent says `Forget` after the program's end;
 * when the program has ended, no agent is there, and the system told the guard to end (SIGTERM: a shutdown);
-* when the program ends that was let go (`LetGo`); at once, if it is somebody else's child;
+* when a program that was let go (`LetGo`) ends; at once, if that program is the child of another process;
 * when the agent is lost before anything was started, or before a restore was committed, also where that has ended already;
 * when no agent ever came, after `FIRST_CALL_S`.
 """

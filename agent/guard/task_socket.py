@@ -1,15 +1,15 @@
-"""The guard's end of the task socket (TASK.md): who keeps the component's state, what it begins with, which commits are safe.
+"""The guard's end of the task socket (TASK.md): which process keeps the state, what it begins with, which commits are safe.
 
-Nothing here waits for the program: what does not fit into its socket is not said, the next one says more.
+Nothing here waits for the program: a message that does not fit into its socket is not sent; the next message says more.
 
 ====================  ==================================================================================================
 state                 arrows out of it
 ====================  ==================================================================================================
-nobody                a process of the right user connects → somebody
-somebody              it says `Hello` and is known how to begin → begun; it hangs up → nobody; it breaks the rules → nobody
-begun                 it says `Keeps` → kept; it hangs up → nobody; it breaks the rules → nobody
+free                  a process of the right user connects → connected
+connected             it says `Hello` and is known how to begin → begun; it hangs up → free; it breaks the rules → free
+begun                 it says `Keeps` → kept; it hangs up → free; it breaks the rules → free
 kept                  it hangs up, or breaks the rules → gone
-gone                  none: whoever connects is refused
+gone                  none: every process that connects is refused
 ====================  ==================================================================================================
 """
 

@@ -1,1 +1,1 @@
-"""The process that beats and decides: one turn of the core, then persist, send, act. Imports nothing of the worker."""
+"""The process that sends heartbeats and decides: one turn of the core, then persist, send, act. Imports nothing of the worker."""

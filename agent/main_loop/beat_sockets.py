@@ -1,8 +1,9 @@
-"""The beat lane: plain UDP datagrams, one socket a link, never queued behind anything.
+"""Sends and receives heartbeats: plain UDP datagrams, one socket per link, never queued behind other traffic.
 
-Nothing here blocks and nothing raises for the network's sake: a datagram that cannot leave is a beat that a peer misses, which
-is exactly what beats are there to show. Authentication is `failover.core.wire.codec`'s. What does not begin as a beat is dropped
-by the kernel, before it takes room in a socket's buffer or wakes this process. Source: Documentation/networking/filter.rst.
+Nothing here blocks, and no state of the network raises an error: a datagram that cannot leave is a heartbeat that a peer misses,
+and heartbeats exist to show exactly that. `failover.core.wire.codec` authenticates them. The kernel drops a datagram that does
+not begin as a heartbeat before it takes room in a socket's buffer or wakes this process.
+Source: Documentation/networking/filter.rst.
 """
 
 from __future__ import annotations

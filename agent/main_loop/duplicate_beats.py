@@ -1,7 +1,7 @@
-"""Each beat travels over every link of its sender; the first that comes is heard, the others show that their links carry.
+"""Drops duplicate heartbeats: each travels over every link of its sender; the first counts, later ones prove their links.
 
-A copy says nothing about whether its sender lives: it proves a link, and only once. What comes a second time over one link is
-somebody's replay.
+A copy says nothing about whether its sender lives: it proves a link, and only once. A copy that comes a second time over one link
+is a replay.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Writes the story down, in a thread: a decision is passed on in a microsecond, whatever the disk does."""
+"""Thread that writes the event log: the main loop hands over a decision in a microsecond, however slow the disk is."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""The heart: the loop that beats and decides. Start reading the agent here.
+"""The main loop: sends heartbeats and decides. Start reading the agent here.
 
-One thread, one process, nothing else in it. A turn is: sleep until something comes or the core's deadline, read the clock once,
-step the node, obey what it says: persist → send → act. Everything slow lives elsewhere: the disk in a thread
-(`agent.main_loop.vote_record_writer`), programs, snapshots and people in the lanes process. The same turn feeds systemd's
-watchdog, so the watchdog proves this loop and nothing beside it.
+One thread, one process, nothing else in it. A turn is: sleep until an input arrives or the core's deadline passes, read the clock
+once, step the node, carry out its orders: persist → send → act. All slow work is elsewhere: the disk in a thread
+(`agent.main_loop.vote_record_writer`), programs, snapshots and users' requests in the worker process (`agent.worker.process`).
+The same turn feeds systemd's watchdog, so the watchdog proves this loop and nothing beside it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the heart and the lanes say to each other, over a `checkpoint.keeper.messages` between the two processes.
+"""Messages between the main loop and the worker process, over a `checkpoint.keeper.messages` between the two processes.
 
 The core's acts and events are plain Structs; each travels as its class name and its msgpack.
 """

@@ -1,10 +1,10 @@
-"""Persist → send → act, without letting a slow disk delay a beat.
+"""Orders persist → send → act, without letting a slow disk delay a heartbeat.
 
-While a ballot is on its way to the disk, nothing that depends on it leaves: acts wait, and so does what beats say. But
-"I live" depends on nothing: a beat that is due meanwhile goes out stripped of its entries, with the ``settled`` of the
-last durable one, so that peers go on knowing exactly what they were told before. Echoes extend the leases of those who
-hear them; one is withheld from a robot whose primacy the waiting ballot gives up, because the vote that follows counts on
-that lease running out.
+While a vote record is on its way to the disk, nothing that depends on it leaves: acts wait, and so does the content of
+heartbeats. But "I live" depends on nothing: a heartbeat that is due meanwhile leaves without its entries, with the ``settled`` of
+the last durable one, so that peers still know exactly what they were told before. Echoes extend the leases of the robots that
+hear them. The outbox withholds an echo from a robot whose primacy the waiting vote record gives up, because the vote that follows
+counts on that lease running out.
 """
 
 from __future__ import annotations

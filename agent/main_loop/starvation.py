@@ -1,6 +1,6 @@
-"""Whether a process that says nothing could have spoken: how much of a time it ran, slept, or waited for a processor.
+"""Tells whether a silent process could have run: how much of a time it ran, slept, or waited for a processor.
 
-What waits for a processor is not hung; another process in its place would wait, too.
+A process that waits for a processor does not hang; another process in its place would wait, too.
 Source: proc_pid_schedstat (Documentation/scheduler/sched-stats.rst), proc_pid_stat(5).
 """
 

@@ -1,7 +1,7 @@
-"""Beats that cannot be authenticated: from which member's address they came, for the rules, which take them for no silence.
+"""Records from which member's address unauthenticated heartbeats came; the rules do not take them for silence.
 
-What is refused on the bulk lane says more, whose key it was and whose team file lacks it:
-`agent.worker.network.replication_link` tells of that.
+A refusal on the replication link says more: whose key it was and whose team file lacks it.
+`agent.worker.network.replication_link` reports that.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What the agent must not forget: durable before anything that depends on it leaves the machine.
+"""Vote record: what the agent must not forget, durable before anything that depends on it leaves the machine.
 
-One small file, ``ballot``: a line of JSON and a line with its digest. It is written aside, synced, renamed, and the
-directory synced, so a power cut leaves the old content or the new, never a mixture. Besides the core's own record it
-holds the boot counter, which tells this life of the agent from every earlier one.
+One small file, ``ballot``: a line of JSON and a line with its digest. The agent writes it aside, syncs it, renames it, and syncs
+the directory, so a power cut leaves the old content or the new, never a mixture. Besides the core's own record it holds the boot
+counter, which distinguishes this life of the agent from every earlier one.
 """
 
 from __future__ import annotations

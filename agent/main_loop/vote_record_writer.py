@@ -1,4 +1,4 @@
-"""A thread that makes ballots durable, so that the loop which beats never waits for a disk."""
+"""Thread that makes vote records durable, so that the main loop never waits for a disk."""
 
 from __future__ import annotations
 

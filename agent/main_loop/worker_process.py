@@ -1,4 +1,4 @@
-"""The lanes process, seen from the heart: started, spoken to without ever waiting for it, buried and replaced."""
+"""The worker process as the main loop sees it: started, sent messages without ever waiting, collected when dead and replaced."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What every process of the agent asks of the machine: clock, permissions, system calls, systemd, network interfaces."""
+"""Access to the machine for every process of the agent: clock, permissions, system calls, systemd, network interfaces."""

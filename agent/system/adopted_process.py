@@ -1,7 +1,7 @@
-"""A process that was started by somebody else than us: named by its number, and told apart from a later one of that number.
+"""An adopted process: started by another program, named by its PID, and told apart from a later process with that PID.
 
-Under protection it does not end with its guard by itself, and must not run without one: without its guard nobody freezes it in
-time, and it is resumed from its checkpoint; then it would run twice.
+Under protection it does not end with its guard by itself, and must not run without one. Without its guard, no process freezes it
+in time, and another robot resumes it from its checkpoint; then it would run twice.
 
 Source: pidfd_open(2), which polls as readable once the process has ended.
 """

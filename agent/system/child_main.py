@@ -1,6 +1,6 @@
-"""The entry of the agent's other processes, which are as lean as the heart (`checkpoint.runtime.slim_imports`).
+"""Entry point of the agent's other processes, as small as the main loop's (`checkpoint.runtime.slim_imports`).
 
-`python -m agent.system.child_main MODULE ARGUMENT…` is how the heart starts its lanes.
+The main loop starts its worker process with `python -m agent.system.child_main MODULE ARGUMENT…`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The agent's only clock, and its real-time rights. Instants are integer nanoseconds of CLOCK_BOOTTIME, this machine's own.
 
-CLOCK_MONOTONIC stands still while a machine sleeps. A lease counted by it would go on after an hour's sleep where it stood, while
-another robot runs the component; by this clock the hour is a stall like any other, and the lease is over.
+CLOCK_MONOTONIC stands still while a machine sleeps. A lease counted by it would continue after an hour's sleep where it stood,
+while another robot runs the component. By CLOCK_BOOTTIME the hour is a stall like any other, and the lease is over.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How many connections to the bulk port each address may hold at a time: ZeroMQ itself takes any number.
+"""Limits how many connections to the port of the replication link each address may hold: ZeroMQ itself takes any number.
 
-A connection that does not prove within some seconds whose it is ends anyway
-(`agent.worker.network.replication_link.HANDSHAKE_LIMIT_MS`). Until then it takes a descriptor and some 30 KB of the lanes.
-Addresses of the team have room of their own, which no other address can take.
+A connection that does not prove its owner within some seconds ends anyway
+(`agent.worker.network.replication_link.HANDSHAKE_LIMIT_MS`). Until then it takes a descriptor and some 30 KB of the worker
+process. Addresses of the team have places of their own, which no other address can take.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What becomes of an error that nobody foresaw: the process ends by it and says so, and the heart starts another."""
+"""Handles an unexpected error: the process ends by it and says so, and the main loop starts another."""
 
 from __future__ import annotations
 

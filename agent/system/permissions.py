@@ -1,4 +1,4 @@
-"""Who is at the other end of a control connection: as the kernel says, never as the client says.
+"""Identifies the client of a control connection: by what the kernel says, never by what the client says.
 
 Sources: unix(7) (SO_PEERCRED), socket(7), asm-generic/socket.h (SO_PEERGROUPS).
 """

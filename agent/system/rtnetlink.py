@@ -1,6 +1,6 @@
-"""What the kernel says of this machine's network interfaces and addresses, and when it changes: a small part of rtnetlink(7).
+"""Reads this machine's network interfaces and addresses, and their changes, from the kernel: a small part of rtnetlink(7).
 
-It speaks of the network namespace that the agent is in, which /sys/class/net need not. Source: rtnetlink(7), netlink(7),
+It shows the network namespace of the agent; /sys/class/net can show another one. Source: rtnetlink(7), netlink(7),
 linux/if_link.h, linux/rtnetlink.h.
 """
 

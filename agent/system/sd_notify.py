@@ -1,4 +1,4 @@
-"""What the agent tells systemd: sd_notify(3) without a library. Silent where systemd did not start us."""
+"""Notifies systemd: sd_notify(3) without a library. Silent where systemd did not start the agent."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
-"""Guards and keepers outlive the agent's service and inherit nothing from it: under systemd each gets a transient service.
+"""Starts guards and keepers as transient systemd services: they outlive the agent's service and inherit nothing from it.
 
-A child of ours would stand in the service's cgroup, and it, its program and every restored program would have what the service
-has: its limits, capability bounding set, group, score for the OOM killer, seccomp filters, view of the files. The parent of a
-transient service is systemd, which gives it what every service gets; the guard then gives the program what it would inherit from
-whoever asked for it (`checkpoint.linux.spawn.inherited_limits`).
+A child of the agent would be in the agent service's cgroup. The child, its program and every restored program would then have
+what that service has: its limits, capability bounding set, group, score for the OOM killer, seccomp filters, view of the files.
+The parent of a transient service is systemd, which gives it what every service gets. The guard then gives the program what it
+would inherit from the user who asked for it (`checkpoint.linux.spawn.inherited_limits`).
 
 A shutdown ends the agent first and these services after it (``Before=`` orders ends the other way round, systemd.unit(5)).
-A program that exits cleanly because the machine tells it to is not done: nobody records an end, and its standby takes over.
+A program that exits cleanly because the machine tells it to is not done: the agent records no end, and its standby takes over.
 
-Where systemd did not start the agent, they are its children, born with what it was started with.
+Where systemd did not start the agent, guards and keepers are its children and inherit what it was started with.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The process for all that may take its time: snapshots, programs, people. It starts at `process` or `witness`."""
+"""The worker process, for all slow work: snapshots, programs, users' requests. It starts at `process` or `witness`."""

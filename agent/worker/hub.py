@@ -1,4 +1,4 @@
-"""The other process's lines: to the heart of this robot, and to the other robots. Whoever keeps or starts something builds on it.
+"""Links of the worker process to this robot's main loop and to the other robots. Each kind of worker builds on it.
 
 `agent.worker.process` is a robot's or a server's, `agent.worker.witness` a witness's: that one imports this file and nothing
 that could read a snapshot or start a program.

@@ -1,8 +1,8 @@
-"""The lanes process: snapshots, programs and people; everything that may take its time.
+"""The worker process of a robot or a server: snapshots, programs, users' requests; all work that may be slow.
 
 Started as `python -m agent.system.child_main agent.worker.process CONFIG DESCRIPTOR`. One asyncio loop at ordinary priority. The
-heart orders (`agent.main_loop.messages`), this carries out and answers. If it dies, the heart starts another; guards and
-programs live on and are found again by their sockets. If the heart dies, this ends.
+main loop orders (`agent.main_loop.messages`); this process carries out and answers. If it dies, the main loop starts another;
+guards and programs live on and are found again by their sockets. If the main loop dies, this process ends.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""A witness's other process: it hands over the keys of beats and answers people, and that is all.
+"""The worker process of a witness: it hands over the keys of heartbeats and answers users' requests, and nothing else.
 
 Started as `python -m agent.system.child_main agent.worker.witness CONFIG DESCRIPTOR` in place of `agent.worker.process`.
-There is no store, no nursery and no log of any
-output; nothing that could read a snapshot or start a program is even imported. It needs no right that an ordinary user has not.
+There is no store, no pool of processes and no output log. Nothing that could read a snapshot or start a program is even imported.
+It needs no right that an ordinary user does not have.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The command line: one function per verb, one parser, one place that draws."""
+"""The command line: one function per verb, one parser, one package that draws."""

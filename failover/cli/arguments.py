@@ -1,6 +1,6 @@
-"""What each verb takes: one function a verb, which adds its arguments to its parser.
+"""Arguments of each verb: one function per verb adds them to the verb's parser.
 
-This file and ``parser.py``, which has the verbs' names, help and examples, are all that knows argparse.
+Only this file and `failover.cli.parser`, which has the verbs' names, help and examples, know argparse.
 """
 
 from __future__ import annotations

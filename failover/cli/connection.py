@@ -1,4 +1,4 @@
-"""The connection that a verb talks to its agent over."""
+"""The connection over which a verb talks to its agent."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A keeper of our own for one command: the tracer's process, started, asked, and gone when we are.
+"""Keeper for one command: starts the tracer's process, asks it, and ends it with the command.
 
-The one-shot verbs go through the same program that the agent uses, so that python-ptrace is never in this process.
+The one-shot verbs use the same program as the agent, so that python-ptrace is never in this process.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The keeper of a command that will need one, started before the command loads anything else.
+"""Starts the keeper of a command that will need one, before the command loads anything else.
 
-Each of the two loads for longer than a small program's checkpoint takes; so they do at the same time. Little is imported
+Command and keeper each load for longer than a small program's checkpoint takes, so they load at the same time. Little is imported
 here, and nothing before there is something to start.
 """
 

@@ -1,4 +1,4 @@
-"""Fresh key pairs, made by the agent's program: it alone knows the cryptography, and we never import it."""
+"""Fresh key pairs, made by the agent's program: it alone knows the cryptography, and this package never imports it."""
 
 from __future__ import annotations
 

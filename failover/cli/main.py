@@ -1,4 +1,4 @@
-"""The command ``failover``: parse, load the verb's function, and turn every error into a sentence and an exit status."""
+"""The command ``failover``: parses, loads the verb's function, and turns every error into a sentence and an exit status."""
 
 from __future__ import annotations
 

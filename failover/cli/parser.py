@@ -1,7 +1,7 @@
-"""What can be typed: every verb with its help and its examples; ``arguments.py`` has what each takes.
+"""Parser of the command line: every verb with its help and its examples; `failover.cli.arguments` has each verb's arguments.
 
-A verb is a row of the table at the bottom; the function that does it is named there as ``module:function`` and loaded when the
-verb is used, so that ``failover status`` does not pay for ``failover demo``.
+A verb is a row of the table at the bottom. The row names the function that carries it out as ``module:function``; it is loaded
+when the verb is used, so that ``failover status`` does not pay for ``failover demo``.
 """
 
 from __future__ import annotations

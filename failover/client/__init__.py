@@ -1,1 +1,1 @@
-"""The agent, from the outside."""
+"""Client side of the agent: its control socket, and the health of a component."""

@@ -1,8 +1,9 @@
-"""The agent's control socket, from the outside: one request, then its replies.
+"""Client of the agent's control socket: one request, then its replies.
 
 Wire: a unix stream socket, 0600. Every message is four bytes of length (big endian) and that many bytes of msgpack: from the
 client one `Request`, from the agent any number of `Update` and `Output`, and at last one `Result` or `Refused`. Closing the
-connection ends a request that goes on for ever (`status` with ``watch``, `logs` with ``follow``); it never ends the component.
+connection ends a request that has no end of its own (`status` with ``watch``, `logs` with ``follow``); it never ends the
+component.
 
 Verbs, their arguments and what ``Result.value`` holds (every argument has a default unless marked *must*):
 

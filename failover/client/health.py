@@ -1,7 +1,7 @@
-"""How a component stands, and whether all is well: from what every robot of the team says, so that all answer the same.
+"""Health of a component and of the team: from what every robot of the team says, so that all answer the same.
 
-Pure: `failover.client.control.STATUS` in, words out. Whichever robot was asked, the same sights lie before this, its own and
-those of the others (``elsewhere``), so nothing here may depend on which of them is its own.
+Pure: `failover.client.control.STATUS` in, words out. Every robot gets the same input: its own view and the others' views
+(``elsewhere``). So the answer may not depend on which of them is the robot's own.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What people write: TOML files, spans and sizes, the team file."""
+"""Files and values that people write: TOML files, spans and sizes, the team file."""

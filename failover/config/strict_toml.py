@@ -1,4 +1,4 @@
-"""TOML files that a person writes: read into frozen dataclasses, and every mistake named with file, line and cure."""
+"""Reads TOML files that a person writes into frozen dataclasses, and names every mistake with file, line and cure."""
 
 from __future__ import annotations
 

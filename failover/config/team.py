@@ -1,4 +1,4 @@
-"""The team directory: who belongs, where each robot listens, and by which key it is known.
+"""The team directory: the members, the address where each robot listens, and the key by which it is known.
 
 ::
 

@@ -1,1 +1,1 @@
-"""The rules, pure: no socket, clock, thread, dice or file. Start with ``node.py``; the words are in ``types.py``."""
+"""The pure rules: no socket, clock, thread, random number, file. Start at `failover.core.node`; terms: `failover.core.types`."""

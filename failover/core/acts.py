@@ -1,7 +1,7 @@
-"""What a node orders. ``Ready`` is obeyed in this order: persist → send → act; the acts in the order given.
+"""Acts that a node orders. The agent carries out ``Ready`` in this order: persist → send → act; the acts in the order given.
 
-Every act carries the epoch under which it was decided; whoever carries it out drops it when it has seen a later one for
-that component, and returns the epoch with the event that answers it.
+Every act carries the epoch under which the node decided it. The agent drops an act when it has seen a later epoch for that
+component, and returns the epoch with the event that answers the act.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a robot says about itself: the entries of the next beat, so that it fits one datagram and each is said in turn."""
+"""Builds a robot's heartbeat: chooses its entries so that they fit one datagram and each is sent in turn."""
 
 from __future__ import annotations
 

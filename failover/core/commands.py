@@ -1,4 +1,4 @@
-"""What an operator may ask of the robot where the component runs. Each request is answered by the act Answer, once."""
+"""Requests of an operator to the robot where the component runs. The act Answer answers each request, once."""
 
 from __future__ import annotations
 

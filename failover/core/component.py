@@ -1,4 +1,4 @@
-"""One component on one robot: its state, the table of its states, and what one step may do to it."""
+"""One component on one robot: its state, the table of its states, and what one step may change."""
 
 from __future__ import annotations
 

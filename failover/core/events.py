@@ -1,4 +1,4 @@
-"""What can happen to a node. Events about a component carry the epoch of the act that caused them; older ones are dropped."""
+"""Events of a node. Events about a component carry the epoch of the act that caused them; a node drops older ones."""
 
 from __future__ import annotations
 

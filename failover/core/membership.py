@@ -1,9 +1,9 @@
-"""Who lives, who hears whom, and for how long a beat that was heard lets its sender act.
+"""Membership: which robots live, which hear each other, and for how long a heartbeat lets its sender act.
 
-A peer is *suspect* when beats are missing, *dead* when it was silent on all links for longer than any lease it may still act
-on, and for as much longer as its beats have lately come late. Invariants: a peer's counter and boot only grow; a lease counts
-from the asking (the instant our beat left), never from the answer; lateness of our own loop makes peers look silent and is
-taken back before anybody is judged.
+A peer is *suspect* when heartbeats are missing. It is *dead* when it was silent on all links for longer than any lease it may
+still act on, and for as much longer as its heartbeats have lately come late. Invariants: a peer's counter and boot only grow; a
+lease counts from the question (the instant this robot's heartbeat left), never from the answer; lateness of this robot's own loop
+makes peers look silent and is subtracted before any peer is judged.
 """
 
 from __future__ import annotations

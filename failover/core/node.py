@@ -1,7 +1,7 @@
 """One robot's rules as one object: events in, obligations out.
 
-The agent feeds it one event at a time with the instant of its own clock and obeys ``Ready``: persist → send → act. The simulator
-(``tests/simulation``) does the same with many of them. There is no socket, clock, thread, dice or file in here.
+The agent feeds it one event at a time with the instant of its own clock and carries out ``Ready``: persist → send → act. The
+simulator (``tests/simulation``) does the same with many nodes. There is no socket, clock, thread, random number or file in here.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""What a member may say of a component: by its role, by how far epochs can have grown, by what the robot that it names says.
+"""Checks what a member may say of a component: by its role, by the growth of epochs, by what the robot that it names says.
 
-Every member holds a key of the team, and one key may be stolen. So each entry is looked at before the rules see it:
+Every member holds a key of the team, and one key may be stolen. So each entry is checked before the rules see it:
 
-* A witness votes; it neither runs, keeps nor ends anything. A server keeps checkpoints, too. Both repeat what robots decided.
-* Nobody tells that another robot has ended a component, or has opened an epoch, while that robot lives and says otherwise.
+* A witness votes; it neither runs, keeps nor ends a component. A server keeps checkpoints, too. Both repeat what robots decided.
+* No member tells that another robot has ended a component, or has opened an epoch, while that robot lives and says otherwise.
 * The words of others raise an epoch by at most ``epoch_max``.
 
-What is beyond that counts as not said: it moves no component and stands for no vote. It is counted, and the status and the story
-tell whose it was.
+An entry beyond that counts as not said: it moves no component and stands for no vote. The robot counts it, and the status and the
+event log tell which member sent it.
 """
 
 from __future__ import annotations

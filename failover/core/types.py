@@ -1,7 +1,8 @@
-"""The words of the rules: what a component is, what a robot remembers, what it shows. Frozen values only.
+"""Terms of the rules: the values for a component, for what a robot remembers, for what it shows. Frozen values only.
 
 Instants are integer nanoseconds of this machine's own clock (suffix ``_ns``); two machines' clocks are never compared.
-What happens to a node is in ``events.py``, what it orders in ``acts.py``, what robots tell each other in ``messages.py``.
+Events of a node are in `failover.core.events`, its orders in `failover.core.acts`, the messages between robots in
+`failover.core.wire.messages`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The ballot as bytes, for the agent to make durable."""
+"""The vote record as bytes, for the agent to make durable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fencing token, as a program reads it: of one that keeps its state, and of one that nobody prepared."""
+"""The fencing token as a program reads it: a program that keeps its state, or one that was not prepared."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
-"""The reference gateway: what stands before an actuator and obeys nobody who has been replaced.
+"""Reference gateway in front of an actuator: obeys no robot that has been replaced.
 
-A robot that was cut off, or hung, may go on for an instant with a program that runs elsewhere by now. No clock and no lease of
-its own can rule that out for what lies outside of it; the one that moves things can, for it hears both:
+A robot that was cut off, or hung, may for an instant still run a program that already runs elsewhere. None of its own clocks and
+leases can rule that out for the world outside of it. The controller of the actuator can, because it hears both robots:
 
     gateway = failover.Gateway("/var/lib/gripper/epoch")
     ...
     with gateway.passing(epoch):        # of the command that came; failover.epoch() at the sender
         move(command)
 
-The rule is the whole protocol: remember the highest epoch that was ever seen, refuse a lower one, and let nobody in between the
-question and the move. It needs no agent, and a controller without Python does the same in a few lines.
+The rule is the whole protocol: remember the highest epoch that was ever seen, refuse a lower one, and let no other command in
+between the question and the move. It needs no agent, and a controller without Python does the same in a few lines.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
-"""A program's state as data: what is kept, and in which form it comes back.
+"""A program's state as data: which values are kept, and in which form they come back.
 
     schema = Schema.of(Mission, default=Mission(), name="mission")
     encoded = schema.encode(mission)                # bytes, and regions for large arrays
     decoded = schema.decode(encoded)                # .value is a Mission, .notes say what changed meanwhile
 
-What is stored names fields and built-in kinds, never classes: reading builds what the program declares and nothing else, and runs
-nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, but where a declaration says ``pickled`` itself.
+The stored form names fields and built-in kinds, never classes: reading builds what the program declares and nothing else, and
+runs nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, except where a declaration says ``pickled`` itself.
 
 | declared | comes back | remarks |
 |---|---|---|
 | None, bool, int, float, complex, str, bytes | the same, to the bit | int of up to a million bits, NaN payloads, odd text |
-| a number's place | whatever number it held | an int in a float's place, numpy's scalars |
+| a number's place | whichever number it held | an int in a float's place, numpy's scalars |
 | bytearray, array.array | one object | numbers only |
 | datetime, date, time, timedelta, timezone, ZoneInfo | the same, fold too | zones of datetime and zoneinfo |
 | Decimal, Fraction, UUID, range, slice, Path, PurePath | the same | |
@@ -26,9 +26,9 @@ nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, but where a decl
 | Any, object, bare list, dict … | any kind above | not a program's own classes: declare these |
 | ``Annotated[X, Pickled()]``, ``Field(pickled=True)`` | what pickle makes | *who can write the stored state can run code here* |
 
-Refused by name and with what to keep instead (`advice`), at declaration or at the commit: locks, files, sockets, functions,
-instances of subclasses of what was declared, attributes that are no fields, views that share memory, nesting deeper than 100,
-more than 64 MiB besides arrays.
+The schema refuses these by name and says what to keep instead (`failover.state.advice`), at declaration or at the commit: locks,
+files, sockets, functions, instances of subclasses of what was declared, attributes that are no fields, views that share memory,
+nesting deeper than 100, more than 64 MiB besides arrays.
 
 An object that is reached by two paths is one object again, and cycles are cycles: a second way to a mutable object is stored as
 the path of the first. That costs one look into a dictionary for each mutable object; refusing it would forbid

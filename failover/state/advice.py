@@ -1,4 +1,4 @@
-"""What to do instead of keeping something that is no data: by the name of its class, so that nothing is imported for it."""
+"""Advice on an object that is no data: what to keep instead, by the name of its class, so that nothing is imported for it."""
 
 from __future__ import annotations
 

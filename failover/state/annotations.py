@@ -1,4 +1,4 @@
-"""Annotation → kind: the only look at types, once, when a program starts."""
+"""Compiles an annotation into a kind: types are examined only here, once, when a program starts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Kinds of containers: list, deque, tuple, set, frozenset, dict and its relatives.
 
 Mutable ones are noted before their contents, so that a way back to them (a cycle) finds them. Where every element is its own
-wire value, the container is handed to the encoder as it is.
+wire value, the encoder gets the container as it is.
 """
 
 from __future__ import annotations

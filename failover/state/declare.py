@@ -1,8 +1,8 @@
-"""What a declaration can say besides a type.
+"""Marks that a declaration can carry besides a type: a former name, pickle.
 
 class Pose:
     heading: Annotated[float, Formerly("theta")] = 0.0     # was stored as theta
-    solver: Annotated[Solver, Pickled()] = Solver()        # runs code when it is read: see ``pickled``
+    solver: Annotated[Solver, Pickled()] = Solver()        # runs code when it is read: see `failover.state.pickled`
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Numpy's element types ⇄ wire, by a list of what is plain memory.
+"""Numpy's element types ⇄ wire, by a list of those that are plain memory.
 
-A dtype is stored as text ("<f8"), or as a map for records and subarrays. What comes from a wire never reaches numpy's own parser
-unless it is of the documented form: no objects, no fields that overlap or lie outside, no sizes that overflow.
+A dtype is stored as text ("<f8"), or as a map for records and subarrays. Text from a wire reaches numpy's own parser only in the
+documented form: no objects, no fields that overlap or lie outside, no sizes that overflow.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Kinds of immutable values: dates and times, Decimal, Fraction, UUID, addresses, paths, ranges, slices; msgspec.UNSET.
 
-Each is a mark and two functions: value → payload, payload → value. The second refuses, by ValueError or TypeError, whatever
-    the first would not have written; the kind turns that into a sentence with the place.
+Each is a mark and two functions: value → payload, payload → value. The second refuses, by ValueError or TypeError, each payload
+that the first would not have written; the kind turns that into a sentence with the place.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 A schema is compiled once into a tree of kinds; a commit then only walks it. Nothing in a kind changes once the schema is made.
 
-Lowering (value → wire) meets every mutable object once: a second way to it is stored as such (``$same`` and the place of the
+Lowering (value → wire) visits every mutable object once: a second way to it is stored as such (``$same`` and the place of the
 first), so an object that is reached by two paths is one object again after a resume, cycles included; a plain copy would have
-been two, silently. Immutable values may be split, for nobody can tell.
+been two, silently. Immutable values may be split: no program can tell.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Kinds of numbers and text: what a wire holds as it is, and what is just beyond it.
+"""Kinds of numbers and text: values that a wire holds as they are, and values just beyond those.
 
 A number's place takes any number that Python takes there: an integer where a float is declared (``x: float = 0``), a truth
 value where an integer is, and the scalars that numpy's arithmetic leaves behind (``pose.x = readings.mean()``). Each comes
-back as exactly what it was.
+back as exactly the value that it was.
 """
 
 from __future__ import annotations

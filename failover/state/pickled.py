@@ -1,7 +1,7 @@
 """The only place where pickle may appear: a field whose declaration says ``pickled``.
 
-Unpickling runs whatever the bytes say. Who can write the stored state can then run code in the program: declare it only where
-every robot and server that holds the state may do that anyway. A state that holds pickled bytes is refused by every
+Unpickling runs any code that the bytes contain. A person who can write the stored state can then run code in the program: declare
+it only where every robot and server that holds the state may do that anyway. A state that holds pickled bytes is refused by every
 declaration that does not say so itself.
 """
 

@@ -1,7 +1,7 @@
 """Kinds of random number generators: Python's and numpy's, kept as the numbers that say what they draw next.
 
-Nothing on the wire names anything but one of numpy's own bit generators, and every number is checked against the table below:
-some of them are places in an array, which numpy's C code would follow wherever they lead.
+Nothing on the wire names anything but one of numpy's own bit generators. Every number is checked against the table below: some
+of them are places in an array, and numpy's C code would follow them anywhere.
 """
 
 from __future__ import annotations

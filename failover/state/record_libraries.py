@@ -1,7 +1,7 @@
-"""How each library makes the classes of records: their fields, and how to read and to make their objects.
+"""Classes of records by library: how each library declares their fields, and how to read and to make their objects.
 
 attrs and pydantic are known by what their classes carry, and never imported: a class of theirs exists only in a program that
-    has them.
+has them.
 """
 
 from __future__ import annotations

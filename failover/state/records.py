@@ -1,8 +1,8 @@
-"""Kinds of records: objects with named fields, whichever library made their class.
+"""Kinds of records: objects with named fields, of classes that any supported library made.
 
 A record comes back as it was: fields are set on an empty object; no constructor, ``__post_init__`` or validator runs, except
-    where a class of msgspec has a ``__post_init__``, which cannot be gone round. Stored are names, not positions: an added
-    field takes its default, a removed one is dropped (both are noted), a renamed one is found by its former name.
+where a class of msgspec has a ``__post_init__``, which cannot be avoided. Stored are names, not positions: an added field takes
+its default, a removed one is dropped (both are noted), a renamed one is found by its former name.
 """
 
 from __future__ import annotations

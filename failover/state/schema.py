@@ -1,7 +1,7 @@
 """A schema: the compiled plan by which one program's state becomes bytes and comes back.
 
-The bytes are msgpack: an array of four, [``FORMAT``, version, fingerprint, state]; see ``wire`` for what a state is made of.
-    The same value by the same schema gives the same bytes, so a commit that changed nothing changes no page.
+The bytes are msgpack: an array of four, [``FORMAT``, version, fingerprint, state]; `failover.state.wire` defines a state's parts.
+The same value by the same schema gives the same bytes, so a commit that changed nothing changes no page.
 """
 
 from __future__ import annotations

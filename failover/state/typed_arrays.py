@@ -1,4 +1,4 @@
-"""The kind of array.array: numbers of one C type, one object with a life of its own, like a bytearray."""
+"""The kind of array.array: numbers of one C type, one mutable object, like a bytearray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kinds of one thing out of several: enums, literals, unions, and Any."""
+"""Kinds that choose one of several: enums, literals, unions, and Any."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A state without its declaration: what a migration, or somebody who only looks, meets in place of the program's classes."""
+"""Values of a state without its declaration: a migration or a reader gets them in place of the program's classes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a kept state is made of while it is stored, and the names of places in it.
+"""Stored form of a kept state, and the names of places in it.
 
 A stored state is msgpack of a *wire* value: None, a bool, an integer of 64 bits, a float, text, bytes, a list, a map with text
 keys that are the fields of a record, or a *marked* value: a map of one entry whose key starts with "$" and says what kind its

@@ -1,1 +1,1 @@
-"""What a program imports to keep its state: the decorator API, loops at their times, commits."""
+"""The API that a program imports to keep its state: the decorator, timed loops, commits."""

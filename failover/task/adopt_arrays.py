@@ -1,7 +1,7 @@
-"""Large arrays of a first value move into live memory, where a commit costs what was changed and not what they hold.
+"""Moves large arrays of a first value into live memory, where a commit costs what was changed and not what they hold.
 
-Only those that nobody but the state holds, so that nobody can notice: an array of which the program has a name, a view or a weak
-reference stays where it is, and so does one that the state reaches by two ways. They are compared at each commit.
+Only arrays that the state alone holds move, so that no program can notice. An array of which the program has a name, a view or a
+weak reference stays where it is, and so does one that the state reaches by two ways. Those are compared at each commit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The state of a program that runs under an agent: what it begins with, and which commits are safe at another robot.
+"""Link of a program to its agent: the state with which it begins, and which commits are safe at another robot.
 
 The guard of such a program listens at a name that it leaves in the environment (`checkpoint/segment/TASK.md`). There is no file
 beside the program then.

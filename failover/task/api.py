@@ -1,12 +1,13 @@
-"""A program that says what must survive: `resume` gives it its state, `commit` makes a point to return to.
+"""Functions by which a program keeps its state: `resume` gives it its state, `commit` makes a point to return to.
 
     state = failover.resume("mission", default=Mission())
     while state.leg < 10:
         state.leg += 1
         failover.commit()
 
-A process keeps one state; the functions here are about that one. Commits go to a segment in shared memory (`task_state`), from
-where a folder beside the program takes them (`task_file`); no call waits for a disk, except the one that says so.
+A process keeps one state; the functions here are about that one. Commits go to a segment in shared memory
+(`failover.task.state`). A folder beside the program takes them from there (`failover.task.file_store`). No call waits for a disk,
+except the one that says so.
 """
 
 from __future__ import annotations

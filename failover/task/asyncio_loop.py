@@ -1,4 +1,4 @@
-"""Turns at their times in an asyncio loop: what `task_loop` is for a thread."""
+"""Timed turns in an asyncio loop; `failover.task.loop` is the same for a thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A component as a class: what is kept, and a step that ends where its state may be committed.
+"""A component as a class: the fields that are kept, and a step that ends where its state may be committed.
 
 @failover.component(name="mapper", every=0.1)
 class Mapper:

@@ -1,7 +1,7 @@
-"""The state beside the program: a crash-safe folder that takes every commit that it can keep up with.
+"""Stores the state beside the program: in a crash-safe folder that takes every commit with which it can keep up.
 
 It is a store like an agent's, filled from the same segment by the same engine. A thread of the program writes it; the program
-itself never waits for the disk. Where commits come faster than the disk, the newest is written and those between are skipped.
+itself never waits for the disk. Where commits come faster than the disk, the thread writes the newest and skips those between.
 """
 
 from __future__ import annotations

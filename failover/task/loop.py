@@ -1,4 +1,4 @@
-"""Turns at their times, each followed by a commit: of the program's own loop, or the steps of a component."""
+"""Timed turns, each followed by a commit: of the program's own loop, or the steps of a component."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How much a program under a guard has written by its commit, without waiting for whoever empties its pipes.
+"""Counts how much a program under a guard has written by its commit, without waiting for the guard to empty its pipes.
 
-Python's buffers are flushed, so that what was printed before a commit counts as printed before it. Where a pipe is full, that
+Python's buffers are flushed, so that output printed before a commit counts as printed before it. Where a pipe is full, a flush
 would wait: then the commit says `PENDING` instead, and a keeper passes it over.
 """
 

@@ -1,4 +1,4 @@
-"""When the next step begins: a period counted from one beginning, so that a late step delays no later one. Pure."""
+"""Computes when the next step begins: a period counted from one beginning, so that a late step delays no later one. Pure."""
 
 from __future__ import annotations
 

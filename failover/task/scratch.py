@@ -1,4 +1,4 @@
-"""Memory that travels in no checkpoint, and holds zeros where the program goes on."""
+"""Scratch memory: it travels in no checkpoint, and holds zeros where the program resumes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a program keeps, and the segment that its commits go to."""
+"""The state that a program keeps, and the segment to which its commits go."""
 
 from __future__ import annotations
 

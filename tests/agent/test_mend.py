@@ -1,4 +1,4 @@
-"""``failover-agent mend``: a record whose epoch leaves none above it is set right, by a person who was told what that costs."""
+"""``failover-agent mend``: corrects a record whose epoch leaves none above it, on the order of a person who was told the cost."""
 
 from __future__ import annotations
 

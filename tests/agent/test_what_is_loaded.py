@@ -1,4 +1,4 @@
-"""An agent that protects nothing yet is small: what only snapshots or people need is not loaded before they come."""
+"""An agent without components is small: it loads modules for snapshots and users' requests only when these come."""
 
 from __future__ import annotations
 

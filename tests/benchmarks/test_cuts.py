@@ -1,4 +1,4 @@
-"""The phases of a takeover, as the benchmark reads them off a standby's story."""
+"""The phases of a takeover, as the benchmark reads them from a standby's event log."""
 
 from __future__ import annotations
 

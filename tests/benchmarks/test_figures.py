@@ -1,4 +1,4 @@
-"""The tables of the benchmarks: percentiles, ratios beside ours, what stands in the written page."""
+"""The tables of the benchmarks: percentiles, ratios beside ours, the content of the written page."""
 
 from __future__ import annotations
 

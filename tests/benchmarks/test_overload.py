@@ -1,4 +1,4 @@
-"""What the benchmark of false alarms counts as one."""
+"""What the benchmark of false alarms counts as a false alarm."""
 
 from __future__ import annotations
 

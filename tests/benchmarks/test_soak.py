@@ -1,4 +1,4 @@
-"""What a soak makes of its samples."""
+"""What a soak test computes from its samples."""
 
 from __future__ import annotations
 

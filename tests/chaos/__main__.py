@@ -1,8 +1,8 @@
-"""``python -m tests.chaos --faults 200``: real faults, drawn from a seed, in a house of five robots, a server and a witness.
+"""``python -m tests.chaos --faults 200``: real faults, drawn from a seed, in a test team of five robots, a server and a witness.
 
-Needs root. Everything stands in namespaces of its own, so whatever ends this (Ctrl-C, kill -9) leaves no process, no mount and no
-interface. A campaign that fails leaves its evidence in a directory and says where: the faults with their instants, the actuator's
-record, each agent's log, and the story that all robots tell (``failover why``).
+Needs root. Everything runs in namespaces of its own, so no end of this program (Ctrl-C, kill -9) leaves a process, a mount or an
+interface. A campaign that fails leaves its evidence in a directory and prints the path: the faults with their instants, the
+actuator's record, each agent's log, and the merged event log of all robots (``failover why``).
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""What all programs of the team drive: it stands outside every robot and writes down who commanded it, when, in which order.
+"""The actuator that all programs of the team drive: outside every robot, it records each command, its sender, instant and order.
 
-Run as ``python -m tests.chaos.actuator DIRECTORY COMPONENT…``. No fault reaches it: a unix socket is there for every network
-namespace. The kernel says who sent a command (his process) and when; a queue keeps the order in which commands were given, so
-whether two copies acted at once needs no clock. A program that cannot have a socket (awk) writes to a named pipe, which keeps
-order as well, and tells the instant itself.
+Run as ``python -m tests.chaos.actuator DIRECTORY COMPONENT…``. No fault reaches it: a unix socket exists for every network
+namespace. The kernel says which process sent a command and when. A queue keeps the order in which commands were given, so the
+check whether two copies acted at once needs no clock. A program that cannot have a socket (awk) writes to a named pipe, which
+keeps the order as well, and reports the instant itself.
 
-What a program says: ``COMPONENT STEP BEFORE SEAL EPOCH NETWORK`` commands a step, ``COMPONENT safe STEP SEAL`` tells what it was
-told is safe. A seal follows from dice thrown in each step, so no two histories have the same; BEFORE is the seal of the step
-before. Written down, one line each: ``INSTANT PROCESS`` and what was said; instants are nanoseconds of CLOCK_MONOTONIC.
+What a program says: ``COMPONENT STEP BEFORE SEAL EPOCH NETWORK`` commands a step, ``COMPONENT safe STEP SEAL`` reports what it
+was told is safe. A seal follows from random numbers drawn in each step, so no two histories have the same; BEFORE is the seal of
+the step before. The record has one line each: ``INSTANT PROCESS`` and the message; instants are nanoseconds of CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations

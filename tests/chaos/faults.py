@@ -1,6 +1,6 @@
-"""What goes wrong in the house: each fault begins, lasts, and is over; what it has changed is as before then.
+"""The faults of a campaign: each begins, lasts, and ends; afterwards, all that it changed is as before.
 
-Faults are drawn from dice, aimed at whoever runs a component more often than at others, and told in a sentence.
+Faults are drawn at random, aimed at the robot that runs a component more often than at others, and described in a sentence.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The house: five robots, a server and a witness, each a computer of its own as far as one machine can play it, and the actuator.
+"""The test team: five robots, a server, a witness, each simulated as a computer of its own on one machine, and the actuator.
 
-Each has its own network and PIDs and a small disk of its own. Everything stands inside one PID, mount and network namespace
-(`tests.chaos.__main__`), so that whatever ends the house, nothing of it is left.
+Each has its own network and PIDs and a small disk of its own. Everything is inside one PID, mount and network namespace
+(`tests.chaos.__main__`), so that no end of the team leaves anything behind.
 """
 
 from __future__ import annotations

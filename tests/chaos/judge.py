@@ -1,11 +1,11 @@
-"""What must never happen, judged by what the actuator wrote down and by what was promised to those who read the programs' output.
+"""Checks what must never happen: by the actuator's record and by the promises to readers of the programs' output.
 
-* *No two copies act at once.* Commands lie in one queue: once another copy has commanded, the earlier one commands no more,
+* *No two copies act at once.* Commands are in one queue: once another copy has commanded, the earlier one commands no more,
   and the epochs that copies carry only grow.
 * *Nothing that was acknowledged is lost.* A step is acknowledged when its program was told that it is safe, or when a reader of
-  its output (`--output=committed`) has seen it. Every copy begins after what was acknowledged by then; and the history that the
-  newest copy stands on, told by its seals, contains every acknowledged step.
-* *Everything goes on.* `tests.chaos.campaign` waits for it.
+  its output (`--output=committed`) has seen it. Every copy begins after the steps acknowledged by then; and the history of the
+  newest copy, proved by its seals, contains every acknowledged step.
+* *Everything resumes.* `tests.chaos.campaign` waits for it.
 """
 
 from __future__ import annotations

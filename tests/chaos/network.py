@@ -1,8 +1,8 @@
-"""The network of the house: bridges as switches, one cable for each link of a member, and every way in which it fails.
+"""The network of the test team: bridges as switches, one cable for each link of a member, and every way in which it fails.
 
-The house is a network namespace of its own; each member has another, and a veth pair leads from there to a port of a switch. A
-cut from one member to another is a filter at the receiver's port that drops frames by their sender's hardware address: what goes
-the other way passes. tc(8) with a classic BPF program does it on any kernel; netfilter and netem need not be there.
+The test team is a network namespace of its own; each member has another, and a veth pair leads from there to a port of a switch.
+A cut from one member to another is a filter at the receiver's port that drops frames by their sender's hardware address: the
+other direction passes. tc(8) with a classic BPF program does it on any kernel; netfilter and netem need not be there.
 """
 
 from __future__ import annotations

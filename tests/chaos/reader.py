@@ -1,4 +1,4 @@
-"""Somebody who reads a component's committed output as it comes: what he has seen is acknowledged, and must stay true."""
+"""A reader of a component's committed output as it comes: output that it has seen is acknowledged, and must stay true."""
 
 from __future__ import annotations
 

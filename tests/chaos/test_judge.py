@@ -1,4 +1,4 @@
-"""The judge of the campaigns finds what must never happen: each test commits one crime."""
+"""The judge of the campaigns finds what must never happen: each test breaks one promise."""
 
 from __future__ import annotations
 

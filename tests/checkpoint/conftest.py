@@ -1,4 +1,4 @@
-"""What tests of captures in their own process stand on: programs that wait for their tracer for longer than in service."""
+"""Base of tests that capture in their own process: programs that wait for their tracer for longer than in service."""
 
 from __future__ import annotations
 

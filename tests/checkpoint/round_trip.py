@@ -1,7 +1,7 @@
-"""Take a real program through capture, death and restore, inside the calling process: what the tracee tests stand on.
+"""Takes a real program through capture, death and restore inside the calling process: base of the tracee tests.
 
-A `Program` writes its output to files in a directory of its own, reads nothing, and is our child, before and after. Everything
-that a snapshot goes through on its way to another robot happens to it here too: it is encoded, decoded and folded.
+A `Program` writes its output to files in a directory of its own, reads nothing, and is our child, before and after. Each step
+of a snapshot on its way to another robot happens here too: it is encoded, decoded and folded.
 """
 
 from __future__ import annotations

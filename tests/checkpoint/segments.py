@@ -1,4 +1,4 @@
-"""Segments for tests: a state that can be told whole from torn, and a child that commits it until it is killed."""
+"""Segments for tests: a state in which a torn one shows, and a child that commits it until it is killed."""
 
 from __future__ import annotations
 

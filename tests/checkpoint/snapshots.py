@@ -1,4 +1,4 @@
-"""Made-up snapshots of a small program, for tests of what stores and sends them."""
+"""Made-up snapshots of a small program, for tests of modules that store and send them."""
 
 from __future__ import annotations
 

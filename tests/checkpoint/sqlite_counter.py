@@ -1,6 +1,6 @@
 """Counts in memory and in a database: one transaction a step. A line is written once its transaction is committed.
 
-Arguments: the database, the journal's mode (delete, wal), how many steps at least; it goes on until a file exists, if one is
+Arguments: the database, the journal's mode (delete, wal), the least number of steps; it continues until a file exists, if one is
 named. In the end it says "ok" if the database is well and has a row for each step.
 """
 

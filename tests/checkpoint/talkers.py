@@ -1,11 +1,11 @@
-"""Two ends of a TCP connection, each a process of its own, which say to each other what a test can check byte for byte.
+"""Two ends of a TCP connection, each a process of its own, which send each other what a test can check byte for byte.
 
     python3 talkers.py caller HOST PORT OWN [ends]     connects from an address of its own; the program that is captured
     python3 talkers.py caller HOST PORT OWN posts      sends its end to itself in a message, and takes it out at the end
     python3 talkers.py called HOST PORT OWN [ends]     listens; its peer, which knows of nothing
 
 Both send until nothing more is taken, while neither reads, and say "ready". Once the file ``go`` is there each reads all that the
-other has said, says something more, and ends its side. Each then says "ok", or what was wrong. One that is told ``ends`` says
+other has sent, sends something more, and ends its side. Each then says "ok", or what was wrong. One that is told ``ends`` sends
 little, and ends its side before it is ready.
 """
 

@@ -1,4 +1,4 @@
-"""Programs that nobody prepared, captured, killed and brought back three times in a row: they compute what they would have."""
+"""Unprepared programs, captured, killed and restored three times in a row: they compute what they would have."""
 
 from __future__ import annotations
 

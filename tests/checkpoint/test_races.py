@@ -1,4 +1,4 @@
-"""Captures that race with what a program does: nothing is lost, no thread is left stopped, no descriptor is left open.
+"""Captures that race with a program's own acts: nothing is lost, no thread is left stopped, no descriptor is left open.
 
 ``FAILOVER_TEST_RACES=10000`` for the long version: so many captures of each kind, some ten minutes each.
 """

@@ -1,4 +1,4 @@
-"""Servers that nobody prepared, with clients: captured, killed and brought back three times; the clients connect again."""
+"""Unprepared servers with clients: captured, killed and restored three times; the clients connect again."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a restore must preserve, one tiny program for each thing: see ``tests/tracees``.
+"""Everything that a restore must preserve, one tiny program for each: see ``tests/tracees``.
 
-Every tracee is captured, runs on for a moment, is killed, comes back and is told to look: it prints what differs. A few are
-also looked at after a capture alone: whoever is captured must never notice.
+Every tracee is captured, runs on for a moment, is killed, restored, and told to look: it prints what differs. A few are
+also checked after a capture alone: a captured program must never notice.
 """
 
 from __future__ import annotations

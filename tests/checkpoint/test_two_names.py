@@ -1,7 +1,7 @@
-"""A file that is reached under two names, one of which is gone, comes back as one file: it is the inode that counts.
+"""A file with two names, one of which is gone, comes back as one file: the inode counts.
 
-sem_open(3) links a temporary name to the real one and unlinks the temporary: the mapping of who made a semaphore looks deleted,
-that of everybody else does not.
+sem_open(3) links a temporary name to the real one and unlinks the temporary: the mapping in the process that made a semaphore
+looks deleted, that in every other process does not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every engine's snapshots must be, so that chain, store and standby need not know where they come from.
+"""The contract of every engine's snapshots, so that chain, store and standby need not know which engine made them.
 
 The ptrace engine on a small process that obeys orders, the cooperative engine on a segment that we write: the same suite.
 """

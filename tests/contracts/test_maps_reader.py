@@ -1,4 +1,4 @@
-"""The mappings of a process that stands still are asked for, not read: whatever has become of them since is noticed."""
+"""The mappings of a process that stands still are asked for, not read: each later change of them is noticed."""
 
 from __future__ import annotations
 

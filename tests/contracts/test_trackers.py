@@ -1,7 +1,7 @@
-"""The contract of ``checkpoint.linux.tracking.Tracker``, on every implementation that this kernel has.
+"""The contract of `checkpoint.linux.memory.tracker.Tracker`, on every implementation that this kernel has.
 
-A child of ours obeys one-letter orders about one mapping; we follow it from outside. It stands still whenever we look,
-because it waits for the next order.
+A child of ours obeys one-letter orders about one mapping; we follow it from outside. It stands still at each look, because it
+waits for the next order.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every team of robots needs, at an interpreter each: key pairs are made once, and handed out again in each test."""
+"""Key pairs for every team of robots: each costs an interpreter, so they are made once and reused in each test."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A program with a write-ahead log of its own: ``ledger.py FOLDER ENOUGH``; it makes steps until ENOUGH exists.
 
-Every step is a transaction: a line in the log, with its sum, forced to the disk; only then it is done, and its number printed.
+Every step is a transaction: a line in the log, with its sum, forced to the disk; only then is it done, and its number printed.
 After some steps all accounts are written aside, renamed, and a new log is begun. Again and again it reads the folder as it would
 after a crash, and compares with its memory: not a line more and none less.
 """

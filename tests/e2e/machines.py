@@ -1,6 +1,6 @@
-"""A machine whose PID 1 is a real systemd, in namespaces of its own: it boots in about a second and goes without a trace.
+"""A machine whose PID 1 is a real systemd, in namespaces of its own: it boots in about a second and leaves no trace.
 
-Its root is laid from this machine's own /usr (an overlay: nothing of it can be changed), this checkout, the Python that runs the
+Its root consists of this machine's own /usr (an overlay: nothing of it can be changed), this checkout, the Python that runs the
 tests, and an /etc and /var of its own. It has its own network, PIDs, hostname and cgroups. Needs root, systemd and overlayfs.
 """
 

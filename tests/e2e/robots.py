@@ -1,6 +1,6 @@
 """Two whole robots for a test: agents with keys, in PID and network namespaces of their own where this machine allows it.
 
-They are the demo's own robots (`failover.cli.demo.robots`), so that what people watch and what tests prove is the same thing.
+They are the demo's own robots (`failover.cli.demo.robots`), so that people watch the same thing that tests prove.
 """
 
 from __future__ import annotations

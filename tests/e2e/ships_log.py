@@ -1,4 +1,4 @@
-"""What a voyage (`tests.e2e.voyage`) has told its log, and whether what it resumed from is what it was promised."""
+"""Log of a voyage (`tests.e2e.voyage`), and the check whether the state from which it resumed is the one it was promised."""
 
 from __future__ import annotations
 

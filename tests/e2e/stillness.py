@@ -1,4 +1,4 @@
-"""How long the machine itself stood still: for processes that nothing of ours can keep waiting, one on each processor."""
+"""Measures how long the machine itself stood still: by processes that no process of ours can delay, one on each processor."""
 
 from __future__ import annotations
 

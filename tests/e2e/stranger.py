@@ -1,4 +1,4 @@
-"""Somebody on the robots' network who does not belong to the team: listens, repeats what it heard, invents, knocks.
+"""A stranger on the robots' network, outside the team: listens, replays what it heard, invents, tries to connect.
 
 Each act is a process of its own inside the network of a robot.
 """

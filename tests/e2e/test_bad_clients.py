@@ -1,4 +1,4 @@
-"""Whoever may use the control socket and talks nonsense: told so, or hung up on; the agent and its components go on."""
+"""Clients that may use the control socket and send nonsense: refused or disconnected; the agent and its components run on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What comes over the network and should not be believed: it changes nothing, is counted, and `failover status` says so."""
+"""Network traffic that should not be believed: it changes nothing, is counted, and `failover status` says so."""
 
 from __future__ import annotations
 

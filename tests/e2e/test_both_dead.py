@@ -1,6 +1,6 @@
-"""Robots come back with empty disks: what they ran comes back to them, from the standby that lives or from the server.
+"""Robots come back with empty disks: their components come back to them, from the standby that lives or from the server.
 
-Each time with a program that nobody prepared and one that keeps its state itself; each of the two robots protects the other.
+Each time with an unprepared program and one that keeps its state itself; each of the two robots protects the other.
 FAILOVER_RETURNS=all plays the returns that CI leaves out as well.
 """
 

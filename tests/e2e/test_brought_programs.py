@@ -1,4 +1,4 @@
-"""Two robots with different files: a program that only one of them has goes on at the other."""
+"""Two robots with different files: a program that only one of them has resumes at the other."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Five robots, a server and a witness under real faults: nothing acts twice, nothing acknowledged is lost, everything goes on.
+"""Five robots, a server, a witness under real faults: nothing acts twice, nothing acknowledged is lost, everything resumes.
 
 Each fault is real: signals to processes, cables and ways of the network that are cut, disks that are full or new (`tests.chaos`).
-Here each kind of fault is dealt once; FAILOVER_FAULTS=200 deals as many, FAILOVER_SEED chooses which, at whom, and for how long.
+Here each kind of fault occurs once; FAILOVER_FAULTS=200 makes as many, FAILOVER_SEED chooses which, at which member, and for how
+long.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Output that was not promised is not seen: whoever follows a component across power cuts reads one history, each line once.
+"""Output that was not promised is not seen: a reader of a component across power cuts reads one history, each line once.
 
-Each line carries dice of the instant in which it was written, and a sum over all dice before it. Whoever saw a line that a
-takeover took back finds that the sums do not fit: no program could write the same line again. (With ``--output=immediate`` these
-tests fail.) FAILOVER_KILLS=50 cuts the power that often, at instants that FAILOVER_SEED chooses.
+Each line carries a random number of the instant in which it was written, and a sum over all numbers before it. A reader that saw
+a line that a takeover took back finds that the sums do not fit: no program could write the same line again. (With
+``--output=immediate`` these tests fail.) FAILOVER_KILLS=50 cuts the power that often, at instants that FAILOVER_SEED chooses.
 """
 
 from __future__ import annotations

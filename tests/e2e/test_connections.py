@@ -1,4 +1,4 @@
-"""TCP connections with somebody outside the team: a handover takes them along and brings them back; a crash resets them."""
+"""TCP connections with peers outside the team: a handover takes them along and brings them back; a crash resets them."""
 
 from __future__ import annotations
 

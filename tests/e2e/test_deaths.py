@@ -1,4 +1,4 @@
-"""Keeper, agent and both are killed, at instants spread over captures and restores: the program is none the worse.
+"""Keeper, agent and both are killed, at instants spread over captures and restores: the program is unharmed.
 
 Two robots of which one waits (``on_loss = "hold"``), so that an agent that is away for a second is a pause of the protection and
 not a takeover. FAILOVER_KILLS=200 kills each that often, at instants that FAILOVER_SEED chooses.

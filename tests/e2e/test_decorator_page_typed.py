@@ -1,4 +1,4 @@
-"""What docs/decorator.md tells to type, typed: two robots on one machine, one of them killed, and the counter counts on."""
+"""The commands of docs/decorator.md, typed: two robots on one machine, one of them killed, and the counter counts on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program goes on at the other robot with that robot's device; what a standby lacks is said while there is time."""
+"""A program resumes at the other robot with that robot's device; a standby reports what it lacks while there is time."""
 
 from __future__ import annotations
 

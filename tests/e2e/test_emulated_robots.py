@@ -1,4 +1,4 @@
-"""Robots of different processors in one team, and two of the same that are both emulated: programs move, or are refused by name.
+"""Robots of different processors in one team, and two equal emulated ones: programs move, or are refused by name.
 
 Takes many minutes: ``FAILOVER_TEST_MACHINES``, as for `tests.machines.test_machines`.
 """

@@ -1,4 +1,4 @@
-"""`failover run` without a word about engines: a program that keeps its state says so itself, at any time, below any launcher."""
+"""`failover run` without an engine named: a program that keeps its state says so itself, at any time, below any launcher."""
 
 from __future__ import annotations
 

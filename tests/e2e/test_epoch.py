@@ -1,4 +1,4 @@
-"""The fencing token reaches a program that nobody prepared: each copy knows the epoch under which it runs, and no other."""
+"""The fencing token reaches an unprepared program: each copy knows the epoch under which it runs, and no other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real-time sender floods a robot's beat port: what is no beat costs nothing, and nobody is replaced or taken over for it."""
+"""A real-time sender floods a robot's heartbeat port: datagrams that are no heartbeats cost nothing and cause no takeover."""
 
 from __future__ import annotations
 

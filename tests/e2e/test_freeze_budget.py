@@ -1,4 +1,4 @@
-"""Status tells of a program that stands still for longer than its operator allows it, wherever it runs."""
+"""Status tells of a program that stands still for longer than its operator allows it, on whichever robot it runs."""
 
 from __future__ import annotations
 

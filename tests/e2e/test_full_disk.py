@@ -1,4 +1,4 @@
-"""The standby's disk is full, really: a small file system of its own. What it holds stays, status says so, space heals it."""
+"""The standby's disk is really full: a small file system of its own. Its content stays, status says so, space heals it."""
 
 from __future__ import annotations
 

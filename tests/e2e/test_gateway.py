@@ -1,4 +1,4 @@
-"""The worst case: a whole robot stands still, guard and all, is replaced, and goes on: the actuator obeys it no more."""
+"""The worst case: a whole robot stands still, guard included, is replaced, and resumes: the actuator obeys it no more."""
 
 from __future__ import annotations
 

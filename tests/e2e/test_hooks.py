@@ -1,4 +1,4 @@
-"""What no snapshot carries is prepared by the operator's own commands, told which robot this is now, which epoch, and why."""
+"""The operator's own commands prepare what no snapshot carries, told which robot this is now, which epoch, and why."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A standby that holds the state of a program, and whose store was damaged, or filled by somebody hostile.
+"""A standby that holds the state of a program, and whose store was damaged, or filled by an attacker.
 
 The harm is done while the standby's agent is away and the other robot is lost, by the project's own writer where no checksum must
-find it. Then the agent comes back, and it is on it to take over: it says what is wrong, and runs nothing.
+find it. Then the agent comes back and must take over: it says what is wrong, and runs nothing.
 FAILOVER_HOSTILE=all tries everything; otherwise one of each kind.
 """
 

@@ -1,4 +1,4 @@
-"""Two robots and the controller of examples/, in C: its state travels, and what it prints has no gap and no repetition."""
+"""Two robots and the controller of examples/, in C: its state travels, and its output has no gap and no repetition."""
 
 from __future__ import annotations
 

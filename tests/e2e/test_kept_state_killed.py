@@ -1,7 +1,7 @@
-"""A program that keeps its state is killed at any instant, with its robot or without: it goes on from what was safe.
+"""A program that keeps its state is killed at any instant, with its robot or without: it resumes from a safe state.
 
-Two robots and a program that commits without pause (`tests.e2e.voyage`), which tells a log of the test's own what was said to be
-safe. Then somebody is killed: the program alone, whatever it does; the whole robot, which comes back later with its disk; a
+Two robots and a program that commits without pause (`tests.e2e.voyage`), which tells a log of the test's own which commits were
+said to be safe. Then the test kills: the program alone, at any act; the whole robot, which comes back later with its disk; a
 keeper, a guard, a part of the agent, the agent. FAILOVER_KILLS=1000 kills so often, at instants that FAILOVER_SEED chooses.
 """
 

@@ -1,4 +1,4 @@
-"""A program that keeps its state goes on under another Python or numpy at the robot that takes it over, and comes back."""
+"""A program that keeps its state resumes under another Python or numpy at the robot that takes it over, and comes back."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Two links between two robots: snapshots keep to the wire, beats use both, a cable that is out degrades and moves nothing.
+"""Two links between two robots: snapshots use the wire, heartbeats both; a cable that is out degrades and moves nothing.
 
-This kernel has no radio to play with, so one of the two cables is declared to lead to one, as an operator would for a radio that
-stands behind an Ethernet port. What the kernel itself knows of real radios: ``tests/agent/worker/network/test_links.py``.
+This kernel has no radio for tests, so one of the two cables is declared to lead to one, as an operator would for a radio behind
+an Ethernet port. The kernel's own facts about real radios: `tests.agent.worker.network.test_links`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A witness whose key was stolen: its sender is changed. It lies for some seconds, and the robots' programs go on."""
+"""A witness whose key was stolen: its sender is changed. It lies for some seconds, and the robots' programs run on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A peer that goes in the middle of a snapshot: nothing half is kept, nothing whole is lost."""
+"""A peer that is lost in the middle of a snapshot: no half of one is kept, no whole one is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an operator orders, on two real robots: handover and back, prefer, release, stop."""
+"""An operator's orders on two real robots: handover and back, prefer, release, stop."""
 
 from __future__ import annotations
 

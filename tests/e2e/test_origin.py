@@ -1,4 +1,4 @@
-"""A program that goes on from a state is told why: what became of the copy before it, wherever that state was made."""
+"""A program that resumes from a state is told why: what happened to the copy before it, wherever that state was made."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Two robots and an ordinary user who orders about a program of theirs: what it carries is read with that user's rights, whatever
-the program executes meanwhile.
+"""Two robots and an ordinary user who gives orders about a program of theirs.
+
+Its carried files are read with that user's rights, whichever program it executes meanwhile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An operator brings to life what the rules hold still, on two real robots; never without being told what that risks."""
+"""An operator brings a held component to life on two real robots, and is always told first what that risks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two robots: the standby holds the newest checkpoint's memory ready in a stopped process, and a takeover lets that one go."""
+"""Two robots: the standby holds the newest checkpoint's memory ready in a stopped process; a takeover resumes that process."""
 
 from __future__ import annotations
 

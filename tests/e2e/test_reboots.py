@@ -1,7 +1,7 @@
 """A standby starts again and cannot hear its healthy primary, or cannot authenticate it: it rewinds nothing.
 
 The network of a robot that boots often comes late (STP, DHCP, Wi-Fi); an operator's keys and team files grow old. Each time the
-primary never stops, and not one number that it has counted is lost.
+primary never stops, and it loses not one number that it has counted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``failover run`` waits for its program: through deaths of its agent, also when the program has gone to the other robot then."""
+"""``failover run`` waits for its program through deaths of its agent, also when the program has moved to the other robot then."""
 
 from __future__ import annotations
 

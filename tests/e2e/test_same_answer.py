@@ -1,4 +1,4 @@
-"""`failover status`, asked at both robots through all that a component goes through: the same words and the same exit status."""
+"""`failover status` at both robots, in every situation of a component: the same words and the same exit status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A server: what it keeps and shows, and that its full disk is told and harms nobody."""
+"""A server: what it keeps and shows, and that its full disk is reported and harms no component."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/servers.md tells to type, typed: both robots die, one comes back with an empty disk, and the counter counts on."""
+"""The commands of docs/servers.md, typed: both robots die, one comes back with an empty disk, and the counter counts on."""
 
 from __future__ import annotations
 

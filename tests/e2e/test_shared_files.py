@@ -1,4 +1,4 @@
-"""Two components that keep one file open for writing: told as not protected while both run, and taken over where it is shared."""
+"""Two components with one file open for writing: reported as not protected while both run, taken over where it is shared."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A cable through which less fits than the program writes: fewer snapshots, each with more in it; the status says so."""
+"""A cable that carries less than the program writes: fewer snapshots, each with more in it; the status says so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the processes of an agent that protects nothing yet have loaded, and what not."""
+"""Which modules the processes of an agent without components have loaded, and which not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program that cannot go on with its state says so where it is read: the takeover failed, and the checkpoint stays."""
+"""A program that cannot resume with its state says so where operators read it: the takeover failed, and the checkpoint stays."""
 
 from __future__ import annotations
 

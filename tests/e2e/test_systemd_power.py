@@ -1,4 +1,4 @@
-"""Two machines, each under a systemd of its own, joined by a cable: one goes, the other counts on."""
+"""Two machines, each under a systemd of its own, joined by a cable: one is lost, the other counts on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several people on one robot: programs run as whoever asked for them, and each gives orders about his own.
+"""Several users on one robot: each program runs as the user who asked for it, and users give orders about their own alone.
 
 On a booted machine with the service as it is shipped, and two real users who are members of its group.
 """

@@ -1,4 +1,4 @@
-"""Two robots, a program that nobody prepared, and what happens to them."""
+"""Two robots and an unprepared program: takeover and the cases around it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program of several threads at one robot, whose power fails: all go on at the other one, confined as they were."""
+"""A program of several threads at one robot, whose power fails: all resume at the other one, confined as they were."""
 
 from __future__ import annotations
 

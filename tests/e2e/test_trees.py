@@ -1,4 +1,4 @@
-"""Programs of several processes at one robot, whose power fails: all of their processes go on at the other one."""
+"""Programs of several processes at one robot, whose power fails: all of their processes resume at the other one."""
 
 from __future__ import annotations
 

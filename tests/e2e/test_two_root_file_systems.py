@@ -1,6 +1,6 @@
 """Two robots of two releases: each has a root file system, a C library and programs of its own, and runs the other's.
 
-Asked for by FAILOVER_OTHER_ROOT, the root of another release than this machine's, with what our Python needs:
+Runs if FAILOVER_OTHER_ROOT names the root of another release than this machine's, with the packages that our Python needs:
 ``debootstrap --include=perl,python3,libffi8,libssl3t64 trixie DIRECTORY`` makes one. Nothing in it is changed: robot2 has it
 below an overlay.
 """

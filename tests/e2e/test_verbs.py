@@ -1,4 +1,4 @@
-"""Every verb as somebody uses it for the first time: what is wrong is said in a sentence, with what to do; nothing is left."""
+"""Every verb as a first-time user types it: each error is one sentence with a cure; nothing is left."""
 
 from __future__ import annotations
 

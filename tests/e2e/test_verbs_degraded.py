@@ -1,4 +1,4 @@
-"""Protection that is not whole: each way it can fail is named by `failover status`, at either robot, and mends itself."""
+"""Protection that is not whole: `failover status` names each way it can fail, at either robot, and each heals by itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a component wrote, watched from either robot while it moves, loses its robot, and ends: no gap, no repetition."""
+"""A component's output, read from either robot while it moves, loses its robot, and ends: no gap, no repetition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""protect and release: a program that somebody else started is taken in, lets itself be moved on, and is let go unharmed."""
+"""protect and release: a program started by another process is taken in, can be moved, and is let go unharmed."""
 
 from __future__ import annotations
 

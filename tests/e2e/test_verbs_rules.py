@@ -1,4 +1,4 @@
-"""What agent.toml says of components, done by real agents."""
+"""Settings of components in agent.toml, as real agents carry them out."""
 
 from __future__ import annotations
 

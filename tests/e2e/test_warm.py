@@ -1,4 +1,4 @@
-"""Two robots and a program that keeps its state: its standby has it started already, and a takeover is one message."""
+"""Two robots and a program that keeps its state: its standby has started it already, and a takeover is one message."""
 
 from __future__ import annotations
 

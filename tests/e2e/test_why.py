@@ -1,4 +1,4 @@
-"""The story of a takeover, as somebody reads it who was not there: at either robot, after the agents were restarted."""
+"""The event log of a takeover, as a reader sees it who was not there: at either robot, after the agents were restarted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program that keeps one field of every kind and an array of a MB, under whatever Python it is started by; it says which.
+"""A program that keeps one field of every kind and an array of a MB, and names the Python under which it was started.
 
 Its output: ``# PYTHON NUMPY DIGEST`` at the beginning of each life, where DIGEST is the same for the same state, then numbers.
 """

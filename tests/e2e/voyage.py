@@ -1,7 +1,7 @@
-"""A program that keeps its state and tells an independent log what became of it: ``python voyage.py LOG [RUNGS]``.
+"""A program that keeps its state and reports its lives to an independent log: ``python voyage.py LOG [RUNGS]``.
 
-It commits without pause. Everything in its state follows from the steps that led to it, so that a state which was put together
-out of two commits, or which belongs to a life that was abandoned, gives itself away. Lines of the log, each one write(2):
+It commits without pause. Everything in its state follows from the steps that led to it, so a state that was put together out of
+two commits, or that belongs to a life that was abandoned, gives itself away. Lines of the log, each one write(2):
 
     r LIFE NUMBER SEAL EPOCH WHY PORTRAIT    it resumed from, or began with, this step; EPOCH 0 where nothing says
     b LIFE NUMBER SEAL                       it begins to commit this step

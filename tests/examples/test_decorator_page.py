@@ -1,4 +1,4 @@
-"""Every program on the page of the decorator is run, as often as the page shows what it prints."""
+"""Every program on the page of the decorator, run as often as the page shows its output."""
 
 from __future__ import annotations
 

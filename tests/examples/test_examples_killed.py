@@ -1,4 +1,4 @@
-"""The examples, killed again and again and started again: their output has no gap, and they end as if nothing had been."""
+"""The examples, killed again and again and started again: their output has no gap, and they end as without kills."""
 
 from __future__ import annotations
 

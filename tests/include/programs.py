@@ -1,4 +1,4 @@
-"""Programs in C that include failover.h: made once a session, and what their state is at each step."""
+"""Programs in C that include failover.h: made once a session, and their state at each step."""
 
 from __future__ import annotations
 

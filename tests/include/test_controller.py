@@ -1,4 +1,4 @@
-"""examples/controller.c, killed again and again: what it controls does not notice."""
+"""examples/controller.c, killed again and again: the plant that it controls does not notice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""failover.h: what C commits is one commit to every reader, whoever is killed; what cannot be kept is refused by a sentence."""
+"""failover.h: each commit in C is one commit to every reader, whichever process is killed; refusals are sentences."""
 
 from __future__ import annotations
 

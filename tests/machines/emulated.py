@@ -4,8 +4,8 @@ python -m tests.machines.emulated KIND                says which packages it tak
 python -m tests.machines.emulated KIND DIRECTORY      makes it there, for FAILOVER_TEST_MACHINES_DIRECTORY
 
 Debian for that processor with a kernel of its own choice, as files in one directory; nothing outside of it is changed. It takes
-root, and the packages of its kind. An emulated machine is some twenty times slower than a real one: what must be in time on
-a robot is not measured here.
+root, and the packages of its kind. An emulated machine is some twenty times slower than a real one: deadlines of a robot are not
+measured here.
 """
 
 from __future__ import annotations

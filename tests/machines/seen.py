@@ -1,4 +1,4 @@
-"""What was seen on which machine: runs of the tests there, kept beside this file, and the tables of docs/machines.md.
+"""Results per machine: runs of the tests there, kept beside this file, and the tables of docs/machines.md.
 
 pytest --junitxml=run.xml [--tracking digest] tests/checkpoint/test_tracees.py …     on that machine
 python -m tests.machines.seen run.xml …                                              keeps the runs, and writes the tables

@@ -1,8 +1,8 @@
-"""Machines of other kinds, emulated: programs go through three lives there. Takes many minutes each: ``FAILOVER_TEST_MACHINES``.
+"""Machines of other kinds, emulated: programs live three lives there. Takes many minutes each: ``FAILOVER_TEST_MACHINES``.
 
 That is "all", or names of `tests.machines.emulated.KINDS`, with commas between them. ``FAILOVER_TEST_MACHINES_DIRECTORY`` names a
-directory where they are kept for the next time; ``FAILOVER_TEST_KERNEL`` packages with a kernel of your own, a robot's for one
-(``linux-image-….deb,linux-modules-….deb``), of which there is a machine more.
+directory where they are kept for the next time. ``FAILOVER_TEST_KERNEL`` names packages with a kernel of your own, a robot's for
+example (``linux-image-….deb,linux-modules-….deb``); this adds one machine.
 """
 
 from __future__ import annotations

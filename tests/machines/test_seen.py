@@ -1,4 +1,4 @@
-"""The page of machines holds what the kept runs say."""
+"""The page of machines holds the results of the kept runs."""
 
 from __future__ import annotations
 

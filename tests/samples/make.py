@@ -1,4 +1,4 @@
-"""Write the sample files of the format's versions: ``python -m tests.samples.make`` (only when a version changes)."""
+"""Writes the sample files of the format's versions: ``python -m tests.samples.make`` (only when a version changes)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Write the sample of a kept state: ``python -m tests.samples.state`` (only when the wire format changes).
+"""Writes the sample of a kept state: ``python -m tests.samples.state`` (only when the wire format changes).
 
-The one that lies here was written by Python 3.12 with numpy 1.26.
+Python 3.12 with numpy 1.26 wrote the sample in this folder.
 """
 
 from __future__ import annotations

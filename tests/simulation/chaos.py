@@ -1,4 +1,4 @@
-"""One seed, one life: which team, what goes wrong, when, and how it ends well."""
+"""One seed, one life: which team, which faults, when, and how it ends well."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a simulated robot carries out what its rules order: programs, snapshots, transfers.
+"""How a simulated robot carries out the orders of its rules: programs, snapshots, transfers.
 
 Everything takes a while and may fail.
 """

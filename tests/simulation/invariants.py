@@ -1,4 +1,4 @@
-"""What must hold at every instant of every world, whatever happens to it."""
+"""Invariants that must hold at every instant of every simulated world, in every fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Members whose key was stolen: their rules are honest, what they say is not. Each lie changes a beat on its way to one peer."""
+"""Members whose key was stolen: honest rules, false messages. Each lie changes a heartbeat on its way to one peer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deliberate mistakes in the rules. Each must be caught by some seed: a simulator that finds nothing proves nothing."""
+"""Deliberate mistakes in the rules. Some seed must catch each: a simulator that finds nothing proves nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The things that a simulated world is made of: clocks, disks, programs, robots, the network between them."""
+"""Parts of a simulated world: clocks, disks, programs, robots, the network between them."""
 
 from __future__ import annotations
 

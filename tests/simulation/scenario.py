@@ -1,4 +1,4 @@
-"""Stories that a person can read, played by the daemon's own rules.
+"""Scenarios that a person can read, played by the daemon's own rules.
 
 A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` looks at the world at that instant:
 
@@ -10,9 +10,9 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     100  run robot1                        an operator starts the component there
     500  cut robot1 robot2                 nothing passes, both ways;  one-way A B: from A to B;  mend: all cuts end
     500  sealed robot1 robot2              neither can authenticate the other, until both have been told: read robot1 robot2
-    500  noise robot2 robot1 900           for 900 ms somebody sends robot1 garbage from robot2's address
+    500  noise robot2 robot1 900           for 900 ms an attacker sends robot1 garbage from robot2's address
     550  old-team robot1 robot2            from its next start on robot1's team file does not know robot2;  new-team robot1 robot2
-    500  lies witness1 finishes            from now on its beats are changed on their way, see liars.py;  honest: not any more
+    500  lies witness1 finishes            from now on its heartbeats are changed on their way (liars.py);  honest: not any more
     900  later robot1 5000                 it is off, and on its disk so many more epochs have passed
     900  tells robot1 witness1 ends runs   robot1 has refused words of witness1 for these reasons, and for no others
     600  stall robot1 300                  its loop gets no processor for 300 ms
@@ -21,7 +21,7 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
     800  promote robot1                    an operator has robot1 run it, without waiting for others
-    850  new-disk robot1                   its checkpoints are gone; what it has decided is not
+    850  new-disk robot1                   its checkpoints are gone; its decisions are not
     850  new-robot robot1                  both are gone
     900  expect robot1 primary             its state there
     900  epoch robot1 2                    the epoch it knows

@@ -1,4 +1,4 @@
-"""A component returns by itself to the robot that is preferred, as soon as that one lacks nothing of what it needs."""
+"""A component returns by itself to its preferred robot, as soon as that robot lacks nothing of what it needs."""
 
 from __future__ import annotations
 

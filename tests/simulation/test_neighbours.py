@@ -1,4 +1,4 @@
-"""A protects B while B protects A: no spare computer stands idle, and whichever is lost, both components live on."""
+"""A protects B while B protects A: no spare computer stands idle, and whichever robot is lost, both components live on."""
 
 from __future__ import annotations
 

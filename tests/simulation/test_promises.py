@@ -1,4 +1,4 @@
-"""Each promise that ``failover status`` states (``failover/core/status/guarantee.py``), held against what happens."""
+"""Each promise that ``failover status`` states (`failover.core.status.guarantee`), held against the behaviour of the rules."""
 
 from __future__ import annotations
 

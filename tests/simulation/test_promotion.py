@@ -1,4 +1,4 @@
-"""`failover promote`: what an operator's order brings to life, and what he is told before."""
+"""`failover promote`: which components an operator's order brings to life, and which risks the operator is told before."""
 
 from __future__ import annotations
 

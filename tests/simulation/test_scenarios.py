@@ -1,4 +1,4 @@
-"""Every story in ``scenarios/`` comes true."""
+"""Every scenario in ``scenarios/`` comes true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lives of a team, from seeds: nothing that goes wrong in any of them breaks a promise."""
+"""Lives of a team, from seeds: no fault in any of them breaks a promise."""
 
 from __future__ import annotations
 

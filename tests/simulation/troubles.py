@@ -1,4 +1,4 @@
-"""What can go wrong in a world: each method is one trouble, which begins now and ends by itself."""
+"""Faults of a simulated world: each method is one fault, which begins now and ends by itself."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A team of robots in one process: clocks, disks, programs and network are made up; the rules are the daemon's own ``Node``.
 
 Everything that happens comes from one seed. True time is the world's alone (nanoseconds from 0); each robot reads a clock of its
-own that drifts and jumps. A robot works off one step at a time: the ballot is durable some time later, then the beats leave and
-the acts begin after that, and a power cut in between loses what had not happened yet.
+own that drifts and jumps. A robot carries out one step at a time: the vote record is durable some time later, then the heartbeats
+leave and the acts begin after that, and a power cut in between loses what had not happened yet.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Three processes that change memory of their own, and memory that they share, in turns: ``mutable_family.py SEED``.
 
-A token goes round by pipes; whoever has it takes the step of its number: it writes, empties or maps again what chance says, which
-is the same for the same seed and step. When the file ``go`` is there each replays all steps on bytes of its own, and says whether
-its memory is what it must be. The first one writes the number of each step of its own.
+A token passes round by pipes. The process that has it takes the step of its number: it writes, empties or maps again what chance
+says, which is the same for the same seed and step. When the file ``go`` is there each replays all steps on bytes of its own, and
+says whether its memory is what it must be. The first one writes the number of each step of its own.
 """
 
 import mmap

@@ -1,9 +1,10 @@
-"""One component on this robot: its guard, its keeper, its streams, as one thing to capture, freeze and end.
+"""One component on this robot: its guard, keeper and streams as one object to capture, freeze and end.
 
-All of it belongs to one asyncio loop (the lanes process). Everything here survives the agent: a restarted one finds the guards by
-their sockets (`births.reconnect`) and gives each component a new keeper, whose first capture is a base.
+All of it belongs to one asyncio loop (the worker process). Everything here survives the agent: a restarted agent finds the guards
+by their sockets (`agent.worker.components.launch.reconnect`) and gives each component a new keeper, whose first capture is a
+base.
 
-    component = await births.start("/lab/robot1/mapper", program, places)
+    component = await launch.start("/lab/robot1/mapper", program, places)
     await component.protect()
     captured = await component.capture(base=False, generation=1, sequence=7, epoch=3)   # send captured.snapshot to the standby …
     await component.acknowledge(captured.position)                                      # … and when it is stored there
@@ -12,7 +13,7 @@ their sockets (`births.reconnect`) and gives each component a new keeper, whose 
 
 On the standby, when it takes over:
 
-    component = await births.restore(name, chain_descriptors, places, outage_ns=…)   # stopped, whole, uncommitted
+    component = await launch.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted
     await component.resume()                                                            # it runs, protected already
 """
 

@@ -1,4 +1,4 @@
-"""One end of a `checkpoint.keeper.messages` inside asyncio: requests are answered in order, events come in between."""
+"""One end of a `checkpoint.keeper.messages` inside asyncio: answers come in the order of the requests, events in between."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every component in this robot's charge is surrounded by, and what can go wrong with it."""
+"""Context that the modules of every component on this robot share, and the errors that can occur with a component."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When commands are run for a component, whose they are, and what they are told."""
+"""Decides when a component's hooks run, whose commands they are, and what they are told."""
 
 from __future__ import annotations
 

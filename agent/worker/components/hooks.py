@@ -1,23 +1,24 @@
-"""Commands that a robot runs before a program begins here, before it is captured, and before and after it goes on here.
+"""Runs a robot's hooks: commands before a program begins here, before it is captured, and before and after it resumes here.
 
-What no snapshot carries is theirs: a device is opened, an address taken over, the places of this robot's own wheels written where
-the program looks for them. They are told in their environment which robot this is now, and why:
+Hooks prepare what no snapshot carries: they open a device, take over an address, or write the settings of this robot's own wheels
+where the program looks for them. Their environment tells them which robot this is now, and why:
 
     FAILOVER_HOOK        before_start, before_capture, before_resume or after_resume
     FAILOVER_COMPONENT   the component's name
     FAILOVER_ROBOT       this robot
-    FAILOVER_EPOCH       the fencing token of the program that begins, is captured, or goes on
+    FAILOVER_EPOCH       the fencing token of the program that begins, is captured, or resumes
     FAILOVER_GENERATION  of the snapshots that are taken of it here
     FAILOVER_WHY         started, captured, restarted (here, after a crash), taken over, handed over
     FAILOVER_PID         the program's, as this robot knows it; not before it is there (before_start, before_resume)
-    FAILOVER_FROM        the robot whose checkpoint it goes on from; not where it is started or captured
+    FAILOVER_FROM        the robot whose checkpoint it resumes from; not where it is started or captured
     FAILOVER_AGE_MS      how old that checkpoint is; likewise
 
 Standard output and error go to the agent's log, under systemd to the journal, and the last line to ``failover why``: the
 component's own output is the program's alone. No shell reads the command.
 
-An after_resume of the one word ``signal:SIGUSR2`` runs nothing: the program itself gets that signal before its next instruction,
-with the generation as its value (``epoch × 64 + the robot's place in the order of names``), and its handler is the hook.
+An after_resume of the one word ``signal:SIGUSR2`` runs no command: the program itself gets that signal before its next
+instruction, with the generation as its value (``epoch × 64 + the robot's place in the order of names``), and its handler is the
+hook.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The keeper of one component: had, told to follow a process, asked about it, and lost."""
+"""Client of one component's keeper: gets one, has it follow a process, asks it about the process, notices its loss."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How a component of this robot comes to be: started afresh, taken in, restored from a checkpoint, or found again.
+"""Ways in which a component begins on this robot: started, taken in, restored from a checkpoint, or found again.
 
-component = await births.start("/lab/robot1/mapper", program, places)           # it runs, and is not protected yet
-component = await births.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted: `resume` it
+component = await launch.start("/lab/robot1/mapper", program, places)           # it runs, and is not protected yet
+component = await launch.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted: `resume` it
 """
 
 from __future__ import annotations

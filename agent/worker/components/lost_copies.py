@@ -1,4 +1,4 @@
-"""States of copies that lost their primacy: kept aside for people to inspect. Nobody resumes from one by himself."""
+"""Keeps the states of copies that lost their primacy, for inspection by a person. failover never resumes from one by itself."""
 
 from __future__ import annotations
 

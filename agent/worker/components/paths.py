@@ -1,4 +1,4 @@
-"""Where the components of one robot keep their things: sockets, output, and where their guards come from."""
+"""Paths of the components of one robot: sockets, output, and where their guards come from."""
 
 from __future__ import annotations
 

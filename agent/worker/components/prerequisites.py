@@ -1,8 +1,8 @@
-"""What this robot lacks of what a component needs to go on here: asked before it is moved here, and looked at while it stands by.
+"""Finds what this robot lacks to run a component: before a move here, and while this robot is the standby.
 
-Where it runs it is looked which of its files others hold open for writing: each of them can be captured, and the restore of the
-one that comes second is refused. Its newest checkpoint here tells what it needs. A keeper compares, for it knows how a restore
-would; nothing is started.
+At the robot where it runs, the agent checks which of its files other components hold open for writing: each of them can be
+captured, but the restore of the second one is refused. The component's newest checkpoint at this robot lists what it needs. A
+keeper compares, because it knows how a restore would; no program is started.
 """
 
 from __future__ import annotations

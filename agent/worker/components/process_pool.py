@@ -1,7 +1,8 @@
-"""Guards and keepers are born here, in advance: a takeover does not wait for an interpreter to start.
+"""Starts guards and keepers in advance: a takeover does not wait for an interpreter to start.
 
-As many pairs wait as there are components that this robot may have to take over and has no ready copy of (that has its pair), up
-to `SPARES_MAX`, and always one from the first component on: an agent that has nothing to protect has no memory taken by them.
+One pair waits for each component that this robot may have to take over and of which it has no ready copy (a ready copy has its
+own pair), up to `SPARES_MAX`. From the first component on, at least one pair waits. An agent without components has no waiting
+pairs, and so spends no memory on them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The ready copy of one component at its standby: laid from the chain, brought on with each checkpoint, given away when needed.
+"""Ready copy of one component at its standby: built from the chain, updated with each checkpoint, handed over when needed.
 
-One that fails, or is torn, is ended and laid again, more and more seldom. A program that can have none goes on from its
-chain, and status says why.
+A copy that fails or is inconsistent is ended and built again, at growing intervals. A program that can have no copy resumes from
+its chain, and status says why.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""With whose rights a snapshot may come back: those of its owner, and no more (`checkpoint.snapshot.credentials`).
+"""Limits the rights of a restored snapshot to those of its owner (`checkpoint.snapshot.credentials`).
 
-An agent of root restores with root's rights; what a snapshot asks for is set. Priorities and limits come back as they were: root
-gives them to ordinary programs while they run (chrt, prlimit, RealtimeKit), and who hands snapshots in counts as root.
+An agent of root restores with root's rights: it sets what a snapshot asks for. Priorities and limits come back as they were: root
+gives them to ordinary programs while they run (chrt, prlimit, RealtimeKit), and a client that hands snapshots in counts as root.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a component comes back from a checkpoint: by the engine that made it, and by what waits for it where something does."""
+"""Resumes a component from a checkpoint: by the engine that made it, and by the process that waits for it where one does."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Under which epoch each program on this robot was let run, and on which terms: noted before it runs, read by the next agent.
+"""Records the epoch and the terms under which each program on this robot runs: written before it runs, read by the next agent.
 
-One small file a component in the runtime directory: it has to outlive the agent, not the robot.
+One small file per component in the runtime directory: it has to outlive the agent, not the robot.
 """
 
 from __future__ import annotations

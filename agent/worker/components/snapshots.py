@@ -1,4 +1,4 @@
-"""Snapshots of one component in this robot's charge: taken, stored, kept aside, put away."""
+"""Snapshots of one component on this robot: taken, stored, kept aside, pruned or dropped."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Whether a process that owes an answer still does anything: one that was stopped, or hangs, is ended, so that it is replaced.
+"""Ends a guard or keeper that owes an answer and was stopped or hangs, so that it is replaced.
 
-A guard that stands still freezes nothing when its program's lease ends; a keeper that does takes no snapshots, and may stand in
-the middle of one, with the program. Both are made for being lost: the program is resumed, or gets another keeper.
+A guard that stands still freezes nothing when its program's lease ends. A keeper that stands still takes no snapshots, and may
+stand in the middle of one, with the program. failover tolerates the loss of both: the program is resumed, or gets another keeper.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What this robot knows of one component beside the core's own view: counts, times and reasons, for ``failover status``."""
+"""Figures of one component for ``failover status``, beside the core's own view: counts, times and reasons."""
 
 from __future__ import annotations
 

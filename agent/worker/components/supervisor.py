@@ -1,7 +1,7 @@
-"""One component in this robot's charge: the core's acts on it, carried out in order, and answered by events.
+"""Supervisor of one component on this robot: carries out the core's acts on it in order and answers by events.
 
-Acts of one component wait for one another; acts of two components do not. Two kinds do not wait: a lease must be renewed, and a
-program frozen, however long a capture takes; they go to the guard, which nothing else keeps busy.
+Acts of one component wait for one another; acts of two components do not. Two kinds do not wait: the renewal of a lease and the
+freeze of a program, however long a capture takes. They go to the guard, which no other work keeps busy.
 """
 
 from __future__ import annotations

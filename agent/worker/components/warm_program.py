@@ -1,4 +1,4 @@
-"""A program that waits at its standby: started in advance, tried again when it fails, given away when it is needed."""
+"""Warm program at its standby: started in advance, tried again when it fails, handed over when it is needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the verbs of the control socket take; their meaning: `failover.client.control`."""
+"""Arguments of the control socket's verbs; `failover.client.control` defines their meaning."""
 
 from __future__ import annotations
 

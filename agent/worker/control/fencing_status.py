@@ -1,8 +1,9 @@
-"""What keeps a program here from acting when it may not, in one sentence, and what this robot does not have for it.
+"""Status of fencing in one sentence: what keeps a program here from acting when it may not, and what this robot lacks for it.
 
 Each part alone, and agent and keeper together, may die or stand still: the guard freezes its program before the lease ends, and a
-guard that stands still is ended with its program. Only if all of them stand still at once, as in a machine that hangs for a while
-and goes on, does nothing here help: then a hardware watchdog resets the robot, or somebody outside switches it off.
+guard that stands still is ended with its program. One case remains: all of them stand still at once, as in a machine that hangs
+for a while and then continues. Nothing here helps then: a hardware watchdog must reset the robot, or another machine or a person
+must switch it off.
 
 Source: the kernel's Documentation/watchdog/watchdog-api.rst and Documentation/ABI/testing/sysfs-class-watchdog.
 """

@@ -1,7 +1,7 @@
-"""What a component wrote, passed on to whoever asks, from the robot that has it.
+"""Passes a component's output on to a client, from the robot that has it.
 
-While it runs, its standby has every byte that no takeover can take back, so it answers by itself. Its end, and whatever a robot
-without checkpoints is asked for, is read at the robot where it runs or ran, piece by piece.
+While the component runs, its standby has every byte that no takeover can take back, so the standby answers by itself. The end of
+the output, and any request to a robot without checkpoints, is read at the robot where the component runs or ran, piece by piece.
 """
 
 from __future__ import annotations

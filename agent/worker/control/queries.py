@@ -1,7 +1,7 @@
-"""What every member answers: how things stand, and why.
+"""Queries that every member answers: the present state, and the reasons of past decisions.
 
-`agent.worker.control.verbs` adds the orders. A witness answers by this alone: nothing in here needs more than the core's view of
-the team.
+`agent.worker.control.verbs` adds the orders. A witness answers by this module alone: nothing here needs more than the core's view
+of the team.
 """
 
 from __future__ import annotations

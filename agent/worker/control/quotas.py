@@ -1,8 +1,7 @@
-"""How many connections of the control socket each user may hold, how many bytes of requests, and how many components: no user
-shuts another out.
+"""Limits per user on connections of the control socket, bytes of requests, and components: no user shuts another out.
 
-Root and the agent's own user have places of their own, which no other user can take. Everybody else shares a number of places and
-of bytes, of which one user gets a part.
+Root and the agent's own user have places of their own, which no other user can take. All other users share a number of places and
+of bytes; each gets a part of them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The control socket: who asks the agent what, on this robot. The wire and the verbs are `failover.client.control`'s."""
+"""Server of the control socket: identifies clients, takes their requests. Wire and verbs: `failover.client.control`."""
 
 from __future__ import annotations
 

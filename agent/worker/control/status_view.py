@@ -1,4 +1,4 @@
-"""What ``failover status`` shows: the core's view and what the lanes know. The fields: `failover.client.control`."""
+"""Builds what ``failover status`` shows: the core's view and what the worker process knows. Fields: `failover.client.control`."""
 
 from __future__ import annotations
 

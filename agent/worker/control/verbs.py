@@ -1,4 +1,4 @@
-"""What the agent does for a client of the control socket, verb by verb. What the core must decide goes to it as a command."""
+"""Carries out the verbs of the control socket. What the core must decide goes to it as a command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``failover why``: this robot's story and every other robot's, read off one clock and told in one order."""
+"""Answers ``failover why``: merges this robot's event log and every other robot's, on one clock, in one order."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""All connections to the other robots: the bulk lane on the wired link, and one lane for words on each further link.
+"""All connections to the other robots: the replication link on the wire, and a message link on each further network link.
 
-Snapshots, which are large and secret, keep to the bulk lane. Orders, questions and the keys of beats are small; while the cable
-is out they go over another link, so that a robot whose agent restarts meanwhile is not taken for dead for want of a key. A
-further link's lane listens at the host of that link's beat address and at the bulk lane's port.
+Snapshots, which are large and secret, stay on the replication link. Orders, questions and the keys of heartbeats are small. While
+the cable is out they travel over another link, so that a robot whose agent restarts meanwhile is not taken for dead for want of a
+key. A message link listens at the host of that network link's heartbeat address and at the replication link's port.
 """
 
 from __future__ import annotations

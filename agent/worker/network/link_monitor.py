@@ -1,6 +1,6 @@
-"""Watches for cables that are pulled and plugged, addresses that come and go: the kernel says so, nobody has to ask.
+"""Watches for cables that are pulled and plugged and for addresses that come and go: the kernel reports them, without polling.
 
-Where it does not (no netlink socket to be had), it is asked once a second.
+Where the kernel does not report them (no netlink socket can be opened), this module polls once a second.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The links of this robot: which are wired and which wireless, whether their cable is in, and what may travel over them.
+"""Network links of this robot: wired or wireless, cable in or out, and which traffic may use them.
 
-Beats go over every link. Snapshots are large and are a program's memory: they go over wired links alone, unless the operator
-allows more (``snapshots_over``). What the kernel knows decides what a link is; where it cannot know, because behind an Ethernet
-port stands a radio, the operator says so (``wireless``).
+Heartbeats use every link. Snapshots are large and are a program's memory: they use wired links alone, unless the operator allows
+more (``snapshots_over``). What the kernel knows decides what a link is. Where the kernel cannot know, because a radio is behind
+an Ethernet port, the operator says so (``wireless``).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Orders that are given on one robot and carried out on another: where the component runs.
+"""Orders given on one robot and carried out on another, where the component runs.
 
-An order travels as an `Errand` on the bulk lane, which says who the sender is; every robot of the team may give one. It is
-carried out as if it had been given there, and its answer travels back. It is carried out once or not at all: when the connection
-is lost in between, whoever gave it is told that nobody knows.
+An order travels as an `Errand` on the replication link, which identifies the sender; every robot of the team may give one. The
+other robot carries it out as if it had been given there, and the answer travels back. It is carried out once or not at all: when
+the connection is lost in between, the agent tells the client that the result is unknown.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The bulk lane: ZeroMQ between agents, authenticated and encrypted by CURVE. The only ``zmq`` import.
+"""The replication link: ZeroMQ between agents, authenticated and encrypted by CURVE. The only ``zmq`` import.
 
-One ROUTER socket hears everybody; one DEALER socket speaks to each peer. A connection carries one direction's messages, in
-order. What is queued for a connection is gone when the connection is: the core says again what still matters.
+One ROUTER socket receives from all peers; one DEALER socket sends to each peer. A connection carries one direction's messages, in
+order. Messages queued for a connection are lost with the connection: the core says again what still matters.
 
-Who speaks is known by key, not by claim: the ZAP answer below admits only public keys of the team file and names their owner.
-Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
+The link identifies a sender by key, not by claim: the ZAP answer below admits only public keys of the team file and names their
+owner. Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
 """
 
 from __future__ import annotations

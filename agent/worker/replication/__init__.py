@@ -1,1 +1,1 @@
-"""Snapshots and the files of programs, on their way out and in: transfers under credit."""
+"""Snapshots and the files of programs, outgoing and incoming: transfers under credit."""

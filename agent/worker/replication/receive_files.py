@@ -1,7 +1,7 @@
-"""What other robots' programs need, at the robot that is to stand by: which of it is here, what is lacking, what comes in.
+"""Receives the files that other robots' programs need, at their future standby: which are here, which lack, which arrive.
 
-A file is here when the one at its path has the very content, or when that was brought before (`checkpoint.store.content_store`).
-A server, which runs nothing, and whose own files help nobody, keeps all of it.
+A file is here when the one at its path has the very content, or when that content was brought before
+(`checkpoint.store.content_store`). A server runs nothing, and its own files help no program: it keeps every file.
 """
 
 from __future__ import annotations

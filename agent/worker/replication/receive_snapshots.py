@@ -1,4 +1,4 @@
-"""What a standby does with what comes in: only from whom the core admitted, verified, stored, and only then told."""
+"""Receives snapshots at a standby: takes them only from senders that the core admitted, verifies, stores, then reports them."""
 
 from __future__ import annotations
 

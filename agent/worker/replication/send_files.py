@@ -1,7 +1,7 @@
-"""A program's files, at the robot that runs it: its standby is asked what it lacks and sent that, once, before a snapshot goes.
+"""Sends a program's files from the robot that runs it: asks the standby what it lacks and sends that once, before a snapshot.
 
-A snapshot that needs a file which its standby has not could not be resumed there: so it is offered only when all is there. What
-was there once is not asked again with each delta, only when something else is needed, and now and then.
+A standby could not resume a snapshot that needs a file which it lacks, so the agent offers a snapshot only when all its files are
+there. The agent does not ask again with each delta, only when the snapshot needs other files, and now and then.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Snapshots that leave this robot's store for another's: the acts Ship and CancelShip."""
+"""Sends snapshots from this robot's store to another's: the acts Ship and CancelShip."""
 
 from __future__ import annotations
 

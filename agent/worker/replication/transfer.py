@@ -1,7 +1,7 @@
-"""Snapshots and the files of programs across the bulk lane: transfers under credit, from a file here into an unnamed one there.
+"""Transfers of snapshots and program files over the replication link: under credit, from a file here into an unnamed one there.
 
-Nothing here knows what a snapshot is. Files give way to snapshots, so that bringing a program along delays no checkpoint. A
-transfer ends in one of two ways: the receiver has every byte, or nothing of it is kept on either side and both say why.
+Nothing here knows what a snapshot is. Files give way to snapshots, so that bringing a program's files delays no checkpoint. A
+transfer ends in one of two ways: the receiver has every byte, or neither side keeps anything of it and both say why.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""``failover demo``: two robots on this machine, real programs, a power cut, the programs go on.
+"""``failover demo``: two robots on this machine, real programs, a power cut; the programs resume.
 
-Four rooms: `programs` (what runs), `robots` (where it runs, and how it loses its power), `play` (the acts, in order),
-`interruption` (Ctrl-C at any instant).
+Main modules: `failover.cli.demo.programs` (the programs that run), `failover.cli.demo.robots` (where they run, and the power
+cut), `failover.cli.demo.play` (the steps, in order), `failover.cli.demo.interruption` (Ctrl-C at any instant).
 """

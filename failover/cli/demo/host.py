@@ -1,11 +1,11 @@
-"""One robot's computer, played by a process: it starts the agent, adopts every orphan, and everything in it dies with it.
+"""One robot's computer, simulated by a process: it starts the agent, adopts every orphan, and all of its processes die with it.
 
 Run as ``python -m failover.cli.demo.host [--pids] -- COMMAND…``. With ``--pids`` the robot has a PID namespace and a /proc of its
 own, so that it sees no process of another robot, and the kernel ends all of it when its first process ends. Without, the
-host is a subreaper: a robot's processes are its descendants, whatever forks twice.
+host is a subreaper: a robot's processes are its descendants, even those that fork twice.
 
-The command starts when a byte comes on standard input: by then the robot's network has been laid. End of file there means
-that whoever started the host has gone.
+The command starts when a byte comes on standard input: by then the robot's network exists. End of file there means that the
+process that started the host has ended.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Being told to end (Ctrl-C, SIGTERM, SIGHUP): at once while the play goes on, never amid the beginning or ending of something.
+"""Ends the demo on request (Ctrl-C, SIGTERM, SIGHUP): at once between steps, never in the middle of a start or an end.
 
-A signal may arrive between the start of a process and the line that notes it, or while everything is being ended: it would leave
-something behind. So it is only noted, except where `allowed`.
+A signal may arrive between the start of a process and the line that records it, or while everything is being ended: it would
+leave something behind. So the handler only records it, except where `allowed`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The demo's acts, in order: set the stage, protect, look on, cut the power, look on, compare."""
+"""Steps of the demo, in order: build the robots, protect, watch, cut the power, watch, compare."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The programs of the demo: ordinary ones that nobody prepared, whose output depends on nothing but themselves."""
+"""The programs of the demo: ordinary, unprepared ones, whose output depends on nothing but themselves."""
 
 from __future__ import annotations
 

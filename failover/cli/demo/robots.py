@@ -1,7 +1,7 @@
 """The robots of the demo: directories, keys, namespaces, agents; and the power cut.
 
-Nothing of a robot outlives its host process (`host`), and network namespaces have no names, so that they go with their
-last process: whatever ends the demo, only a temporary directory can be left.
+Nothing of a robot outlives its host process (`failover.cli.demo.host`), and network namespaces have no names, so that they go
+with their last process: however the demo ends, at most a temporary directory can be left.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where the demo tells what happens: lines, and on a terminal a table above which they scroll."""
+"""Output of the demo: lines, and on a terminal a table above which they scroll."""
 
 from __future__ import annotations
 

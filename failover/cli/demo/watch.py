@@ -1,4 +1,4 @@
-"""Looking on: one program's output as a robot's agent tells it, with the instant at which each piece arrived."""
+"""Watches one program's output through a robot's agent, with the instant at which each piece arrived."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What commands print: tables, colours, the tree of the team."""
+"""Output of commands: tables, colours, the tree of the team."""

@@ -1,4 +1,4 @@
-"""The team as rows of a tree: what ``failover status`` shows, without saying how it is drawn.
+"""The team as rows of a tree, as ``failover status`` shows it, independent of how it is drawn.
 
 Pure: the agent's answer in (see `failover.client.control.STATUS`), rows of text out.
 """

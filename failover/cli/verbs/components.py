@@ -1,4 +1,4 @@
-"""run, protect, release, stop, logs, handover, failback, promote, prefer: what is done with one component."""
+"""run, protect, release, stop, logs, handover, failback, promote, prefer: the verbs that act on one component."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""inspect: what a snapshot's file holds, in tables or as JSON, after every byte of it was verified."""
+"""inspect: shows the content of a snapshot's file, in tables or as JSON, after every byte of it was verified."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""capture, restore, check: what one command does alone, without an agent. (`inspect` is in `inspection`.)"""
+"""capture, restore, check: verbs that one command carries out alone, without an agent.
+
+`inspect` is in `failover.cli.verbs.inspect_file`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""status: what the team does."""
+"""status: shows what the team does."""
 
 from __future__ import annotations
 

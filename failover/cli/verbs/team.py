@@ -1,4 +1,4 @@
-"""team create, enrol, show: who belongs, and by which key each robot is known."""
+"""team create, enrol, show: the members of the team, and the key by which each robot is known."""
 
 from __future__ import annotations
 

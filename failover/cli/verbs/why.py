@@ -1,4 +1,4 @@
-"""why: the story of the team's decisions, for somebody who was not there."""
+"""why: explains the team's decisions to a reader who did not see them happen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a peer's entry says: its state, and whether it consents to our primacy or objects to it."""
+"""Reads a peer's entry: its state, and whether it consents to this robot's primacy or objects to it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How long a primary may act, and when it stands still.
+"""Lease: how long a primary may act, and when it stands still.
 
-Invariant: while anybody else may start the component, it runs here only before ``lease_ns``, and the guard knows that instant.
+Invariant: while another robot may start the component, it runs here only before ``lease_ns``, and the guard knows that instant.
 """
 
 from __future__ import annotations

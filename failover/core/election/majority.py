@@ -1,15 +1,17 @@
-"""The rule ``majority``: robots, servers and witnesses elect each component's primary. Who is free to vote, and for whom.
+"""The rule ``majority``: robots, servers and witnesses elect each primary. Here: which member is free to vote, and for whom.
 
-* *One vote an epoch.* Naming a robot as the primary of an epoch is the vote; it is on the disk before it is said, and is never
-  given to a second robot in that epoch.
-* *Loyalty.* A member votes for another than the primary it follows only when it is free: that one is silent for a lease and a
-  margin, says itself that it runs nothing, or gives way. A primary acts on leases that a majority has granted by echoes. Of
-  any two majorities one member is in both, and it voted only after what it had granted was over: so never two valid leases.
-* *Pre-vote.* Members say in beats whether they are free. Nobody claims before a majority is: whoever is cut off raises no epoch.
-* *Nothing acknowledged is lost.* A primary acknowledges what a standby holds once a majority has noted that standby. Members
-  vote for robots that hold as much; for others only when those were out of reach for ``patience_ms``, or by an operator's order.
-* *Whoever has a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that. Whoever has
-  none gives its copy up to one that was elected, and to a later epoch's that holds as much; otherwise it contends for votes.
+* *One vote an epoch.* Naming a robot as the primary of an epoch is the vote. It is on the disk before the member says it, and the
+  member never gives it to a second robot in that epoch.
+* *Loyalty.* A member votes for another robot than the primary it follows only when it is free: the primary is silent for a lease
+  and a margin, says itself that it runs nothing, or gives way. A primary acts on leases that a majority has granted by echoes.
+  Any two majorities share a member, and that member voted only after the lease it had granted was over: so there are never two
+  valid leases.
+* *Pre-vote.* Members say in heartbeats whether they are free. No robot claims before a majority is free: a robot that is cut off
+  raises no epoch.
+* *Nothing acknowledged is lost.* A primary acknowledges what a standby holds once a majority has noted that standby. Members vote
+  for robots that hold as much; for others only when those were out of reach for ``patience_ms``, or by an operator's order.
+* *The robot with a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that. A robot
+  without one gives its copy up to an elected one, and to a later epoch's that holds as much; otherwise it contends for votes.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""Who runs a component: claims, consent, and what follows from hearing another robot's.
+"""Decides which robot runs a component: claims, consent, and what follows from hearing another robot's.
 
-A primacy is an epoch and the robot that all who know of it name as its primary. The rules:
+A primacy is an epoch and the robot that all robots which know of it name as its primary. The rules:
 
-* A robot claims a *vacant* component: no living robot holds it, and everybody is either heard or dead.
-* A robot that has just started claims nothing that another one ran last, or was entrusted with, and of which it has heard no
-  word yet, for ``boot_patience_ms``.
-* Of two copies that meet again, the one that never stopped acting goes on, above the other's epoch.
+* A robot claims a *vacant* component: no living robot holds it, and every robot is either heard or dead.
+* A robot that has just started does not claim a component that another robot ran last, or was entrusted with, and of which it has
+  heard no word yet, for ``boot_patience_ms``.
+* Of two copies that meet again, the one that never stopped acting continues, above the other's epoch.
 * Naming the claimant at its epoch is consent; hearing a claim raises the hearer's own epoch before it answers.
 * Of two claims the higher epoch wins; at the same epoch the one that acts already, then the lesser name W.
-* Under ``when_alone = freeze`` a robot starts a component only with everybody's consent, or with the *right to act alone*: it was
-  entrusted by the primary that has gone silent, or it was the primary itself and had entrusted nobody. One robot has that right.
+* Under ``when_alone = freeze`` a robot starts a component only with every robot's consent, or with the *right to act alone*: it
+  was entrusted by the primary that has gone silent, or it was the primary itself and had entrusted no robot. One robot has that
+  right.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Who runs a component under the rule ``majority``: the same arrows as in ``election.py``, drawn by votes.
+"""Elects a component's primary under the rule ``majority``: the state arrows of `failover.core.election.pair`, drawn by votes.
 
-``majority.py`` says who is free and for whom; this file claims, withdraws, follows, and answers rivals.
+`failover.core.election.majority` says which member is free and for which robot; this module claims, withdraws, follows, and
+answers rivals.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What is remembered of a decision, and one log out of several robots' logs. Pure."""
+"""The event log: the record of a decision, and the merge of several robots' logs into one. Pure."""

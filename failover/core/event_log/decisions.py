@@ -1,7 +1,7 @@
-"""What is remembered of a decision for ``failover why``: the sentence, and what this robot knew at that instant.
+"""Record of a decision for ``failover why``: the sentence, and what this robot knew at that instant.
 
-The newest beats that were heard order the stories of several robots without comparing their clocks: whoever had heard a beat of
-ours that was sent after our decision decided later (`failover.core.event_log.merge`).
+The newest heartbeats that a robot had heard order the event logs of several robots without a comparison of their clocks: a robot
+that had heard a heartbeat sent after this robot's decision decided later (`failover.core.event_log.merge`).
 """
 
 from __future__ import annotations

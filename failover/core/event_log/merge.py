@@ -1,8 +1,8 @@
-"""One story out of several robots' stories, in the order in which it happened.
+"""Merges the event logs of several robots into one, in the order in which things happened.
 
-No two robots' clocks agree, so what is known for certain goes first: a robot's own lines are in order, and a robot that had
-heard a beat sent after some decision decided later than that. Where neither is known, the instants decide, as well as they can be
-read on one common clock; where those are too close to tell, the lower epoch comes first.
+No two robots' clocks agree, so certain knowledge comes first: a robot's own lines are in order, and a robot that had heard a
+heartbeat sent after some decision decided later than that. Where neither is known, the instants decide, as well as they can be
+read on one common clock. Where those are too close to tell, the lower epoch comes first.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""How checkpoints get to the standby and to the servers, and what waits there."""
+"""Replication of checkpoints to the standby and to the servers, and what waits there."""

@@ -1,7 +1,7 @@
-"""Checkpoints for the servers: besides its standby, a primary sends each server what it has acknowledged.
+"""Replication to servers: besides its standby, a primary sends each server the checkpoints that it has acknowledged.
 
-Invariants: a server gets acknowledged positions only, in their order; one snapshot at a time is on its way to each. One that does
-not keep up gets a whole checkpoint instead of the deltas, at most every ``archive_ms``.
+Invariants: a server gets acknowledged positions only, in their order; one snapshot at a time is on its way to each server. A
+server that does not keep up gets a whole checkpoint instead of the deltas, at most every ``archive_ms``.
 """
 
 from __future__ import annotations

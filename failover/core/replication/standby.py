@@ -1,7 +1,7 @@
-"""How a component's state gets to its standby and is acknowledged there.
+"""Replication of a component's state to its standby, and its acknowledgement there.
 
 Invariants: one snapshot in flight per component (a slower link means fewer snapshots, not longer queues); a position is
-acknowledged to the keeper only when it is safe elsewhere, or nobody else is there; a delta counts from what the standby has.
+acknowledged to the keeper only when it is safe elsewhere, or no other robot is there; a delta counts from what the standby has.
 """
 
 from __future__ import annotations

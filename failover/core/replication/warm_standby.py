@@ -1,11 +1,11 @@
-"""What waits at a standby, so that a takeover is one message: made in advance, it has done everything before its first step.
+"""Prepares a takeover at the standby, so that the takeover is one message: the prepared process has done all but its first step.
 
-Of a program that keeps its state itself that is the program, started; of one that is captured from outside it is a stopped
-process with the newest checkpoint's memory (the ready copy). Which of the two, and whether it can be had, is the robot's affair.
-One waits a component, at the robot that its primary has entrusted, and nowhere else.
+For a program that keeps its state itself that process is the program, started. For a program that is captured from outside it is
+a stopped process with the newest checkpoint's memory (the ready copy). The robot decides which of the two, and whether it can be
+had. One process waits per component, at the robot that its primary has entrusted, and nowhere else.
 
-Invariants: nothing waits at a robot that runs the component, or to which its primary ships nothing; what waits is what a takeover
-would start.
+Invariants: nothing waits at a robot that runs the component, or to which its primary ships nothing; the process that waits is the
+one that a takeover would start.
 """
 
 from __future__ import annotations

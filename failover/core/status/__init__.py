@@ -1,1 +1,1 @@
-"""What one robot says of the team: its view, what it noticed, what is promised now."""
+"""Status of the team as one robot sees it: its view, its observations, the promise that holds now."""

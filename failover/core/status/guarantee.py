@@ -1,6 +1,6 @@
-"""What is promised now, in one sentence: for the team as one robot sees it, and for each component.
+"""The promise that holds now, in one sentence: for the team as one robot sees it, and for each component.
 
-``failover status`` shows the team's, and a component's where it is another than the team's; the journal has both at each change.
+``failover status`` shows the team's, and a component's where it differs from the team's; the journal has both at each change.
 ``tests/simulation/test_promises.py`` holds every sentence against what the rules do.
 """
 

@@ -1,6 +1,6 @@
-"""What a robot notices of its peers and of itself, for ``failover why``: who fell silent, who is heard again, an own stall.
+"""Observations of a robot about its peers and itself, for ``failover why``: silent peers, peers heard again, stalls of its own.
 
-Nothing is decided here: `membership` judges, this only tells.
+Nothing is decided here: `failover.core.membership` judges, this module only reports.
 """
 
 from __future__ import annotations

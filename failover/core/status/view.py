@@ -1,4 +1,4 @@
-"""What ``failover status`` says: one robot's sight of the team, and the promise in force in one sentence."""
+"""The content of ``failover status``: one robot's view of the team, and the promise in force in one sentence."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""How a component moves or ends on purpose: handover, failback, promotion, exit."""
+"""Planned moves and ends of a component: handover, failback, promotion, exit."""

@@ -1,6 +1,7 @@
-"""What becomes of a component whose program ended, crashed, or could not be brought to run.
+"""Decides what follows when a component's program ended, crashed, or could not be brought to run.
 
-Invariants: an end is a record before anybody is told of it; crashes make no endless loop and throw no checkpoint away.
+Invariants: an end is a record before any robot or client is told of it; crashes make no endless loop and throw no checkpoint
+away.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A component's return to the robot that its operator prefers, by itself: that robot is asked first whether it could go on there.
+"""Returns a component by itself to the robot that its operator prefers: asks that robot first whether it could run it.
 
 A handover that the other robot can only refuse would hold the program still for nothing, again and again.
 """

@@ -1,4 +1,4 @@
-"""The planned move: hold the program still, ship the last delta, let the other robot claim: nothing is computed twice."""
+"""The planned move: freeze the program, ship the last delta, let the other robot claim. No step is computed twice."""
 
 from __future__ import annotations
 

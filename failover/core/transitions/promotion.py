@@ -1,6 +1,6 @@
-"""An operator's order that this robot runs a component now, whatever the rules still wait for; and what is at risk when it does.
+"""An operator's order that this robot runs a component now, although the rules still wait; and what that risks.
 
-Under ``pair`` the order stands for the consent of robots that are not heard: it is what brings a component back to life that
+Under ``pair`` the order stands for the consent of robots that are not heard: it brings a component back to life that
 ``on_loss = hold`` or ``when_alone = freeze`` holds still. Its epoch is above any that they could have opened meanwhile. Under
 ``majority`` it stands for the wait for robots that may hold a newer checkpoint; a majority must vote for it all the same.
 """

@@ -1,7 +1,7 @@
-"""A beat ⇄ one authenticated datagram. ``PROTOCOL.md`` has the byte table.
+"""A heartbeat ⇄ one authenticated datagram. ``PROTOCOL.md`` has the byte table.
 
-What arrives is a stranger's until its code is checked, so nothing here raises for what arrives: ``Receiver.open`` returns the
-beat, or a ``Refused`` that says why. The bulk lane's messages are plain msgpack; their transport authenticates them.
+An incoming datagram is untrusted until its code is checked, so nothing here raises for it: ``Receiver.open`` returns the
+heartbeat, or a ``Refused`` that says why. The replication link's messages are plain msgpack; their transport authenticates them.
 """
 
 from __future__ import annotations

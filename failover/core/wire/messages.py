@@ -1,8 +1,8 @@
-"""What the rules of one robot tell those of another, as msgspec structs. The bytes are in ``PROTOCOL.md``.
+"""Messages between the rules of two robots, as msgspec structs. The bytes are in ``PROTOCOL.md``.
 
-Two lanes. *Beats* carry state, never news: a lost beat is repaired by the next, so there is nothing to repeat and nothing to time
-out: a claim, a vote, a standby's acknowledgement, its wish for a base are fields of beats. The *bulk lane* carries snapshots, in
-chunks, under credit.
+Two kinds. *Heartbeats* carry state, never news: the next heartbeat repairs a lost one, so there is nothing to repeat and nothing
+to time out. A claim, a vote, a standby's acknowledgement, its wish for a base are fields of heartbeats. The *replication link*
+carries snapshots, in chunks, under credit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The real guard, over its real socket: who dies when, and what is left of it."""
+"""The real guard, over its real socket: which processes end when others die, and what they leave."""
 
 from __future__ import annotations
 

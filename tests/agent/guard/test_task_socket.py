@@ -1,4 +1,4 @@
-"""The guard's end of the task socket: who may keep a state, in which order things are said, and that nobody can upset it."""
+"""The guard's end of the task socket: which process may keep a state, the order of messages, and that no client can upset it."""
 
 from __future__ import annotations
 

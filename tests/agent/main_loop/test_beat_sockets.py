@@ -1,4 +1,4 @@
-"""The beat sockets of two robots on the loopback: what comes, over which interface, and when."""
+"""The heartbeat sockets of two robots on the loopback: which datagrams arrive, over which interface, and when."""
 
 from __future__ import annotations
 

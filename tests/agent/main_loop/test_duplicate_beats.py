@@ -1,4 +1,4 @@
-"""A beat comes over each of its sender's links; what comes once more over one of them is a replay."""
+"""A heartbeat arrives once over each link of its sender; a second copy over one link is a replay."""
 
 from __future__ import annotations
 

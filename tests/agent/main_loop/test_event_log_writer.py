@@ -1,4 +1,4 @@
-"""The story on disk: what is written survives, a torn end is skipped, the size is bounded, and nobody waits for the disk."""
+"""The event log on disk: written lines survive, a torn end is skipped, the size is bounded, and no caller waits for the disk."""
 
 from __future__ import annotations
 

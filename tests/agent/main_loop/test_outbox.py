@@ -1,4 +1,4 @@
-"""Persist → send → act while the disk is slow: nothing that depends on the disk leaves, and the beat goes on."""
+"""Persist → send → act while the disk is slow: nothing that depends on the disk leaves, and heartbeats continue."""
 
 from __future__ import annotations
 

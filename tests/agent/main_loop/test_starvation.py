@@ -1,4 +1,4 @@
-"""Whether a process that says nothing could have spoken, of real processes: busy, asleep, stopped, and kept from running."""
+"""Whether a silent process could have run, on real processes: busy, asleep, stopped, and kept from running."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beats that are not believed are signs of whoever they come from, and no more."""
+"""Unauthenticated heartbeats count as signs of the member from whose address they come, and as no more."""
 
 from __future__ import annotations
 

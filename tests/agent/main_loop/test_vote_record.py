@@ -1,4 +1,4 @@
-"""What must not be forgotten: it survives, and what cannot be trusted is refused."""
+"""The vote record: it survives, and a record that cannot be trusted is refused."""
 
 from __future__ import annotations
 

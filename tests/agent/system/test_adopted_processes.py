@@ -1,4 +1,4 @@
-"""A process that a client names by its number is the one that was asked whose it is, or none."""
+"""A process that a client names by its PID is the one whose owner was checked, or none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who asks, what a program inherits from him, and what he may do."""
+"""Which user asks, what a program inherits from that user, and what that user may do."""
 
 from __future__ import annotations
 

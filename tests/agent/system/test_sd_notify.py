@@ -1,4 +1,4 @@
-"""What systemd hears from an agent: that it is ready, that its loop lives, that it ends."""
+"""What an agent tells systemd: that it is ready, that its loop lives, that it ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the heart and the guards ask of the kernel for themselves."""
+"""System calls that the main loop and the guards make for themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In whose service an agent runs: the one that a shutdown must end before the agent's components."""
+"""The service in which an agent runs: the one that a shutdown must end before the agent's components."""
 
 from __future__ import annotations
 

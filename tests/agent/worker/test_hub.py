@@ -1,4 +1,4 @@
-"""A witness may be anybody's process: what it says to a robot starts, ends and overwrites nothing."""
+"""A witness may be any user's process: what it says to a robot starts, ends and overwrites nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same as count.c in Python, by nobody prepared either: ``count.py NAME ACTUATOR PERIOD_MS``."""
+"""The same as count.c in Python, and equally unprepared: ``count.py NAME ACTUATOR PERIOD_MS``."""
 
 import ctypes
 import os

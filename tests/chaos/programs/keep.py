@@ -1,4 +1,4 @@
-"""A program that keeps its state itself: ``keep.py NAME ACTUATOR PERIOD_MS``. It also tells what it was told is safe."""
+"""A program that keeps its state itself: ``keep.py NAME ACTUATOR PERIOD_MS``. It also reports what it was told is safe."""
 
 import contextlib
 import os

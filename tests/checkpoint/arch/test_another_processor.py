@@ -1,4 +1,4 @@
-"""A program whose snapshot comes from a processor that lays its registers out otherwise, or has more of them."""
+"""A program whose snapshot comes from a processor with another register layout, or with more registers."""
 
 from __future__ import annotations
 

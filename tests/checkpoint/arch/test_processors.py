@@ -1,6 +1,6 @@
-"""The files of each processor: what others use of them is in every one, in the same order, and the machine code is what it says.
+"""The modules of each processor: all have the same names that others use, in the same order, and correct machine code.
 
-A program that runs on another processor is the matter of a machine of that kind.
+A program that runs on another processor is tested on a machine of that kind.
 """
 
 from __future__ import annotations

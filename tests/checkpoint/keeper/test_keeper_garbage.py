@@ -1,4 +1,4 @@
-"""A keeper lives for weeks, and no collection may fall into a freeze: it looks for garbage itself, between requests."""
+"""Garbage collection of a keeper that lives for weeks: it collects between requests, so that none falls into a freeze."""
 
 from __future__ import annotations
 

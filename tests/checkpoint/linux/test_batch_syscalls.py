@@ -1,4 +1,4 @@
-"""Many system calls of our own in one go."""
+"""Many system calls of this process in one batch."""
 
 import array
 import ctypes

@@ -1,4 +1,4 @@
-"""How much memory control groups leave: the least of all that are around a process, in both versions."""
+"""Memory that control groups leave: the least of all that are around a process, in both versions."""
 
 from __future__ import annotations
 

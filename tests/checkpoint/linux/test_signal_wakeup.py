@@ -1,4 +1,4 @@
-"""A keeper that waits for its peer hears of the dead whenever, and by whichever of its threads, it is told of them."""
+"""A keeper that waits for its peer is woken when a child ends, at any instant, whichever of its threads gets the signal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A second thread asks half of what is asked of many sockets: whatever becomes of it, the answers are the same."""
+"""A second thread makes half of the calls about many sockets: however it fares, the answers are the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sets of pages behave like sets, and a page sum kept step by step is that of the whole."""
+"""Sets of pages behave like sets, and a page sum kept step by step equals that of the whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deltas that tell pages as differences from what was acknowledged: they add up to the same, and what they lean on is bounded."""
+"""Deltas with pages as differences from what was acknowledged: they add up to the same, and their references are bounded."""
 
 from __future__ import annotations
 

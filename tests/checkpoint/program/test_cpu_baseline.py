@@ -1,4 +1,4 @@
-"""Programs that are started for a level of processors: what their libraries choose, and where they may go on."""
+"""Programs that are started for a level of processors: what their libraries choose, and where they may resume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the fencing token stands in an environment."""
+"""Where the fencing token is in an environment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of a program that runs while its descriptors are read: what changes between two looks is not held against it."""
+"""Files of a program that runs while its descriptors are read: a change between two looks causes no refusal."""
 
 from __future__ import annotations
 

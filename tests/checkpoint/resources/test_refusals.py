@@ -1,4 +1,4 @@
-"""What cannot be preserved is refused by name before the program is touched; the program goes on as if nobody had looked."""
+"""Resources that cannot be preserved are refused by name before the program is touched; the program runs on unaffected."""
 
 from __future__ import annotations
 

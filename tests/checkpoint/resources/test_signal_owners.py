@@ -1,4 +1,4 @@
-"""Who is sent the signals of a descriptor, and which: as it was while the program stood still, not as it is right afterwards."""
+"""Which process gets the signals of a descriptor, and which signals: as during the freeze, not as right afterwards."""
 
 from __future__ import annotations
 

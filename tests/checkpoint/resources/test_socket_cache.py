@@ -1,4 +1,4 @@
-"""Sockets that answer as at the last look are not looked into again; whatever has changed about one is seen."""
+"""Sockets that answer as at the last look are not examined again; any change of one is seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is freed goes back to the kernel: counted in bytes that the C library holds, in a process of its own."""
+"""Freed memory goes back to the kernel: counted in bytes that the C library holds, in a process of its own."""
 
 from __future__ import annotations
 

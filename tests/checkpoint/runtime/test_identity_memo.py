@@ -1,4 +1,4 @@
-"""What is remembered of things that have not changed, and what must not be."""
+"""Memo of facts: which unchanged objects it remembers, and which facts it must not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work that is done in several threads comes out as if one had done it."""
+"""Work that is done in several threads gives the same results as in one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""numpy is loaded without what we never ask of it, and is numpy all the same."""
+"""numpy is loaded without the parts that we never use, and is numpy all the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shared segment: what is read is always one commit, whoever is killed, stuck or hostile."""
+"""The shared segment: a reader always gets one commit, whichever process is killed, stuck or hostile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files are read again for their digests only when they have changed, in whichever way."""
+"""Files are read again for their digests only when they have changed, in any way."""
 
 from __future__ import annotations
 

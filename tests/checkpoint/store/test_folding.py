@@ -1,4 +1,4 @@
-"""A chain's files as the file of one base: the same as its fold, and a frame that nothing changed is copied as it is stored."""
+"""A chain's files as the file of one base: the same as its fold, and an unchanged frame is copied as it is stored."""
 
 from __future__ import annotations
 

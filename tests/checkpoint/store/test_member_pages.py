@@ -1,4 +1,4 @@
-"""The pages of each of several processes, out of a snapshot that tells each content once: the same as put together for each."""
+"""The pages of each of several processes, from a snapshot that holds each content once: the same as put together for each."""
 
 from __future__ import annotations
 

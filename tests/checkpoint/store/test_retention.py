@@ -1,4 +1,4 @@
-"""What a store keeps for people: spread over a span, bounded by number, age and size, and never at the cost of what is needed."""
+"""Snapshots that a store keeps for people: spread over a span, bounded by number, age, size, never at the cost of needed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A directory of snapshots: what was put is there, and what is damaged is passed over. (Power cuts: `test_store_power`.)"""
+"""A directory of snapshots: a stored one is there, and a damaged one is passed over.
+
+Power cuts: `tests.checkpoint.store.test_store_power`.
+"""
 
 from __future__ import annotations
 

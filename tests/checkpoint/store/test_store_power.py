@@ -1,4 +1,4 @@
-"""Power may go at any instant of a store's life: what was acknowledged is there afterwards."""
+"""A power cut at any instant of a store's life: every acknowledged snapshot is there afterwards."""
 
 from __future__ import annotations
 

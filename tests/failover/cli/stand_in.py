@@ -1,4 +1,4 @@
-"""An agent's control socket played by a thread: it speaks the real protocol over a real socket and answers by a script."""
+"""An agent's control socket simulated by a thread: it speaks the real protocol over a real socket and answers by a script."""
 
 from __future__ import annotations
 

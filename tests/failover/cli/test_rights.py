@@ -1,6 +1,6 @@
-"""A snapshot's file is its owner's word: whatever it asks for, root's restore gives it its owner's rights at most, and says so.
+"""A snapshot's file is its owner's word: root's restore gives it its owner's rights at most, whichever it asks for, and says so.
 
-Each field of a snapshot that carries authority is changed by the project's own encoder; what came back is read from /proc.
+Each field of a snapshot that carries authority is changed by the project's own encoder; the restored rights are read from /proc.
 """
 
 from __future__ import annotations

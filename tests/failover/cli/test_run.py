@@ -1,4 +1,4 @@
-"""What ``failover run`` says when it cannot wait any longer."""
+"""Messages of ``failover run`` when it cannot wait any longer."""
 
 from __future__ import annotations
 

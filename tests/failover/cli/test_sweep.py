@@ -1,4 +1,4 @@
-"""Every verb given what it cannot use: a sentence and an exit status, as JSON one object, never anything else."""
+"""Every verb with arguments it cannot use: a sentence and an exit status, as JSON one object, never anything else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether all is well, asked at each of two robots: the answer is the same, and never better than what is known."""
+"""Health asked at each of two robots: the answer is the same, and never better than what is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a member may say, one word at a time. Whole lies are in ``tests/simulation/scenarios``."""
+"""What a member may say, one claim at a time. Whole lies are in ``tests/simulation/scenarios``."""
 
 from __future__ import annotations
 

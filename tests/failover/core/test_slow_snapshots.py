@@ -1,4 +1,4 @@
-"""What the status says of snapshots that are seldom because they take long: while they do, and not any more afterwards."""
+"""Status of snapshots that are rare because they take long: it says so while they do, and not afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether two values are the same in everything that a program could see, and round trips."""
+"""Compares two values in everything that a program could see, and makes round trips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States damaged by dice: refused or read, and reading them runs nothing."""
+"""States damaged at random: refused or read, and reading them runs nothing."""
 
 from __future__ import annotations
 

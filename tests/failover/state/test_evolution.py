@@ -1,4 +1,4 @@
-"""A state outlives its declaration: fields come, go and are renamed; what no longer fits is refused by name."""
+"""A state outlives its declaration: fields are added, removed and renamed; those that no longer fit are refused by name."""
 
 from __future__ import annotations
 

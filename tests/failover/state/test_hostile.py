@@ -1,4 +1,4 @@
-"""Bytes that somebody else wrote: refused with a reason that names the place, in bounded memory and time, and nothing runs."""
+"""Bytes from an attacker: refused with a reason that names the place, in bounded memory and time, and nothing runs."""
 
 from __future__ import annotations
 

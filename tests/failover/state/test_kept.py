@@ -1,4 +1,4 @@
-"""What is kept comes back as it was: same types, same values, same bits."""
+"""Kept values come back as they were: same types, same values, same bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models of attrs and pydantic are kept by what they are; we never import either."""
+"""Models of attrs and pydantic are recognized by what they carry and kept; we never import either."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever type is declared and whatever value it has: what comes back is the same."""
+"""Any declared type with any value: the restored value is the same."""
 
 from __future__ import annotations
 

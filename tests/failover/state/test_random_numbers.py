@@ -1,4 +1,4 @@
-"""Random numbers go on where they stood: what would have been drawn next is drawn next."""
+"""Random numbers continue where they stood: the next draw is the one that would have come."""
 
 from __future__ import annotations
 

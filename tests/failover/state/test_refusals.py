@@ -1,4 +1,4 @@
-"""What cannot be kept is refused by name, when it is declared or when it is committed, with what to do about it."""
+"""Values that cannot be kept are refused by name, when declared or when committed, with a cure."""
 
 from __future__ import annotations
 

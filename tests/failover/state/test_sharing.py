@@ -1,4 +1,4 @@
-"""An object that is reached by two paths is one object again, cycles too; what cannot be so is refused by both names."""
+"""An object that is reached by two paths is one object again, cycles too; one that cannot be is refused by both names."""
 
 from __future__ import annotations
 

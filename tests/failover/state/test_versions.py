@@ -1,4 +1,4 @@
-"""A state moves between Python versions and numpy versions: the sample was written by others than those that run here."""
+"""A state moves between Python versions and numpy versions: other versions than those that run here wrote the sample."""
 
 from __future__ import annotations
 

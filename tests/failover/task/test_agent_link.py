@@ -1,4 +1,4 @@
-"""The program's end of the task socket: what its guard may say, what it may not, and what happens where there is none."""
+"""The program's end of the task socket: what its guard may say, what it may not, and the case without a guard."""
 
 from __future__ import annotations
 

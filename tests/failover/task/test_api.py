@@ -1,4 +1,4 @@
-"""What an application imports to keep its state: tried as its author would, in other processes where they end or are killed."""
+"""The API by which an application keeps its state: used as by its author, in other processes where they end or are killed."""
 
 from __future__ import annotations
 

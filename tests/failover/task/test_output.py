@@ -1,4 +1,4 @@
-"""How much a program has written by its commit, where the guard that counts does not come to an end."""
+"""How much a program has written by its commit, where the guard that counts does not catch up."""
 
 from __future__ import annotations
 

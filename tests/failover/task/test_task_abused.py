@@ -1,4 +1,4 @@
-"""A program that keeps its state and is treated as programs are: threads, signals in a commit, limits, exec, odd places."""
+"""A program that keeps its state under ordinary abuse: threads, signals in a commit, limits, exec, odd places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A component with a real guard and a real keeper, as the lanes process has it: captures, deaths, restores."""
+"""A component with a real guard and a real keeper, as in the worker process: captures, deaths, restores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program that keeps its state, with a real guard and a real keeper: captures of its commits, and going on from them."""
+"""A program that keeps its state, with a real guard and a real keeper: captures of its commits, and its resume from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When hooks are run: before a capture seldom, and never for long."""
+"""When hooks run: before a capture seldom, and never for long."""
 
 from __future__ import annotations
 

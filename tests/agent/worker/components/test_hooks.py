@@ -1,4 +1,4 @@
-"""Hooks by themselves: which signal one names, and what is left of one that takes too long."""
+"""Hooks alone: the signal that one names, and the remains of one that takes too long."""
 
 from __future__ import annotations
 

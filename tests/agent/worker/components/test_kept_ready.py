@@ -1,4 +1,4 @@
-"""What is kept ready at a standby ends whole, also where nobody waits for that any more."""
+"""Processes kept ready at a standby end completely, also where no caller waits for the end any more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Copies that lost are kept for people, a few of each component."""
+"""Copies that lost their primacy are kept for inspection, a few of each component."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who waits in advance, and when."""
+"""The process pool: which guards and keepers wait in advance, and when."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the next agent reads of a program that runs on: on whichever version's terms."""
+"""What the next agent reads of a program that runs on: under the terms of any version."""
 
 from __future__ import annotations
 

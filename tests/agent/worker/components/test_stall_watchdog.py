@@ -1,4 +1,4 @@
-"""Who owes an answer and does nothing is ended; who works, waits for a disk, or owes nothing, is not."""
+"""The watchdog ends a process that owes an answer and does nothing, and none that works, waits for a disk, or owes nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What status tells of a component beyond counts: commits that no longer come, a processor that has too little."""
+"""Figures of a component in status beyond counts: commits that no longer come, a processor that has too little."""
 
 from __future__ import annotations
 

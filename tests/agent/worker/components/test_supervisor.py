@@ -1,4 +1,4 @@
-"""Leases and freezes overtake what waits in a component's queue; a takeover that what waits cannot carry out starts anew."""
+"""Leases and freezes overtake a component's waiting acts; a takeover that the process kept ready cannot carry out starts anew."""
 
 from __future__ import annotations
 

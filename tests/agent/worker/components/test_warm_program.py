@@ -1,4 +1,4 @@
-"""A program that waits at its standby, with a real guard and a real keeper: it begins when it is told, and not a step before."""
+"""A warm program at its standby, with a real guard and a real keeper: it begins when it is told, and not a step before."""
 
 from __future__ import annotations
 

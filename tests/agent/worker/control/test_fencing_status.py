@@ -1,4 +1,4 @@
-"""What status says of the worst case depends on whether a hardware watchdog is fed."""
+"""Fencing in status: the sentence about the worst case depends on whether a hardware watchdog is fed."""
 
 from __future__ import annotations
 

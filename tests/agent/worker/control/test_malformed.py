@@ -1,4 +1,4 @@
-"""Bytes that are no message, at every door that takes bytes: each is refused in words, nothing is lost, nobody falls over."""
+"""Malformed bytes at every interface that takes bytes: each is refused in words, nothing is lost, no process fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a component wrote, passed on: all of it from the moment at which status says that it has ended."""
+"""Relay of a component's output: complete from the moment at which status says that the component has ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is asked how things stand there."""
+"""Queries: which robots are asked for their state, and which users see a program's output there."""
 
 from __future__ import annotations
 

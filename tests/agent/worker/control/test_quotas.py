@@ -1,4 +1,4 @@
-"""How many components a user may have: no user takes the names that the team follows from the others."""
+"""How many components a user may have: no user takes from the others the names that the team follows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control socket, and users who hold connections or begin requests and never end them: all others are served."""
+"""The control socket and users who hold connections, or begin requests and never end them: all others are served."""
 
 from __future__ import annotations
 

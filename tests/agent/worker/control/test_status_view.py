@@ -1,4 +1,4 @@
-"""What status says of one component."""
+"""What status shows of one component."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wired or wireless, by the kernel's own facts; and what is said when a cable is pulled."""
+"""Wired or wireless links, by the kernel's own facts; and the messages when a cable is pulled."""
 
 from __future__ import annotations
 

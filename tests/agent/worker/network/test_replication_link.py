@@ -1,4 +1,4 @@
-"""Two and more bulk lanes on the loopback: who gets in, what arrives, what is told."""
+"""Two and more replication links on the loopback: which peers are admitted, which messages arrive, what is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Snapshots that come in, and the instant from which a robot writes the component's output itself."""
+"""Incoming snapshots, and the instant from which a robot writes the component's output itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program's files between two robots: what is lacking is sent once; what is hostile or too large is refused by name."""
+"""A program's files between two robots: missing ones are sent once; hostile or too large ones are refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transfers under credit: whole or without a trace, whatever the other side does."""
+"""Transfers under credit: complete or without a trace, however the other side behaves."""
 
 from __future__ import annotations
 

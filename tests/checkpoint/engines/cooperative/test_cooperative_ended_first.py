@@ -1,4 +1,4 @@
-"""A program that keeps its state goes on when its first thread has ended; it has ended once all of it has."""
+"""A program that keeps its state lives on when its first thread has ended; it has ended once all of its threads have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a program that keeps its state is started again from; and how it is shown to it where it is missing."""
+"""Files from which a program that keeps its state is started again; and how the program sees them where they are missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cooperative engine besides what all engines promise: segments that grow or are filled, states that do not fit together."""
+"""The cooperative engine beyond the common contract: segments that grow or are filled, states that do not fit together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Guard pages are found where they are now, whatever is watched and whatever is watched no more."""
+"""Guard pages are found where they are now, whichever mappings are watched or no longer watched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory of our own whose written pages are known: nothing that was written is left out, however it was written."""
+"""Live memory of this process, whose written pages are known: no written page is left out, however it was written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose streams are whose, also when those who started a program have ended meanwhile."""
+"""Which program owns which streams, also when the processes that started the program have ended meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a program has open is told as it is now, however much was known of it from an earlier look."""
+"""The open descriptors of a program are reported as they are now, however much an earlier look had found."""
 
 from __future__ import annotations
 

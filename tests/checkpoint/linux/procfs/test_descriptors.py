@@ -1,4 +1,4 @@
-"""Descriptors of every kind: captured, killed and brought back three times in a row, then the program looks at what it has.
+"""Descriptors of every kind: captured, killed and restored three times in a row; then the program checks what it has.
 
 One tracee for a family of kinds, one case for each thing that could be lost: see ``tests/tracees``.
 """

@@ -1,4 +1,4 @@
-"""Names that look like lines of the kernel's: of processes and of files that are mapped."""
+"""Names of processes and of mapped files that look like lines of the kernel's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cannot be read of a process because that has ended, or is becoming another program, is told as such."""
+"""Reads of a process that has ended, or is becoming another program, are reported as such."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PIDs and namespaces in every combination: what a program that comes back knows of itself, and what is said of the rest."""
+"""PIDs and namespaces in every combination: what a restored program knows of itself, and what is reported of the rest."""
 
 from __future__ import annotations
 

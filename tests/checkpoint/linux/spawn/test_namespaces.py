@@ -1,4 +1,4 @@
-"""What a vessel is born with: of its maker's descriptors none, whatever the kernel can do."""
+"""A new vessel: it inherits no descriptor from its maker, whichever features the kernel has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vessels and fresh programs: born with the PID, the clocks and the descriptors asked for, and gone when they should be."""
+"""Vessels and fresh programs: created with the requested PID, clocks and descriptors, and gone when they should be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the kernel told of threads while they stood still can be read when they run again."""
+"""Facts that the kernel reported of threads while they stood still can be read when they run again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many threads seized, asked to stop, heard of and let go in one go; whoever does not do as most is left to be asked singly."""
+"""Many threads seized, stopped, waited for and let go in one batch; a thread that behaves unlike most is handled singly."""
 
 from __future__ import annotations
 

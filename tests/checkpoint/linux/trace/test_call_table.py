@@ -1,4 +1,4 @@
-"""Tables of system calls inside a vessel: all made at one stop, and a result that was not expected named."""
+"""Tables of system calls inside a vessel: all made at one stop, and an unexpected result named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The first entry into a program, where something of it fails on our side: nothing of ours stays inside."""
+"""The first entry into a program, where some step of it fails on our side: nothing of ours stays inside."""
 
 from __future__ import annotations
 

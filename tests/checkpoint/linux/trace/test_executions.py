@@ -1,4 +1,4 @@
-"""A thread that executes another program while its process is being stopped: nobody waits for ever, nobody is left stopped."""
+"""A thread that executes another program while its process is being stopped: no thread waits for ever, none is left stopped."""
 
 from __future__ import annotations
 

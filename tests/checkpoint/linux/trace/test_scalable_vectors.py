@@ -1,6 +1,6 @@
-"""Scalable vectors of aarch64 (SVE), of which every system call takes a part: whoever has us make calls in it gets them back.
+"""Scalable vectors of aarch64 (SVE), part of which every system call destroys: a thread in which we make calls gets them back.
 
-Skipped by the program itself where the processor has none. The rest of what is seen of them is in ``test_tracees``.
+The program skips the test where the processor has none. `tests.checkpoint.test_tracees` tests the rest of them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whoever waits for a thread to stop sleeps where that thread needs the processor, and is woken by its stop."""
+"""A process that waits for a thread to stop sleeps where that thread needs the processor, and is woken by its stop."""
 
 from __future__ import annotations
 

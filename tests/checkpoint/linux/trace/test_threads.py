@@ -1,4 +1,4 @@
-"""Programs of several threads: none is missed when it is frozen, and none is ever left stopped, whatever goes wrong."""
+"""Programs of several threads: a freeze misses none, and none is ever left stopped, whichever step fails."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Devices come back by the operator's rules: a line with its settings, under another name elsewhere, hung up where it is missing.
 
-A pseudo-terminal stands for the serial line; the test holds its other end, as what the line leads to does.
+A pseudo-terminal stands for the serial line; the test holds its other end, like the equipment at the end of the line.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a ring of asynchronous I/O says of itself is the program's to write: it is believed only as far as it can be."""
+"""A ring of asynchronous I/O, which the program can overwrite: its content is believed only as far as possible."""
 
 from __future__ import annotations
 

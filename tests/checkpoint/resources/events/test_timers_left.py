@@ -1,4 +1,4 @@
-"""What is left of a timerfd when some time has gone by: the arithmetic alone."""
+"""Time left of a timerfd after some time: the arithmetic alone."""
 
 from __future__ import annotations
 

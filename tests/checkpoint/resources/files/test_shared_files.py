@@ -1,4 +1,4 @@
-"""A file that several programs write to: found out while all of them run, refused by a restore, or ruled to be shared."""
+"""A file that several programs write to: detected while all of them run, refused by a restore, or declared shared."""
 
 from __future__ import annotations
 

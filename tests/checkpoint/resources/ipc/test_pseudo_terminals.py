@@ -1,4 +1,4 @@
-"""Pseudo-terminals of a program's own: three restores in a row, then it looks at what it has."""
+"""Pseudo-terminals of a program's own: three restores in a row, then it checks what it has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose login a program belongs to is kept where the kernel lets us, and said where it is not."""
+"""The login to which a program belongs is kept where the kernel permits it, and reported where it does not."""
 
 from __future__ import annotations
 

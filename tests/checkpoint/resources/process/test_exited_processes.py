@@ -1,4 +1,4 @@
-"""A child that stands for a process that has ended does not outlive the step that it was born for."""
+"""A child that stands for a process that has ended does not outlive the step for which it was created."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What waits in sockets is looked at where it lies: the program's own looks (MSG_PEEK) find what they would find without us."""
+"""Data that waits in sockets is read in place: the program's own looks (MSG_PEEK) find what they would find without us."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unix sockets whose file was given another name than bind(2) was told: see ``checkpoint/resources/sockets/renamed_paths.py``."""
+"""Unix sockets whose file has another name than bind(2) was told: see `checkpoint.resources.sockets.renamed_paths`."""
 
 from __future__ import annotations
 

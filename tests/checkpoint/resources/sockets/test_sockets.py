@@ -1,4 +1,4 @@
-"""Sockets: what a restore says of them, and who they say they are."""
+"""Sockets: what a restore says of them, and which process they say they belong to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TCP connections: of a program with itself they come back, others end as if the peer had crashed; three restores in a row."""
+"""TCP connections: those within a program come back, others end as if the peer had crashed; three restores in a row."""
 
 from __future__ import annotations
 

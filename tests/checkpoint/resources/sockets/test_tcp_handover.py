@@ -1,4 +1,4 @@
-"""TCP connections with somebody else that go along: the peer, in a network of its own, sees one unbroken stream of bytes."""
+"""TCP connections with others that move along: the peer, in a network of its own, sees one unbroken stream of bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the demo makes of a program that is not well for a while: it waits; where that lasts, it says why."""
+"""The demo with a program that is unhealthy for a while: it waits; if that lasts, it says why."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`failover why` for somebody who was not there: what stands below a decision, who told it, and what is left out."""
+"""`failover why` for a reader who was not there: the lines below a decision, which robot told it, and omitted lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a robot remembers of a decision, and how the stories of several robots become one."""
+"""A robot's record of a decision, and the merge of several robots' event logs into one."""
 
 from __future__ import annotations
 

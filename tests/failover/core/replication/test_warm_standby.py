@@ -1,4 +1,4 @@
-"""What waits at a standby, one event at a time. Whole lives are in ``tests/simulation``."""
+"""The process that waits at a standby, one event at a time. Whole lives are in ``tests/simulation``."""
 
 from __future__ import annotations
 

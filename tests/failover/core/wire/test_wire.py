@@ -1,4 +1,4 @@
-"""Frames of the beat lane: what is believed, and what is refused by value."""
+"""Frames of heartbeats: which are believed, and which are refused by value."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A capture takes nothing with other rights than those of the component's owner, whenever the program came by them.
+"""A capture takes nothing with more rights than those of the component's owner, however the program came by more.
 
 The program executes a set-user-id program: before a keeper looks at it, between a look and the freeze, between two captures, or
-in a child. What it carries is opened with its owner's rights, whatever the program's are by then.
+in a child. Its carried files are opened with its owner's rights, not with the rights that the program has by then.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A base and many deltas, taken at random instants, are the program: whatever it did to its memory in between.
+"""A base and many deltas, taken at random instants, equal the program, however it changed its memory in between.
 
 ``tests/tracees/mutator.c`` changes its memory in every way that can hide a write, and its transcript is the same in every run
-with the same seed; so a restored mutator must go on with the very lines of an undisturbed one. The seed is in the test's
+with the same seed; so a restored mutator must continue with the very lines of an undisturbed one. The seed is in the test's
 name. FAILOVER_TEST_SEEDS=100 tries that many more.
 """
 

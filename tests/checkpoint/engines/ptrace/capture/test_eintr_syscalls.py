@@ -1,4 +1,4 @@
-"""Calls that the kernel ends with EINTR at every stop: a program that is captured many times a second does not notice."""
+"""System calls that the kernel ends with EINTR at every stop: a program that is captured many times a second does not notice."""
 
 from __future__ import annotations
 

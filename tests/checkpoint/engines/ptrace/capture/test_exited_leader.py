@@ -1,4 +1,4 @@
-"""Programs whose first thread has ended while others live on: looked at by a spokesman, and what they were in every life."""
+"""Programs whose first thread has ended while others live on: read through another thread, and the same in every life."""
 
 from __future__ import annotations
 

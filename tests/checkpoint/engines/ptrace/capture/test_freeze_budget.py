@@ -1,4 +1,4 @@
-"""A freeze keeps to what an operator allows it by copying before; a program too fast for that is captured all the same."""
+"""Copies before a freeze keep it within the operator's limit; a program too fast for that is captured all the same."""
 
 from __future__ import annotations
 

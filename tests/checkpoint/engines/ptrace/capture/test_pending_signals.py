@@ -1,4 +1,4 @@
-"""Pending signals: all are told, in however many goes the kernel tells them."""
+"""Pending signals: all are reported, in however many calls the kernel reports them."""
 
 from __future__ import annotations
 

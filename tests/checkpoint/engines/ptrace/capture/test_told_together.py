@@ -1,4 +1,4 @@
-"""What can only be refused where several things that are told are looked at together."""
+"""Refusals that are possible only when several reported facts are checked together."""
 
 from __future__ import annotations
 

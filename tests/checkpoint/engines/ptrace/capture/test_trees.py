@@ -1,4 +1,4 @@
-"""Programs of several processes: all of them are captured together, and come back as what they were to each other."""
+"""Programs of several processes: all are captured together, and come back with the same relations to each other."""
 
 from __future__ import annotations
 

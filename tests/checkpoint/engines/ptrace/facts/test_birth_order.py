@@ -1,4 +1,4 @@
-"""In which order processes are born again: parents, sessions and groups come out as they were, whoever has ended meanwhile."""
+"""Order in which processes are created again: parents, sessions and groups come out as before, whichever have ended meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Children of sessions that their parent never was in: they were given to it, and their leaders may be elsewhere since."""
+"""Children in sessions that their parent never was in: they were given to it, and their leaders may be elsewhere since."""
 
 from __future__ import annotations
 

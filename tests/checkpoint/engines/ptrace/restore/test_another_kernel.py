@@ -1,4 +1,4 @@
-"""A program whose snapshot comes from a kernel with another vdso: it reads the clocks through this one's."""
+"""A program whose snapshot comes from a kernel with another vdso: it reads the clocks through this kernel's."""
 
 from __future__ import annotations
 

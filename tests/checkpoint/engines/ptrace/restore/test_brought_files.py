@@ -1,4 +1,4 @@
-"""A program goes on where its own files are missing or others: with what was brought of them, and nothing in place is touched."""
+"""A program resumes where its own files are missing or differ: with the files brought along, and no file in place is touched."""
 
 from __future__ import annotations
 

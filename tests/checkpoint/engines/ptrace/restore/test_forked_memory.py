@@ -1,4 +1,7 @@
-"""What processes of a tree are born with (`checkpoint.engines.ptrace.restore.forked_memory`); `test_trees` sees real ones."""
+"""Memory that new processes of a tree inherit (`checkpoint.engines.ptrace.restore.forked_memory`).
+
+`tests.checkpoint.engines.ptrace.capture.test_trees` tests real ones.
+"""
 
 from __future__ import annotations
 

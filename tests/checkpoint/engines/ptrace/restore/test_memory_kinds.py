@@ -1,4 +1,4 @@
-"""Memory of special kinds: each captured, killed and brought back, and what becomes of it where the machine has none of it."""
+"""Memory of special kinds: each captured, killed and restored, and the result where the machine has none of that kind."""
 
 from __future__ import annotations
 

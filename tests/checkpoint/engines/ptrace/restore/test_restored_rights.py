@@ -1,4 +1,4 @@
-"""What a restore does not do with its own rights: names that are somebody else's, and what is more than its user had."""
+"""What a restore does not do with its own rights: names that belong to others, and more than its user had."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a child is to its parent besides being there: stopped, told of or not; who it runs as; what both have open."""
+"""States of a child besides its existence: stopped, reported to its parent or not; its user; what both have open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a delta changes in the mappings of a ready copy: each is as all of it would be mapped, whichever part of it is new."""
+"""Mappings of a ready copy after a delta: each as if all of it were mapped anew, whichever part of it is new."""
 
 from __future__ import annotations
 

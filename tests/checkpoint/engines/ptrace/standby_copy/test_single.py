@@ -1,4 +1,4 @@
-"""A ready copy is the program: laid from a base, kept current by deltas while the program runs, and let go when it has ended."""
+"""A ready copy equals the program: built from a base, updated by deltas while the program runs, and resumed when it has ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ready copy of several processes is all of them: laid from a base, kept current by deltas, let go when they have ended."""
+"""The ready copy of several processes equals them all: built from a base, updated by deltas, resumed when they have ended."""
 
 from __future__ import annotations
 
