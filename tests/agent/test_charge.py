@@ -235,7 +235,7 @@ def released(directory: Path, trouble: GuardError | None = None) -> Exception | 
 
         verbs = Verbs.__new__(Verbs)
         verbs.__dict__.update(_lanes=SimpleNamespace(charge=lambda _: charge), _command=command, _known=known)
-        answer = asyncio.create_task(verbs.release({"name": NAME}))
+        answer = asyncio.create_task(verbs.release({"name": NAME}, 0))
         await settled()
         assert not answer.done()
         guard.answers.set()
