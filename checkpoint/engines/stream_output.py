@@ -1,6 +1,7 @@
 """Read how much a guarded component has written to its standard streams, and the bytes, without asking another process.
 
-The guard counts a byte when it takes it out of the pipe, and writes it to the log a little later (docs/internals.md, section 5). While output
+The guard counts a byte when it takes it out of the pipe, and writes it to the log a little later (docs/internals.md, section 5).
+While output
 is held, the guard may leave bytes in the pipe: this module reads them there, and they stay in the pipe.
 """
 

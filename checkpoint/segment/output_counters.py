@@ -1,7 +1,7 @@
 """How many bytes a guarded program has written to its output streams: the counted ones plus those still in the pipe.
 
-The guard takes bytes out of a pipe and counts them in one step (docs/internals.md, section 5). Either end of the pipe reports how many bytes
-are unread.
+The guard takes bytes out of a pipe and counts them in one step (docs/internals.md, section 5). Either end of the pipe reports
+how many bytes are unread.
 """
 
 from __future__ import annotations
