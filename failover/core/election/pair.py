@@ -11,6 +11,8 @@ A primacy is an epoch and the robot that all robots which know of it name as its
 * Under ``when_alone = freeze`` a robot starts a component only with every robot's consent, or with the *right to act alone*: it
   was entrusted by the primary that has gone silent, or it was the primary itself and had entrusted no robot. One robot has that
   right.
+
+The rule ``majority`` (`failover.core.election.votes`) shares `vacant`, `claim`, `begin` and `follow`.
 """
 
 from __future__ import annotations

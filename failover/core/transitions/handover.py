@@ -1,4 +1,8 @@
-"""The planned move: freeze the program, ship the last delta, let the other robot claim. No step is computed twice."""
+"""The planned move: freeze the program, ship the last delta, let the other robot claim. No step is computed twice.
+
+This is the half of the primary. `failover.core.replication.standby` says that it yields once the last delta is acknowledged; the
+other robot reads that (``Entry.yields_to``) and claims in `failover.core.election.pair.follow`, under both rules.
+"""
 
 from __future__ import annotations
 
