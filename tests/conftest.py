@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import functools
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 TRACEES = Path(__file__).parent / "tracees"
 
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
+WALL = 0x40000000  # __WALL of linux/wait.h
 LEAVE_S = 30.0
 """How long a process that a test has told to end may take for it."""
 
@@ -196,6 +198,13 @@ def reap(pids: set[int]) -> set[int]:
     return alive
 
 
+def reap_threads(pid: int) -> None:
+    """Collect the threads of a child that a test has left traced by us: until then it is no child that can be collected."""
+    for task in Path(f"/proc/{pid}/task").glob("*"):
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(int(task.name), os.WNOHANG | WALL)
+
+
 def command_of(pid: int) -> str:
     """What a process runs, for a message."""
     try:
@@ -231,8 +240,10 @@ def _no_process_left_behind(_subreaper: None) -> Iterator[None]:
     left = [f"{pid} ({command_of(pid)})" for pid in sorted(alive)]
     for pid in alive:
         os.kill(pid, signal.SIGKILL)
-    while children() - before:  # their own children come to us as they die
+    deadline = time.monotonic() + LEAVE_S
+    while children() - before and time.monotonic() < deadline:  # their own children come to us as they die
         for pid in reap(children() - before):
             os.kill(pid, signal.SIGKILL)
+            reap_threads(pid)
         time.sleep(0.01)
     pytest.fail(f"the test left processes running: {', '.join(left)}")

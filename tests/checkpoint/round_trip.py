@@ -24,6 +24,7 @@ from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Sessio
 from checkpoint.engines.registry import engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import abi
+from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.signal_wakeup import waking
 from checkpoint.linux.spawn.namespaces import prctl
 from checkpoint.linux.spawn.vessel import Birth, Born, discard, spawn_program, spawn_vessel
@@ -179,6 +180,11 @@ def expect_ok(tracee: Program) -> None:
     """Let a tracee that was told finish, and show what it found to differ."""
     status = tracee.finish()
     assert (status, tracee.output.splitlines()[-1:]) == (0, ["ok"]), f"status {status}\n{tracee.output}{tracee.complaints}"
+
+
+def another_thread(pid: int) -> int:
+    """A thread of a process besides its first one, if there is one. Ids wrap around, so the first may have the greatest."""
+    return max((tid for tid in thread_ids(pid) if tid != pid), default=pid)
 
 
 @contextlib.contextmanager

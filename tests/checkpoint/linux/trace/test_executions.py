@@ -22,7 +22,7 @@ from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Stop, Tracee, no_stop
 from checkpoint.program import cpu_baseline
 from tests.checkpoint.linux.trace.test_threads import open_descriptors, states, tracers
-from tests.checkpoint.round_trip import ENGINE, PATIENCE_S, Program, ended, expect_ok, start_tracee
+from tests.checkpoint.round_trip import ENGINE, PATIENCE_S, Program, another_thread, ended, expect_ok, start_tracee
 
 pytestmark = [pytest.mark.compiler, pytest.mark.root]
 
@@ -36,7 +36,7 @@ MANY = 1000
 
 def have_it_execute(tracee: Program) -> None:
     """Until it has executed its program, or waits inside the kernel for us to take note of the others' ends, or stands still."""
-    executes = max(thread_ids(tracee.pid))
+    executes = another_thread(tracee.pid)
     tracee.tell()
     deadline = time.monotonic() + PATIENCE_S
     while "executed" not in tracee.output and "D" not in states(tracee.pid) and state(tracee.pid, executes) != "t":
@@ -172,7 +172,7 @@ def test_a_thread_that_did_not_stop_and_executes_a_program_instead_is_let_go(
     ask, detach = Tracee.ask_to_stop, Tracee.detach
 
     with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
-        executes = max(thread_ids(tracee.pid))
+        executes = another_thread(tracee.pid)
 
         def ask_all_but_one(self: Tracee) -> Stop | None:
             if self.pid == executes:
@@ -203,7 +203,7 @@ def test_a_thread_that_executes_a_program_between_two_looks_at_it_is_let_go(
     looked_at: list[int] = []
 
     with ended(start_tracee(compiled("executes", "-O2", "-pthread"), tmp_path)) as tracee:
-        executes = max(thread_ids(tracee.pid))
+        executes = another_thread(tracee.pid)
 
         def ask_all_but_one(self: Tracee) -> Stop | None:
             if self.pid == executes:

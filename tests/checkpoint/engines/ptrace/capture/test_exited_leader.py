@@ -19,7 +19,6 @@ from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.live_thread import PIDFD_THREAD, SPOKESMEN_MAX, spokesman_of, told_by_spokesman
 from checkpoint.linux.procfs.procfs import Stat
-from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.trace.bulk_stops import Together
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
@@ -29,6 +28,7 @@ from tests.checkpoint.round_trip import (
     ENGINE,
     LIVES,
     Program,
+    another_thread,
     as_nobody,
     captured,
     captured_and_killed,
@@ -185,7 +185,7 @@ def test_a_stranger_who_has_the_id_of_a_spokesman_by_now_is_left_in_peace(compil
 def test_nobody_speaks_for_a_process_whose_first_thread_lives(compiled: Compiled, tmp_path: Path) -> None:
     with ended(started(compiled, tmp_path, "late")) as tracee:
         with pytest.raises(ProcessGoneError, match="another program"):
-            Threads(Tracee(max(thread_ids(tracee.pid))), process=tracee.pid).freeze()
+            Threads(Tracee(another_thread(tracee.pid)), process=tracee.pid).freeze()
 
 
 def test_a_first_thread_comes_to_its_end_before_the_others_are_stopped(
