@@ -12,6 +12,7 @@ from failover.core.acts import Act
 from failover.core.event_log.decisions import Decision, Facts, Sighting
 from failover.core.membership import Membership
 from failover.core.types import (
+    ENDED,
     EPOCH_MAX,
     HISTORY_MAX,
     HOLDING,
@@ -76,7 +77,7 @@ TABLE: dict[tuple[State, Cause], State] = {
     **{(state, Cause.CRASH): State.RECOVERING for state in _RUNS_HERE},
     (State.STARTING, Cause.CRASH): State.RECOVERING,
     (State.TAKING_OVER, Cause.CRASH): State.RECOVERING,
-    **{(state, Cause.OUTBID): State.STOPPING for state in (*_RUNNING, State.FINISHED, State.FAILED, State.RELEASED)},
+    **{(state, Cause.OUTBID): State.STOPPING for state in (*_RUNNING, *ENDED)},
     **{(state, Cause.CANNOT): State.STOPPING for state in (State.TAKING_OVER, *_RUNS_HERE)},
     (State.STOPPING, Cause.CLEARED): State.STANDBY,
     **{(state, Cause.FOLLOW): State.STANDBY for state in _IDLE},

@@ -341,13 +341,18 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
     follow(component, turn, sender, entry)
 
 
+def clear_away(component: Component, turn: Turn, epoch: int) -> None:
+    """Have the agent end the copy that is here, or what is left of it, before this robot stands by."""
+    component.move(Cause.OUTBID)
+    component.until_ns = turn.now_ns + turn.config.retry_ms * MS
+    turn.order(acts.Stop(component.name, epoch))
+
+
 def follow(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     """The accepted primary's word: keep its checkpoints, and claim the component when it gives way to us."""
     if component.state in ENDED:
         drop(component, turn, f"{sender} runs it anew")
-        component.move(Cause.OUTBID)  # a copy that ended here, and whose end was not agreed, may be left
-        component.until_ns = turn.now_ns + turn.config.retry_ms * MS
-        turn.order(acts.Stop(component.name, component.epoch))
+        clear_away(component, turn, component.epoch)  # a copy that ended here, and whose end was not agreed, may be left
     if component.state is not State.STANDBY and component.state is not State.STOPPING:
         component.move(Cause.FOLLOW)
     component.trusted = entry.standby == turn.me and turn.config.runs(turn.me)
@@ -432,9 +437,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
             reason = f"{winner} holds epoch {entry.epoch}, this copy had epoch {component.epoch}"
             turn.order(acts.KeepAside(component.name, component.epoch, reason))
             turn.say(component, f"{turn.me} is told stale: {reason}; its state is kept aside")
-        component.move(Cause.OUTBID)
-        component.until_ns = turn.now_ns + turn.config.retry_ms * MS
-        turn.order(acts.Stop(component.name, entry.epoch))
+        clear_away(component, turn, entry.epoch)
     component.handing = component.flight = None
     component.standby, component.lease_ns, component.told_ns = "", 0, 0
     component.crashed = 0

@@ -7,7 +7,6 @@ answers rivals.
 from __future__ import annotations
 
 from checkpoint.model import Position
-from failover.core import acts
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import majority
 from failover.core.election.consent import state_of
@@ -15,6 +14,7 @@ from failover.core.election.pair import (
     accept,
     begin,
     claim,
+    clear_away,
     first_of_equals,
     follow,
     heard_end,
@@ -117,10 +117,8 @@ def withdraw(component: Component, turn: Turn, why: str) -> None:
 
 def step_down(component: Component, turn: Turn) -> None:
     """A primary that has given way and was not relieved clears its copy away; its checkpoint is claimed anew."""
-    component.move(Cause.OUTBID)
     component.handing = component.flight = None
-    component.until_ns = turn.now_ns + turn.config.retry_ms * MS
-    turn.order(acts.Stop(component.name, component.epoch))
+    clear_away(component, turn, component.epoch)
     turn.say(component, f"{turn.me} gives its copy up: what it handed over is claimed anew")
 
 
