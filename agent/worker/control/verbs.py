@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final, Protocol
 
 import msgspec
+from msgspec.structs import replace
 
 from agent.core_config import level_of, rules_for
 from agent.errors import RefusedError
@@ -199,7 +200,7 @@ class Verbs(Questions):
         name = await self._known(arguments_of(NameArguments, "release", arguments).name)
         charge = self._lanes.charge(name)
         pid = charge.component.pid if charge.component is not None else None
-        await self._command(lambda number: events.Release(number, name, asking(by)))
+        await self._command(by, lambda number: events.Release(number, name))
         await charge.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
 
@@ -208,7 +209,7 @@ class Verbs(Questions):
         wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
         end = self._lanes.charge(name).end()
-        await self._command(lambda number: events.Stop(number, name, wanted.signal, asking(by)))
+        await self._command(by, lambda number: events.Stop(number, name, wanted.signal))
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
 
@@ -217,14 +218,14 @@ class Verbs(Questions):
         wanted = arguments_of(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
         await self._check_fit(name, "hand over", wanted.to or (await self._view(name))["standby"])
-        return await self._moved(name, lambda number: events.Handover(number, name, wanted.to, asking(by)))
+        return await self._moved(by, name, lambda number: events.Handover(number, name, wanted.to))
 
     async def failback(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
         name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
         view = await self._view(name)
         await self._check_fit(name, "fail back", view["prefer"] or view["home"])
-        return await self._moved(name, lambda number: events.Failback(number, name, asking(by)))
+        return await self._moved(by, name, lambda number: events.Failback(number, name))
 
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot lacks of what a component needs to go on here."""
@@ -245,9 +246,9 @@ class Verbs(Questions):
             sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 
-    async def _moved(self, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
+    async def _moved(self, by: int, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
         began_ns, before = clock.now_ns(), await self._view(name)
-        answer = await self._command(make)
+        answer = await self._command(by, make)
         view = await self._view(name)
         if view["primary"] != self._lanes.settings.config.robot:
             view = await self._running_at(view["primary"], name)
@@ -280,7 +281,7 @@ class Verbs(Questions):
         wanted = arguments_of(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)
         await self._check_fit(name, "prefer", wanted.robot)
-        await self._command(lambda number: events.Prefer(number, name, wanted.robot, asking(by)))
+        await self._command(by, lambda number: events.Prefer(number, name, wanted.robot))
         return {"name": name, "robot": wanted.robot}
 
     async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -299,7 +300,7 @@ class Verbs(Questions):
     async def _promoted(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Promote this robot, or tell what that would risk."""
         wanted = arguments_of(PromoteArguments, "promote", arguments)
-        answer = await self._command(lambda number: events.Promote(number, wanted.name, not wanted.sure, asking(by)))
+        answer = await self._command(by, lambda number: events.Promote(number, wanted.name, not wanted.sure))
         view = await self._view(wanted.name)
         told = {"name": wanted.name, "to": wanted.robot, "epoch": view["epoch"], "sentence": answer.sentence}
         return {**told, "promoted": wanted.sure, "risks": list(answer.risks)}
@@ -385,7 +386,7 @@ class Verbs(Questions):
         end = charge.end()
         try:
             spec = ComponentSpec(name, config.robot, launch, rules, owner)
-            await self._command(lambda number: events.Run(number, spec, asking(by)))
+            await self._command(by, lambda number: events.Run(number, spec))
         except RefusedError as refusal:
             raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
         begun = asyncio.ensure_future(charge.started.wait())
@@ -401,8 +402,9 @@ class Verbs(Questions):
             raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; failover why {name} tells what it waits for")
         return charge
 
-    async def _command(self, make: Callable[[int], events.Command]) -> acts.Answer:
-        answer = await self._lanes.command(make)
+    async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:
+        """Have the core decide, by the right of this user. Raises RefusedError: it says no."""
+        answer = await self._lanes.command(lambda number: replace(make(number), by=asking(by)))
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return answer

@@ -226,7 +226,7 @@ def released(directory: Path, trouble: GuardError | None = None) -> Exception | 
         charge = Charge(NAME, around, cast(Component, guard), epoch=3)
         charge.begin()
 
-        async def command(_: object) -> acts.Answer:
+        async def command(*_: object) -> acts.Answer:
             charge.order(acts.LetGo(NAME, 3))
             return acts.Answer(1, True, "it is protected no longer")
 
