@@ -10,7 +10,7 @@ import ast
 import functools
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -30,22 +30,31 @@ def modules(root: Path = ROOT) -> dict[str, Path]:
     return found
 
 
-def imported(tree: ast.AST, known: Iterable[str]) -> set[str]:
-    """The modules of the product that a source imports; ``from package import name`` may be a module."""
-    names, known = set(), set(known)
+def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
+    """Every import anywhere in a file, also inside functions and of names given as text: (line, dotted module)."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                names.add(inner if inner in known else node.module)
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
-            called = node.func.id if isinstance(node.func, ast.Name) else node.func.attr
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*start, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{module}.{alias.name}" if module else alias.name) for alias in node.names)
+        elif isinstance(node, ast.Call) and called(node) in ("__import__", "import_module"):
             first = node.args[0] if node.args else None
-            if called in ("import_module", "__import__") and isinstance(first, ast.Constant):
-                names.add(first.value)
-    return names & known
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                yield node.lineno, first.value
+
+
+def called(node: ast.Call) -> str:
+    """The last part of the name that a call calls, "" for anything fancier."""
+    return node.func.id if isinstance(node.func, ast.Name) else node.func.attr if isinstance(node.func, ast.Attribute) else ""
+
+
+def imported(tree: ast.AST, known: Iterable[str]) -> set[str]:
+    """The modules of the product that a source imports; ``from package import name`` may be a module."""
+    known = set(known)
+    names = (name for _, name in imports(tree, []))
+    return {name if name in known else name.rpartition(".")[0] for name in names} & known
 
 
 @functools.cache

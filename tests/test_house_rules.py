@@ -6,12 +6,12 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
-from tests.imports import Graph, circles, folders, graph, imported
+from tests.imports import Graph, called, circles, folders, graph, imported, imports
 
 ROOT = Path(__file__).parent.parent
 FLOORS = ("checkpoint", "failover", "agent")
@@ -82,26 +82,6 @@ def name_of(path: Path) -> str:
 def package_of(path: Path) -> list[str]:
     """The package that a relative import in this file starts from."""
     return list(path.relative_to(ROOT).parent.parts)
-
-
-def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
-    """Every import anywhere in a file, also inside functions and of names given as text: (line, dotted module)."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            start = package[: len(package) - node.level + 1] if node.level else []
-            module = ".".join([*start, *([node.module] if node.module else [])])
-            yield from ((node.lineno, f"{module}.{alias.name}" if module else alias.name) for alias in node.names)
-        elif isinstance(node, ast.Call) and called(node) in ("__import__", "import_module"):
-            first = node.args[0] if node.args else None
-            if isinstance(first, ast.Constant) and isinstance(first.value, str):
-                yield node.lineno, first.value
-
-
-def called(node: ast.Call) -> str:
-    """The last part of the name that a call calls, "" for anything fancier."""
-    return node.func.id if isinstance(node.func, ast.Name) else node.func.attr if isinstance(node.func, ast.Attribute) else ""
 
 
 def parsed(path: Path) -> ast.Module:
