@@ -80,8 +80,8 @@ def _call_off(component: Component, turn: Turn, handing: Handing) -> None:
     else:
         component.flight = None
     turn.order(acts.Freeze(component.name, component.epoch))
-    why = component.degraded or component.awaited or component.undelivered
-    sentence = f"{handing.to} did not take {component.name} in time; it stays at {turn.me}" + (f": {why}" if why else "")
+    why = component.degraded or component.awaited or component.undelivered or f"{handing.to} did not take it in time"
+    sentence = f"{component.name} stays at {turn.me}: {why}; order it again when status says protected"
     _answer(turn, handing.request, False, sentence)
     turn.say(component, f"the handover to {handing.to} is called off")
 
