@@ -40,7 +40,6 @@ COMPONENTS: Final = {
 LEGACY_SIZE: Final = 512
 LEGACY_USED: Final = 464
 """Bytes of the legacy region that are registers; the kernel uses the rest for itself (arch/x86/include/uapi/asm/sigcontext.h)."""
-HEADER_SIZE: Final = 64
 FIRST_EXTENDED: Final = 2
 """Components 0 and 1 lie in the legacy region."""
 PKRU: Final = 9

@@ -318,7 +318,7 @@ def refuse_process(
         lines: its mappings, where they are known.
     """
     lines = procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines
-    yield from refused_threads.refuse(pid, status, kin)
+    yield from refused_threads.refuse(pid, status)
     yield from shared_memory.refuse(pid, lines, kin)
     yield from refuse_entering(pid, status, files_kept=files_kept, lines=lines)
     yield from _refuse_places(pid)

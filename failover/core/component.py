@@ -100,7 +100,6 @@ class Flight(Struct):
 
     started_ns: int
     until_ns: int
-    base: bool
     to: str = ""
     position: Position | None = None
     parent: Position | None = None

@@ -34,9 +34,9 @@ from agent.guard.messages import Described, Exited, Refused, Started, TaskConnec
 from agent.guard.output_logs import STREAMS, OutputLogs, discard, logs_of
 from agent.guard.output_pump import HOLD_LIMIT
 from agent.system.adopted_process import Guest
+from agent.worker.components.connection import Dialogue
 from agent.worker.components.keeper_client import Following
 from agent.worker.components.paths import Places, log_directory
-from agent.worker.components.process_pool import GuardLink
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
 from checkpoint.keeper import messages as channel
@@ -123,14 +123,13 @@ class Component:
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
     """
 
-    def __init__(self, name: str, guard: GuardLink, places: Places) -> None:
+    def __init__(self, name: str, guard: Dialogue, places: Places) -> None:
         self.name = name
         self.pid = self.inner_pid = 0
         self.isolated = False
         self.notes: tuple[str, ...] = ()
         self.logs = OutputLogs(log_directory(name, places))
         self.ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
-        self._places = places
         self._guard = guard
         self.keeper = Following(name, places)
         self.streams: tuple[int, ...] = ()
@@ -150,8 +149,8 @@ class Component:
         self._held = False
         self._output_limited: bool | None = None
         self.guest: Guest | None = None
-        guard.dialogue.heard = self._heard
-        guard.dialogue.ended = self._guard_lost
+        guard.heard = self._heard
+        guard.ended = self._guard_lost
 
     def begin_output(self, owner: int) -> None:
         """Its output begins anew, and is this owner's. A namesake that was let go may still write: to files without a name.
@@ -343,7 +342,7 @@ class Component:
         self.limit_output(self.engine == PTRACE or not is_safe)
         self.keeper.tell(channel.Acknowledge(position))
         if (commit := self._commits.pop(position, 0)) and is_safe:
-            self._guard.dialogue.tell(messages.CommitSafe(commit))
+            self._guard.tell(messages.CommitSafe(commit))
 
     def limit_output(self, limited: bool) -> None:
         """Bound how much of held output may wait, or do not.
@@ -351,9 +350,9 @@ class Component:
         A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while nobody stands by,
         for then its checkpoints would not help.
         """
-        if self._guard.dialogue.open and self.logs.is_held and limited != self._output_limited:
+        if self._guard.open and self.logs.is_held and limited != self._output_limited:
             self._output_limited = limited
-            self._guard.dialogue.tell(messages.LimitOutput(HOLD_LIMIT if limited else 0))
+            self._guard.tell(messages.LimitOutput(HOLD_LIMIT if limited else 0))
 
     @contextlib.asynccontextmanager
     async def _standing_still(self, wanted: bool) -> AsyncIterator[None]:
@@ -438,7 +437,7 @@ class Component:
     def close(self) -> None:
         """Let go of guard, keeper and logs without changing anything for the program: what a stopping agent does."""
         self._drop_keeper()
-        self._guard.dialogue.close()
+        self._guard.close()
         if self.prepared is not None:
             os.close(self.prepared.segment)
             self.prepared = None
@@ -467,7 +466,7 @@ class Component:
         Raises:
             GuardError: it refuses, with its sentence; GuardLostError.
         """
-        reply, streams = await self._guard.dialogue.ask(request, descriptors)
+        reply, streams = await self._guard.ask(request, descriptors)
         if isinstance(reply, Refused):
             raise GuardError(f"{self.name}: {reply.message}")
         return reply, streams

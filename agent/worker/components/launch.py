@@ -406,10 +406,10 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
         with contextlib.suppress(FileNotFoundError):
             socket_path.unlink()
         raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
-    guard.dialogue.heard = lambda message: isinstance(message, messages.Event)  # the end is told by the answer, too
-    described, streams = await guard.dialogue.ask(messages.Describe())
+    guard.heard = lambda message: isinstance(message, messages.Event)  # the end is told by the answer, too
+    described, streams = await guard.ask(messages.Describe())
     if described.state == "none":
-        guard.dialogue.close()
+        guard.close()
         raise GuardLostError(f"the guard of {socket_path.name} guards nothing; it ends")
     component = Component(described.component, guard, places)
     component.take(described, streams)

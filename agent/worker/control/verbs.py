@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import logging
 import os
 from collections.abc import Callable, Iterable
 from typing import Any, Final, Protocol
@@ -50,8 +49,6 @@ STANDING_POLL_S: Final = 0.01
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
-
-log = logging.getLogger("failover.verbs")
 
 
 class Lanes(Lines, Protocol):

@@ -9,7 +9,7 @@ Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from msgspec import Struct
@@ -89,12 +89,11 @@ OF_SEVERAL: Final = (
 _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
 
 
-def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]:
+def refuse(pid: int, status: Status) -> Iterator[str]:
     """Why the threads of a process cannot be captured.
 
     Args:
         status: of the first one.
-        kin: all processes of its component, if there are several.
     """
     yield from refuse_shared_memory(pid, status)
     if status.threads == 1:

@@ -17,7 +17,7 @@ import pytest
 
 from checkpoint.errors import SegmentBusyError, SegmentError
 from checkpoint.segment import layout as segment
-from checkpoint.segment.layout import ARRAY, BANKS, NEWEST_OFFSET, PAGE, PENDING, STATE, Layout, Region, lock_of, numbered
+from checkpoint.segment.layout import ARRAY, BANKS, NEWEST_OFFSET, PAGE, PENDING, STATE, Layout, Region, lock_of
 from checkpoint.segment.reader import SegmentReader
 from checkpoint.segment.writer import SegmentWriter
 from tests.checkpoint.segments import LINEAGE, Telling, committing_child, layout, number_read, source
@@ -300,7 +300,7 @@ def test_regions_that_overlap_or_share_a_name_are_refused() -> None:
     with pytest.raises(SegmentError, match="begins before"):
         Layout((Region("a", ARRAY, PAGE, PAGE + 1), Region("b", ARRAY, 2 * PAGE, 1)), LINEAGE).check()
     with pytest.raises(SegmentError, match="same name"):
-        Layout(numbered([("a", ARRAY, 1), ("a", ARRAY, 1)]), LINEAGE).check()
+        Layout((Region("a", ARRAY, PAGE, 1), Region("a", ARRAY, 2 * PAGE, 1)), LINEAGE).check()
 
 
 def test_a_pipe_is_no_segment() -> None:

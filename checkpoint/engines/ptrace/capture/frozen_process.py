@@ -113,7 +113,7 @@ class Onlooker:
         self._files = KeptFiles(threads.pid)
         self._readings = Readings()
         self._waiting = Waiting(threads.leader)
-        self._confinements = Confinements(threads.pid, entered.interruptions)
+        self._confinements = Confinements(entered.interruptions)
         self._others = ThreadOnlooker(threads, entered, self._confinements)
         self._recollection = Recollection()
         self.rights = ThreadRights(threads.pid)

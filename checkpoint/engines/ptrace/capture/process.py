@@ -238,7 +238,7 @@ class CapturedProcess:
 
     def thread_states(self, look: Look) -> tuple[ThreadState, ...]:
         """Its threads, the first one first."""
-        living = thread_states(self.pid, look.standing)
+        living = thread_states(look.standing)
         if self.ended_first is None:
             return living
         return (self.ended_first.state(living[0], look.standing.status.tgids[-1], look.taken.lines), *living)

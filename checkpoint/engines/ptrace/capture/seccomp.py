@@ -27,8 +27,7 @@ Life = tuple[int, int]
 class Confinements:
     """Of one process."""
 
-    def __init__(self, pid: int, interruptions: Interruptions) -> None:
-        self._pid = pid
+    def __init__(self, interruptions: Interruptions) -> None:
         self._interruptions = interruptions
         self._known: dict[Life, Confinement] = {}
 

@@ -339,12 +339,10 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str],
             yield from (reason + damage for reason in reasons)
 
 
-def of_mapped_files(
-    state: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file
-) -> tuple[tuple[str, ...], dict[str, str]]:
+def of_mapped_files(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], dict[str, str]]:
     """Why its executable, or what it maps, cannot be had here; and the contents to open for what was brought along, by path."""
     brought: dict[str, str] = {}
-    return tuple(_of_files(state, options, brought, digest_of)), brought
+    return tuple(_of_files(state, options, brought, digest_of_file)), brought
 
 
 def _content(options: RestoreOptions, digest: bytes, digest_of: DigestOf) -> tuple[str, str]:

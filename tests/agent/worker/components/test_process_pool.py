@@ -58,7 +58,7 @@ def test_with_the_first_guard_that_is_given_a_keeper_is_born(tmp_path: Path) -> 
         await until({"agent.guard.server": 1, "keeper": 1})
         nursery.expect(0)
         await until({"agent.guard.server": 2, "keeper": 1})  # one more than the one that was given
-        guard.dialogue.close()
+        guard.close()
 
     live(tmp_path, story)
 
