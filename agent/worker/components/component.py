@@ -39,7 +39,7 @@ from agent.worker.components.keeper_client import Following
 from agent.worker.components.paths import Places, log_directory
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
-from checkpoint.keeper import messages as channel
+from checkpoint.keeper import messages as keeper_messages
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import Position
 
@@ -200,13 +200,13 @@ class Component:
             untold = await self._tell(*told) if told else ""
             if streams:
                 self._take_streams(streams)
-            resumed, _ = await self.keeper.ask(channel.Resume(bool(streams)), streams)
+            resumed, _ = await self.keeper.ask(keeper_messages.Resume(bool(streams)), streams)
         except (CheckpointError, GuardError, KeeperLostError):
             await self.undo()
             raise
         self.notes = (*self.notes, *resumed.notes)
         self.let_go_ns = resumed.let_go_ns
-        if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
+        if any(note.startswith(keeper_messages.UNPROTECTED) for note in resumed.notes):
             self._drop_keeper()  # the next capture tries with a new one
         else:
             self.keeper.followed = PTRACE, self.pid
@@ -283,7 +283,7 @@ class Component:
 
     async def capture(
         self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False
-    ) -> Captured | channel.Unchanged:
+    ) -> Captured | keeper_messages.Unchanged:
         """Take a snapshot; a base if the keeper has no acknowledged position to start from.
 
         Args:
@@ -301,11 +301,11 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = channel.Capture(base, generation, sequence, epoch, hold, self.keeper.share())
+        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share())
         async with self._standing_still(is_held_by_guard):
             with self._patience():
                 captured, descriptors = await self.keeper.ask(order)
-        if isinstance(captured, channel.Unchanged):
+        if isinstance(captured, keeper_messages.Unchanged):
             return captured
         self.keeper.note(captured)
         (snapshot,) = descriptors
@@ -340,7 +340,7 @@ class Component:
         if totals is not None:
             self.logs.commit(totals, is_safe=is_safe)
         self.limit_output(self.engine == PTRACE or not is_safe)
-        self.keeper.tell(channel.Acknowledge(position))
+        self.keeper.tell(keeper_messages.Acknowledge(position))
         if (commit := self._commits.pop(position, 0)) and is_safe:
             self._guard.tell(messages.CommitSafe(commit))
 

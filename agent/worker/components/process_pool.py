@@ -26,7 +26,7 @@ from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard import messages
 from agent.system.systemd_units import Kind, in_a_unit
 from agent.worker.components.connection import Dialogue
-from checkpoint.keeper import messages as channel
+from checkpoint.keeper import messages as keeper_messages
 from checkpoint.linux.unix_address import address_of
 
 BIRTH_S: Final = 20.0
@@ -193,7 +193,7 @@ class Nursery:
             end, pid = await self._keeper_called() if self._starter else self._keeper_forked()
         except GuardError as error:
             raise KeeperLostError(str(error)) from error
-        dialogue = Dialogue(end, channel.Reply, KeeperLostError, "the keeper")
+        dialogue = Dialogue(end, keeper_messages.Reply, KeeperLostError, "the keeper")
         dialogue.watch(pid)
         return KeeperLink(dialogue, pid)
 
@@ -206,7 +206,7 @@ class Nursery:
         return end, _peer_of(end)
 
     def _keeper_forked(self) -> tuple[socket.socket, int]:
-        ours, theirs = channel.pair()
+        ours, theirs = keeper_messages.pair()
         with theirs:
             try:
                 child = self._spawn("keeper", "", ["checkpoint", "keeper", str(theirs.fileno())], (theirs.fileno(),))

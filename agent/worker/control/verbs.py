@@ -16,7 +16,7 @@ from agent.hook_kinds import check_told
 from agent.system import clock
 from agent.system.adopted_process import Guest
 from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for
-from agent.worker.components import prerequisites as lacks
+from agent.worker.components import prerequisites
 from agent.worker.components.paths import Places
 from agent.worker.components.supervisor import Charge
 from agent.worker.control.arguments import (
@@ -238,7 +238,7 @@ class Verbs(Questions):
         """
         if robot not in await self._reachable():
             return
-        if reasons := await lacks.asked_of(self._lanes.errands, robot, name):
+        if reasons := await prerequisites.asked_of(self._lanes.errands, robot, name):
             sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 

@@ -22,7 +22,7 @@ from checkpoint.linux.procfs.live_thread import can_look_through
 from checkpoint.linux.procfs.procfs import Status
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.procfs.timers import parse_timers
-from checkpoint.linux.trace import seccomp as confinement
+from checkpoint.linux.trace import seccomp as trace_seccomp
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.resources.process import seccomp, unshared_threads
 
@@ -190,7 +190,7 @@ def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: unshared_t
     named = f"its thread {tid} ({status.name})"
     if shared.tracer:
         yield f"{named} is traced by pid {shared.tracer}: end that debugger"
-    elif shared.seccomp and (why := confinement.why_not()):
+    elif shared.seccomp and (why := trace_seccomp.why_not()):
         yield seccomp.not_ours(why, named)
     if own:
         yield from unshared_threads.refuse(pid, tid, own)

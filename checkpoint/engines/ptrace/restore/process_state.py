@@ -28,7 +28,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.trace.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
 from checkpoint.resources.files import proc_and_sys, unlinked
-from checkpoint.resources.process import scheduling as deadlines
+from checkpoint.resources.process import scheduling as thread_scheduling
 
 _NO_FILE: Final = 0xFFFFFFFF
 _MM_MAP: Final = struct.Struct("<12Q2I")
@@ -241,7 +241,7 @@ def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel, whose: str
         whose: added to the notes.
     """
     table.attempt(f"nice {thread.nice} is not kept{whose}", "setpriority", 0, 0, thread.nice)
-    if thread.policy & ~os.SCHED_RESET_ON_FORK != deadlines.SCHED_DEADLINE and thread.policy:
+    if thread.policy & ~os.SCHED_RESET_ON_FORK != thread_scheduling.SCHED_DEADLINE and thread.policy:
         priority = table.place(struct.pack("<i", thread.priority))
         table.attempt(f"scheduling policy {thread.policy} is not kept{whose}", "sched_setscheduler", 0, thread.policy, priority)
     allowed = vessel.affinity & set(thread.affinity)

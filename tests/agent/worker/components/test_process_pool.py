@@ -10,7 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
-from agent.worker.components import process_pool as nursery_module
+from agent.worker.components import process_pool
 from agent.worker.components.process_pool import Nursery
 
 PATIENCE_S = 60.0
@@ -64,7 +64,7 @@ def test_with_the_first_guard_that_is_given_a_keeper_is_born(tmp_path: Path) -> 
 
 
 def test_what_has_a_ready_copy_needs_no_pair_besides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nursery_module, "REFILL_S", 0.0)
+    monkeypatch.setattr(process_pool, "REFILL_S", 0.0)
 
     async def story(nursery: Nursery) -> None:
         for name in ("one", "other"):
