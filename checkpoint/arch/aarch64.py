@@ -263,7 +263,7 @@ def call_number_before(code: bytes) -> int | None:
     return None
 
 
-# Code of a borrowed page (see ``checkpoint.linux.remote``)
+# Code of a borrowed page (see `checkpoint.linux.trace.remote_syscalls`)
 
 CLOBBERED: Final = ("x0", "x1", "x2", "x3", "x4", "x5", "x8", "x9", "sp", "pstate")
 """What the calls change, or the code between them: ours to give back, in this order in the table."""

@@ -152,7 +152,7 @@ def _is_as_at_first(number: int, content: bytes) -> bool:
     return not any(content) or (number == PKRU and int.from_bytes(content[:4], "little") == PKRU_OF_LINUX)
 
 
-# --- What this processor has: asked by ``checkpoint.linux.processor`` ---------------------------------------------------
+# --- What this processor has: asked by `checkpoint.linux.spawn.cpuid` ------------------------------------------------
 
 ASK: Final = bytes.fromhex(
     "53"  #        push rbx

@@ -174,7 +174,7 @@ KERNEL_PLACES: Final = ("/proc/", "/sys/")
 """Where nobody can make a directory."""
 
 _KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
-"""Mappings that the kernel gives every process: they move, see ``restore_memory``."""
+"""Mappings that the kernel gives every process: they move, see `checkpoint.engines.ptrace.restore.memory`."""
 
 
 # --- Descriptors -----------------------------------------------------------------------------------------------------

@@ -210,7 +210,7 @@ def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """Sort one process's open files into the kinds: what comes back, and what does not.
 
-    What can be told only of all processes of a component together is told by `kinds.findings_of_all`.
+    What can be told only of all processes of a component together is told by `registry.findings_of_all`.
     """
     resources, findings = [], []
     for held in opened:

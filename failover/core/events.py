@@ -214,7 +214,7 @@ class Noticed(Struct, frozen=True):
     """Something that belongs in the story and changes nothing: about a component, or ("") about this robot.
 
     Attributes:
-        output_pending: see ``story.Facts``.
+        output_pending: see `failover.core.event_log.decisions.Facts`.
     """
 
     component: str

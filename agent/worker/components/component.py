@@ -180,7 +180,7 @@ class Component:
         return sum(stream.size - stream.committed for stream in bounds)
 
     async def resume(self, told: tuple[int, int] | None = None) -> str:
-        """After `births.restore`: commit to it and let it go on.
+        """After `launch.restore`: commit to it and let it go on.
 
         Args:
             told: a signal, and its value, that it gets before its next instruction.

@@ -112,7 +112,7 @@ class Tracee:
     Attributes:
         is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
         left_alone: the registers that it gives itself back if we die while it makes calls of ours; empty: those it stood with.
-        waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`ended_calls`); "" otherwise.
+        waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`interrupted_syscalls`); "" otherwise.
         whereabouts: tells where it runs, of one that is stopped again and again.
         stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 

@@ -84,7 +84,7 @@ REFUGE_SIZE: Final = 1 << 20
 
 
 class Estate(Struct, frozen=True):
-    """What a process of a component of several finds when it is born, and shares with others (`restore_tree`).
+    """What a process of a component of several finds when it is born, and shares with others (`tree`).
 
     Attributes:
         base, size: the stretch of addresses that is ours in all of them; the stub lies at its beginning.

@@ -159,7 +159,7 @@ def memory_layout(table: CallTable, process: ProcessState, *, with_executable: b
 
 
 def signal_actions(table: CallTable, actions: Iterable[SignalAction]) -> None:
-    """Set what every signal does, but SIGTRAP: the table's own end resets that one, see `signal_action`."""
+    """Set what every signal does, but SIGTRAP: the table's own end resets that one, see `trap_action`."""
     for action in actions:
         if action.signal not in (*_UNCHANGEABLE, _SIGTRAP):
             what = f"set the action of signal {action.signal}"
@@ -346,7 +346,7 @@ def make_directories(table: CallTable, directories: Iterable[str]) -> None:
 
 
 def enter_directory(table: CallTable, directory: str, opened: int | None) -> None:
-    """Make a directory the working one; one that is gone is made again, and goes again; `departed` has entered one of /proc.
+    """Make a directory the working one; one that is gone is made again, and goes again; `exited_processes` has entered /proc's.
 
     Args:
         opened: a descriptor that the program has of it, if it is gone.
@@ -388,7 +388,7 @@ def surroundings(table: CallTable, process: ProcessState) -> None:
     table.call("set the umask", "umask", process.umask)
     table.call("set the execution domain", "personality", process.personality)
     if process.sid == process.pid:
-        table.attempt("", "setsid")  # of several processes each has come to its session when it was born (`births`)
+        table.attempt("", "setsid")  # of several processes each has come to its session when it was born (`birth_order`)
     elif process.pgid == process.pid:
         table.attempt("", "setpgid", 0, 0)
     if process.child_subreaper:
