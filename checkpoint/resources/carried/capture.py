@@ -228,7 +228,7 @@ class CarriedTrees(Struct):
             try:
                 if behind := tuple(filter(None, map(self._refuse_link, self.paths))):
                     return Seen(unreadable=behind)
-                names = [name for index, path in enumerate(self.paths) for name in self._below(index, path)]
+                names = [name for index in range(len(self.paths)) for name in self._below(index)]
                 links = {(one.tree, one.name): os.readlink(self._place(one)) for one in names if one.kind == stat.S_IFLNK}
                 self._read_stale(names, mapped, FROZEN_SIZE_MAX if frozen else self.size_max)
             except PermissionError as error:
@@ -254,8 +254,8 @@ class CarriedTrees(Struct):
 
     # Names
 
-    def _below(self, index: int, path: str) -> Iterator[Name]:
-        """The path itself and what lies below it, a directory before what is in it; no more than `ENTRIES_MAX`, and one."""
+    def _below(self, index: int) -> Iterator[Name]:
+        """A path itself and what lies below it, a directory before what is in it; no more than `ENTRIES_MAX`, and one."""
         first = Name(index, b"", os.stat_result(range(10)))
         try:
             first = Name(index, b"", os.lstat(self._place(first)))
