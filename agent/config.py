@@ -85,8 +85,8 @@ class ComponentConfig:
         snapshot_period_ms: 0 for the agent's own.
         freeze_budget_ms: how long it may stand still for a snapshot here, as far as that depends on what is copied; 0: as short
             as can be.
-        portable: a level of processors that it must be able to go on at, see ``checkpoint.portable``; true for the usual one;
-            "" for the agent's own.
+        portable: a level of processors that it must be able to go on at, see `checkpoint.program.cpu_baseline`; true for
+            the usual one; "" for the agent's own.
         warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
         ready_copy: of any other program the newest checkpoint's memory stands ready here, where this robot is its standby and has
             room for it.

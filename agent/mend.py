@@ -19,7 +19,7 @@ from agent.main_loop.vote_record import Ballot
 from agent.worker.components.run_records import Records
 from checkpoint.store.store import Store, open_store
 from failover.client.control import Control
-from failover.core import vote_record as core_ballot
+from failover.core import vote_record as core_vote_record
 from failover.core.types import EPOCH_SAID_MAX, PEERS_MAX, Record, State
 from failover.errors import NoAgentError
 
@@ -44,7 +44,7 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
     _check_right(directory)
     _check_stopped(settings, name)
     ballot = Ballot(directory, settings.config.robot)
-    before = core_ballot.decode(ballot.read().core)
+    before = core_vote_record.decode(ballot.read().core)
     record = next((one for one in before.records if one.name == name), None)
     if record is None:
         known = ", ".join(f"{one.name} (epoch {one.epoch})" for one in before.records) or "nothing"
@@ -63,7 +63,7 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
             store.set_aside(name, {generation for generation, _ in later})
         mended = _mended(record, epoch, has_left=held > len(later))
         records = tuple(mended if one is record else one for one in before.records)
-        ballot.keep(core_ballot.encode(replace(before, records=records)))
+        ballot.keep(core_vote_record.encode(replace(before, records=records)))
     finally:
         if store is not None:
             store.close()

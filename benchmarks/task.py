@@ -86,7 +86,7 @@ def _small(directory: Path) -> Iterator[Case]:
 def _big(directory: Path) -> Iterator[Case]:
     fields = {"turn": Field(int, default=0), "grid": Field(np.ndarray, shape=(BIG,), dtype="u1")}
 
-    def begin(state: KeptState, schema: Schema) -> dict[str, Any]:
+    def begin(state: KeptState) -> dict[str, Any]:
         _grid.update(turn=0, grid=state.array("grid", (BIG,), np.dtype("u1")))
         return _grid
 

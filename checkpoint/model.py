@@ -93,7 +93,7 @@ class Vma(Struct, frozen=True):
             fork, "dd" don't dump, "wf" wipe on fork, "hg"/"nh" huge page advice, "lo" locked, "nr" no reserve,
             "sr"/"rr" read advice, "mg" mergeable, "ht" huge pages, "dp" droppable, "sl" sealed, "mw" may be
             made writable), and two-letter codes of our own
-            (``checkpoint.linux.vm_flags``): "gb" huge pages of 1 GiB, "k1" to "kf" a protection key.
+            (`checkpoint.linux.procfs.vm_flags`): "gb" huge pages of 1 GiB, "k1" to "kf" a protection key.
         guards: pages that MADV_GUARD_INSTALL (madvise(2)) lets nobody touch, in address order; they hold nothing.
     """
 
@@ -290,7 +290,8 @@ class Member(Struct, frozen=True):
     """One more process of a component, besides the first: a child, or a child's child.
 
     Attributes:
-        slot: from 1; its own pages stand in the snapshot's runs at address + slot × 2⁴⁸ (see ``checkpoint.tree``).
+        slot: from 1; its own pages stand in the snapshot's runs at address + slot × 2⁴⁸ (see
+            `checkpoint.snapshot.process_tree`).
         exit_signal: what its parent is sent when it ends; SIGCHLD as a rule.
         process: its ``ppid`` is a pid of the component; 0 when its parent has ended.
     """
@@ -327,7 +328,7 @@ class Machine(Struct, frozen=True):
     Attributes:
         architecture: as uname(2) says ("x86_64").
         features: processor features that the program may have chosen code by: all that there were, or those of the level that it
-            was started for (see ``checkpoint.portable``).
+            was started for (see `checkpoint.program.cpu_baseline`).
         vdso_digest: blake3 of the vdso image, 32 bytes.
         robot: name of the robot, "" for a one-shot capture.
     """
@@ -347,9 +348,9 @@ class Position(Struct, frozen=True, order=True):
     """A point in a component's history. Equal numbers with unequal digests mean the histories diverged.
 
     Attributes:
-        generation: incarnation; every restore opens a new one.
+        generation: of one primacy: an epoch and the robot that runs it then, however often it is started there.
         sequence: of the snapshot inside its generation, from 1.
-        digest: state digest, 16 bytes (see ``checkpoint.chain``).
+        digest: state digest, 16 bytes (see `checkpoint.store.chain`).
     """
 
     generation: int
@@ -386,7 +387,7 @@ class Snapshot(Struct, frozen=True):
         members, zombies: of a component of several processes, those besides the first, which the other fields are of.
         copies: pages that it carries by naming others that it carries, of processes that have memory in common since a fork.
         differences: those of ``runs`` whose bytes in ``contents`` are to be XORed with what the parent's state holds there
-            (see ``checkpoint.differences``); none in a base.
+            (see `checkpoint.pages.xor_delta`); none in a base.
     """
 
     component: str

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
-from checkpoint.capability import Capability
+from checkpoint.capability import Area, Capability
 from checkpoint.engines import capability_table
 
 PAGE = Path(__file__).parent.parent / "docs" / "capabilities.md"
@@ -23,10 +25,20 @@ def line_of(row: Capability) -> str:
 def whole() -> str:
     """Every row, a table for each area."""
     parts = []
-    for area, rows in capability_table.by_area().items():
-        lines = "\n".join(line_of(row) for row in rows)
+    for area in Area:
+        lines = "\n".join(line_of(row) for row in capability_table.rows() if row.area == area)
         parts.append(f"## {area.value[0].upper()}{area.value[1:]}\n\n{HEAD}{lines}\n")
     return "\n".join(parts)
+
+
+def row_of(sentence: str) -> Capability | None:
+    """The row that a refusal or note belongs to, by the words that it says; None where no row has them."""
+    return next((row for row in capability_table.rows() for part in row.said if _pattern(part).search(sentence)), None)
+
+
+@cache
+def _pattern(part: str) -> re.Pattern[str]:
+    return re.compile(".*".join(map(re.escape, part.split("{}"))))
 
 
 def put_into(text: str, table: str) -> str:

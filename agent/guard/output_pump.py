@@ -197,7 +197,7 @@ class Pump:
                 written = self.logs.write(stream, offset, rest)
             except OSError as error:
                 self.blocked = f"output of the program is held back: cannot write {self.logs.directory}: {error.strerror}"
-                self._make_room(stream, error)
+                self._make_room(error)
                 continue
             offset, rest = offset + written, rest[written:]
         if self.blocked:
@@ -210,7 +210,7 @@ class Pump:
         self._hold_limit = hold_limit
         os.eventfd_write(self._wake, 1)
 
-    def _make_room(self, stream: int, error: OSError) -> None:
+    def _make_room(self, error: OSError) -> None:
         """Give the older half of both logs back, if the disk is full and they are long enough; else wait a moment."""
         gave = False
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):

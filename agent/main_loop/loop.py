@@ -21,8 +21,7 @@ from typing import Final
 from agent.config import Settings
 from agent.core_config import node_config
 from agent.errors import AgentError
-from agent.main_loop import messages, starvation
-from agent.main_loop import vote_record as ballot_file
+from agent.main_loop import messages, starvation, vote_record
 from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
 from agent.main_loop.duplicate_beats import Copies
 from agent.main_loop.event_log_writer import Scribe
@@ -46,7 +45,7 @@ from agent.main_loop.worker_process import LanesProcess
 from agent.system import clock, syscalls
 from agent.system.sd_notify import Notifier, watchdog_period_ns
 from checkpoint.keeper.messages import ChannelClosedError, ChannelError
-from failover.core import vote_record as core_ballot
+from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
 from failover.core.node import Node
@@ -92,7 +91,7 @@ log = logging.getLogger("failover.heart")
 class Heart:
     """One life of one robot's agent."""
 
-    def __init__(self, settings: Settings, ballot: ballot_file.Ballot, notifier: Notifier) -> None:
+    def __init__(self, settings: Settings, ballot: vote_record.Ballot, notifier: Notifier) -> None:
         """Bind the beat sockets; nothing runs yet.
 
         Raises:
@@ -108,9 +107,9 @@ class Heart:
         self._keys: dict[str, bytes] = {}
         self._lanes = LanesProcess(settings)
         self._node: Node | None = None
-        durable = core_ballot.decode(ballot.record.core)
+        durable = core_vote_record.decode(ballot.record.core)
         self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
-        self._persister = Persister(lambda wanted: ballot.keep(core_ballot.encode(wanted)))
+        self._persister = Persister(lambda wanted: ballot.keep(core_vote_record.encode(wanted)))
         self._scribe = Scribe(Path(settings.config.state_directory), self._me, ballot.record.boot)
         self._poll = select.epoll()
         self._wake, self._signalled = socket.socketpair(
@@ -292,7 +291,7 @@ class Heart:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
         life = self._node.outlived_by(beat) if self._node is not None else 0
         if life:
-            told = (beat.sender, life, self._me, ballot_file.FILE_NAME, self._ballot.record.boot, life + 1)
+            told = (beat.sender, life, self._me, vote_record.FILE_NAME, self._ballot.record.boot, life + 1)
             log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
@@ -429,7 +428,7 @@ def beat(settings: Settings, notifier: Notifier) -> None:
         raise AgentError(
             f"cannot use the state directory {directory}: {error.strerror}; name another in state_directory"
         ) from error
-    ballot = ballot_file.Ballot(directory, settings.config.robot)
+    ballot = vote_record.Ballot(directory, settings.config.robot)
     ballot.open()
     while remembered := Heart(settings, ballot, notifier).run():
         ballot.outlive(remembered)

@@ -10,8 +10,6 @@ import os
 
 from msgspec import Struct
 
-from agent.system import clock
-
 RUNNABLE = "R"
 
 
@@ -23,7 +21,6 @@ class Turns(Struct, frozen=True):
         is_ready: a thread runs, or would run if it had a processor.
     """
 
-    at_ns: int
     ran_ns: int
     waited_ns: int
     is_ready: bool
@@ -42,7 +39,7 @@ def look(pid: int) -> Turns | None:
             ran_ns, waited_ns = ran_ns + int(ran), waited_ns + int(waited)
     except (OSError, ValueError):
         return None
-    return Turns(clock.now_ns(), ran_ns, waited_ns, is_ready)
+    return Turns(ran_ns, waited_ns, is_ready)
 
 
 def had_ns(before: Turns | None, now: Turns | None, passed_ns: int) -> int:

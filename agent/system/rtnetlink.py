@@ -67,7 +67,7 @@ class KernelLink(Struct, frozen=True):
         hardware: ARPHRD_*, see linux/if_arp.h.
         kind: "veth", "bridge", "vlan", "wireguard" …; "" for a device's own.
         lower, master: index of the interface that it stands on, or belongs to; 0 for none.
-        up: the operator wants it up; ``carrier``: something is connected at the other end.
+        carrier: something is connected at the other end, and the operator wants it up.
     """
 
     index: int
@@ -76,7 +76,6 @@ class KernelLink(Struct, frozen=True):
     kind: str = ""
     lower: int = 0
     master: int = 0
-    up: bool = False
     carrier: bool = False
 
 
@@ -199,7 +198,6 @@ def _link(body: bytes) -> KernelLink:
         _text(kind),
         _number(said.get(IFLA_LINK, b"")),
         _number(said.get(IFLA_MASTER, b"")),
-        bool(flags & IFF_UP),
         bool(flags & IFF_UP) and said.get(IFLA_CARRIER, b"\1") != b"\0",
     )
 

@@ -56,7 +56,7 @@ def big(is_live: bool) -> tuple[Task, Callable[[], None]]:
     fields = {"turn": Field(int, default=0), "grid": Field(np.ndarray, shape=(BIG,), dtype="u1")}
     values: dict[str, Any] = {"turn": 0}
 
-    def begin(state: KeptState, schema: Schema) -> dict[str, Any]:
+    def begin(state: KeptState) -> dict[str, Any]:
         values["grid"] = state.array("grid", (BIG,), np.dtype("u1")) if is_live else np.zeros(BIG, "u1")
         values["grid"][:] = 1
         return values

@@ -263,7 +263,7 @@ def call_number_before(code: bytes) -> int | None:
     return None
 
 
-# Code of a borrowed page (see ``checkpoint.linux.remote``)
+# Code of a borrowed page (see `checkpoint.linux.trace.remote_syscalls`)
 
 CLOBBERED: Final = ("x0", "x1", "x2", "x3", "x4", "x5", "x8", "x9", "sp", "pstate")
 """What the calls change, or the code between them: ours to give back, in this order in the table."""
@@ -294,7 +294,7 @@ def frame_of_lost(frame: int, lost: bytes) -> tuple[int, bytes]:
 
 
 _STACK_FLAGS, _MASK_OF_FRAME, _GENERAL_OF_FRAME = 24, 40, 184
-_SP_OF_FRAME, _PC_OF_FRAME, _PSTATE_OF_FRAME, _VECTORS = 432, 440, 448, 464
+_PC_OF_FRAME, _VECTORS = 440, 464
 _END_OF_FRAME: Final = _VECTORS + 528
 """Offsets in struct ucontext (asm/ucontext.h, asm/sigcontext.h): `_VECTORS` begins struct fpsimd_context, the last that every
 thread has."""

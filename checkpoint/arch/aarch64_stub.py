@@ -244,11 +244,10 @@ VDSO_CALLS: Final = {
 __kernel_getrandom, which makes the system call by itself without the kernel's data, and __kernel_rt_sigreturn, which needs none.
 Source: vdso(7); lib/vdso/getrandom.c.
 """
-JUMP_SIZE: Final = 16
 
 
 def jump_to(address: int) -> bytes:
-    """``ldr x16, …; br x16`` and where to: `JUMP_SIZE` bytes that go on at any address, all registers as they are but x16.
+    """``ldr x16, …; br x16`` and where to: 16 bytes that go on at any address, all registers as they are but x16.
 
     That one is nobody's at the beginning of a function.
     """

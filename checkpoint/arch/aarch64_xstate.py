@@ -148,7 +148,7 @@ def _content(state: bytes, one: Component) -> bytes:
     return state[one.offset : one.offset + one.size]
 
 
-# --- What this processor has: asked by ``checkpoint.linux.processor`` ---------------------------------------------------
+# --- What this processor has: asked by `checkpoint.linux.spawn.cpuid` ------------------------------------------------
 
 
 def layout_here(features: Callable[[], Collection[str]], vector_size: Callable[[], int], run: Callable[[bytes], int]) -> Layout:

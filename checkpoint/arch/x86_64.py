@@ -228,7 +228,7 @@ def call_number_before(code: bytes) -> int | None:
     return None if place < 0 else int(struct.unpack_from("<I", code, place + 1)[0])
 
 
-# Code of a borrowed page (see ``checkpoint.linux.remote``)
+# Code of a borrowed page (see `checkpoint.linux.trace.remote_syscalls`)
 
 _MOVE_IMMEDIATE: Final = {"rax": 0, "rcx": 1, "rdx": 2, "rbx": 3, "rsp": 4, "rbp": 5, "rsi": 6, "rdi": 7} | {
     f"r{number}": number for number in range(8, 16)

@@ -290,11 +290,10 @@ VDSO_CALLS: Final = {
 __vdso_getrandom: what a program keeps for it has another form with each kernel, and without the kernel's data it makes the
 system call by itself. Source: vdso(7); lib/vdso/getrandom.c.
 """
-JUMP_SIZE: Final = 15
 
 
 def jump_to(address: int) -> bytes:
-    """``notrack jmp [rip+0]`` and where to: `JUMP_SIZE` bytes that go on at any address, all registers as they are."""
+    """``notrack jmp [rip+0]`` and where to: 15 bytes that go on at any address, all registers as they are."""
     return b"\x3e\xff\x25" + bytes(4) + struct.pack("<Q", address)
 
 

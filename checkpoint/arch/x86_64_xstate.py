@@ -40,7 +40,6 @@ COMPONENTS: Final = {
 LEGACY_SIZE: Final = 512
 LEGACY_USED: Final = 464
 """Bytes of the legacy region that are registers; the kernel uses the rest for itself (arch/x86/include/uapi/asm/sigcontext.h)."""
-HEADER_SIZE: Final = 64
 FIRST_EXTENDED: Final = 2
 """Components 0 and 1 lie in the legacy region."""
 PKRU: Final = 9
@@ -153,7 +152,7 @@ def _is_as_at_first(number: int, content: bytes) -> bool:
     return not any(content) or (number == PKRU and int.from_bytes(content[:4], "little") == PKRU_OF_LINUX)
 
 
-# --- What this processor has: asked by ``checkpoint.linux.processor`` ---------------------------------------------------
+# --- What this processor has: asked by `checkpoint.linux.spawn.cpuid` ------------------------------------------------
 
 ASK: Final = bytes.fromhex(
     "53"  #        push rbx

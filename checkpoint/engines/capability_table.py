@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from functools import cache
 from types import ModuleType
 from typing import Final
 
@@ -114,18 +111,3 @@ def carried_by(carrier: ModuleType) -> tuple[Capability, ...]:
     """The rows of one file."""
     found: tuple[Capability, ...] = carrier.CAPABILITIES
     return found
-
-
-def row_of(sentence: str) -> Capability | None:
-    """The row that a refusal or note belongs to, by the words that it says; None where no row has them."""
-    return next((row for row in rows() for part in row.said if _pattern(part).search(sentence)), None)
-
-
-@cache
-def _pattern(part: str) -> re.Pattern[str]:
-    return re.compile(".*".join(map(re.escape, part.split("{}"))))
-
-
-def by_area() -> Mapping[Area, tuple[Capability, ...]]:
-    """The rows of each area."""
-    return {area: tuple(row for row in rows() if row.area == area) for area in Area}

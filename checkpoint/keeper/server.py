@@ -35,8 +35,7 @@ from checkpoint.linux.spawn import namespaces
 from checkpoint.linux.unix_address import address_of
 from checkpoint.model import Position, Snapshot
 from checkpoint.runtime import allocator, parallel, slim_imports
-from checkpoint.snapshot import carried_files as carried
-from checkpoint.snapshot import format, untrusted
+from checkpoint.snapshot import carried_files, format, untrusted
 from checkpoint.snapshot.credentials import Owner
 from checkpoint.snapshot.required_files import names_of_contents, needs
 from checkpoint.store import chain
@@ -239,7 +238,7 @@ class Keeper:
         """Restore what a chain's files amount to; and what its program knows its files by, where a robot keeps them."""
         places = dict(request.terms.carry.places)
         if not files or _has_several_processes(files):
-            state = carried.relocated(folded(files), places)
+            state = carried_files.relocated(folded(files), places)
             names = _names_of(state, request)
             return self._tracer.restore(request.pid, state, _options(request)), names
         with stored_base(*files) as base:
@@ -305,7 +304,7 @@ class Keeper:
     def _fill(self, request: messages.Fill, descriptors: Descriptors) -> Answer:
         try:
             with untrusted.facts(f"fill the state of {request.component}"):
-                state = carried.relocated(folded(descriptors), dict(request.places))
+                state = carried_files.relocated(folded(descriptors), dict(request.places))
         finally:
             messages.close_all(descriptors)
         from checkpoint.engines.cooperative.session import fill_segment
@@ -319,7 +318,7 @@ class Keeper:
     def _compare(self, request: messages.Compare, descriptors: Descriptors) -> Answer:
         try:
             with untrusted.facts("compare a snapshot with what is here"):
-                outline = carried.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
+                outline = carried_files.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
         finally:
             messages.close_all(descriptors)
         chosen = self._tracer if outline.engine == self._tracer.name else registry.engine_named(outline.engine)

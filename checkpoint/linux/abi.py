@@ -19,20 +19,16 @@ IOV_MAX: Final = 1024
 """Ranges that process_vm_readv(2) takes in one call (UIO_MAXIOV)."""
 
 # linux/ptrace.h
-PTRACE_TRACEME: Final = 0
 PTRACE_CONT: Final = 7
 PTRACE_SINGLESTEP: Final = 9
 PTRACE_DETACH: Final = 17
 PTRACE_SYSCALL: Final = 24
 PTRACE_SETOPTIONS: Final = 0x4200
 PTRACE_GETEVENTMSG: Final = 0x4201
-PTRACE_GETSIGINFO: Final = 0x4202
-PTRACE_SETSIGINFO: Final = 0x4203
 PTRACE_GETREGSET: Final = 0x4204
 PTRACE_SETREGSET: Final = 0x4205
 PTRACE_SEIZE: Final = 0x4206
 PTRACE_INTERRUPT: Final = 0x4207
-PTRACE_LISTEN: Final = 0x4208
 PTRACE_PEEKSIGINFO: Final = 0x4209
 PTRACE_GETSIGMASK: Final = 0x420A
 PTRACE_SETSIGMASK: Final = 0x420B
@@ -68,7 +64,6 @@ SIGINFO_PID: Final = 16
 SIGSET_SIZE: Final = 8
 SIGNAL_COUNT: Final = 64
 ALL_SIGNALS: Final = (1 << SIGNAL_COUNT) - 1
-SIG_SETMASK: Final = 2
 
 # asm-generic/mman-common.h
 PROT_NONE: Final = 0
@@ -83,7 +78,6 @@ MAP_GROWSDOWN: Final = 0x0100
 MAP_NORESERVE: Final = 0x4000
 MAP_STACK: Final = 0x20000
 MAP_FIXED_NOREPLACE: Final = 0x100000
-MADV_DONTDUMP: Final = 16
 MADV_DONTFORK: Final = 10
 MADV_GUARD_INSTALL: Final = 102
 
@@ -96,7 +90,6 @@ UFFD_FEATURE_WP_UNPOPULATED: Final = 1 << 13
 UFFD_FEATURE_WP_ASYNC: Final = 1 << 15
 UFFDIO_API: Final = 0xC018AA3F
 UFFDIO_REGISTER: Final = 0xC020AA00
-UFFDIO_UNREGISTER: Final = 0x8010AA01
 UFFDIO_REGISTER_MODE_WP: Final = 2
 UFFDIO_WRITEPROTECT: Final = 0xC018AA06
 
@@ -110,8 +103,6 @@ PAGE_IS_FILE: Final = 1 << 2
 PAGE_IS_PRESENT: Final = 1 << 3
 PAGE_IS_SWAPPED: Final = 1 << 4
 PAGE_IS_PFNZERO: Final = 1 << 5
-PAGE_IS_HUGE: Final = 1 << 6
-PAGE_IS_SOFT_DIRTY: Final = 1 << 7
 PAGE_IS_GUARD: Final = 1 << 8
 
 # linux/prctl.h
@@ -122,7 +113,6 @@ PR_SET_DUMPABLE: Final = 4
 PR_GET_KEEPCAPS: Final = 7
 PR_SET_KEEPCAPS: Final = 8
 PR_SET_NAME: Final = 15
-PR_GET_TSC: Final = 25
 PR_GET_SECUREBITS: Final = 27
 PR_SET_SECUREBITS: Final = 28
 PR_SET_TIMERSLACK: Final = 29
@@ -132,7 +122,6 @@ PR_SET_MM_MAP: Final = 14
 PR_SET_CHILD_SUBREAPER: Final = 36
 PR_GET_CHILD_SUBREAPER: Final = 37
 PR_SET_NO_NEW_PRIVS: Final = 38
-PR_GET_NO_NEW_PRIVS: Final = 39
 PR_GET_TID_ADDRESS: Final = 40
 PR_SET_THP_DISABLE: Final = 41
 PR_GET_THP_DISABLE: Final = 42
@@ -186,12 +175,6 @@ class UffdWriteProtect(ctypes.Structure):
     """struct uffdio_writeprotect of ioctl_userfaultfd(2); mode 0 takes the protection away."""
 
     _fields_ = (("start", ctypes.c_uint64), ("length", ctypes.c_uint64), ("mode", ctypes.c_uint64))
-
-
-class PageRegion(ctypes.Structure):
-    """struct page_region: what PAGEMAP_SCAN answers."""
-
-    _fields_ = (("start", ctypes.c_uint64), ("end", ctypes.c_uint64), ("categories", ctypes.c_uint64))
 
 
 class PageScan(ctypes.Structure):

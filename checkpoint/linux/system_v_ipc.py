@@ -22,7 +22,6 @@ MADV_REMOVE: Final = 9
 SHM_DEST: Final = 0o1000
 """Bit of the permissions: it goes with the last that has it attached."""
 PERMISSIONS: Final = 0o777
-IPC_PRIVATE: Final = 0
 
 _TABLE: Final = Path("/proc/sysvipc/shm")
 _NEXT_ID: Final = Path("/proc/sys/kernel/shm_next_id")

@@ -7,7 +7,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from checkpoint.pages import page_set as pages
+from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Buffer, Flags, PageMap, Words
 from checkpoint.runtime.lazy_numpy import NDArray, np
 
@@ -30,7 +30,7 @@ def newest(copies: Sequence[Copy], page_size: int) -> PageMap:
     """For every page of any copy where its newest content lies: (index of the copy, index of the page there)."""
     found = PageMap.empty()
     for index, copy in enumerate(copies):
-        addresses = pages.addresses_of(copy.pages, page_size)
+        addresses = page_set.addresses_of(copy.pages, page_size)
         places = np.empty((len(addresses), 2), dtype=np.uint64)
         places[:, 0] = index
         places[:, 1] = np.arange(len(addresses))
@@ -44,7 +44,7 @@ def are_zero(copies: Sequence[Copy], sources: PageMap, page_size: int) -> Flags:
     for index, copy in enumerate(copies):
         if len(copy.pages):
             from_here = sources.words[:, 0] == np.uint64(index)
-            zero[from_here] = pages.zero_pages(copy.content, page_size)[sources.words[from_here, 1]]
+            zero[from_here] = page_set.zero_pages(copy.content, page_size)[sources.words[from_here, 1]]
     return zero
 
 

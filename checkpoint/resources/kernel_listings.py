@@ -10,8 +10,7 @@ import socket
 from collections.abc import Mapping
 from typing import Final
 
-from checkpoint.linux.net import inet_diag, unix_diag
-from checkpoint.linux.net import packet_diag as packet_sockets
+from checkpoint.linux.net import inet_diag, packet_diag, unix_diag
 from checkpoint.linux.net.packet_diag import PacketSocket
 from checkpoint.linux.procfs import procfs
 from checkpoint.model import Fact
@@ -58,7 +57,7 @@ class Listings:
             OSError: the kernel does not tell.
         """
         if self._packet_sockets is None:
-            self._packet_sockets = packet_sockets.packet_sockets()
+            self._packet_sockets = packet_diag.packet_sockets()
         return self._packet_sockets
 
     def unix_answer(self, inode: int) -> bytes:

@@ -76,9 +76,10 @@ class OpenFile(Struct, frozen=True, eq=False):
         is_its_own: the former alone.
         observed: facts that only the process standing still could tell, as its kind's ``observe`` found them.
         kin: the other processes of its component.
-        description: the number of an open file that several processes of a component share (`sharing`); 0: it is this one's.
+        description: the number of an open file that several processes of a component share (`shared_descriptions`); 0: of
+            this one alone.
         is_echo: another process of the component has told of it already.
-        lent: through which it is looked at, if it is on its way to the program (`travelling`); ``pid`` is ours then.
+        lent: through which it is looked at, if it is on its way to the program (`scm_rights`); ``pid`` is ours then.
         owners: what is known of who has owners, of a process that is looked at again and again.
         signals: what it sends, to whom, if that was asked while the process stood still; else none, or it is asked now.
     """

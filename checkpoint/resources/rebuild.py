@@ -54,7 +54,7 @@ from checkpoint.resources.process import (
 )
 from checkpoint.resources.restore_context import Rebuilding, number_of
 from checkpoint.resources.sockets import inet, netlink, packet, tcp, unix_names
-from checkpoint.resources.sockets import unix as unix_sockets
+from checkpoint.resources.sockets import unix as unix_kind
 from checkpoint.resources.sockets.peer_credentials import Disguise
 from checkpoint.resources.sockets.unix_rebuild import Work
 from checkpoint.snapshot import credentials
@@ -92,7 +92,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
     fifos.KIND: fifos.mismatches,
     inotify.KIND: inotify.mismatches,
-    unix_sockets.KIND: unix_names.mismatches,
+    unix_kind.KIND: unix_names.mismatches,
     proc_and_sys.KIND: proc_and_sys.mismatches,
     overmounted.KIND: overmounted.mismatches,
     inet.KIND: inet.mismatches,
@@ -104,7 +104,7 @@ NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {
 """Kinds that need something of this machine: why it does not have that, one sentence each."""
 OF_KERNEL: Final = {netlink.KIND: netlink.prepare, packet.KIND: packet.prepare}
 """Sockets that lead to the kernel or an interface alone."""
-SOCKETS: Final = (unix_sockets.KIND, tcp.KIND, inet.KIND, *OF_KERNEL)
+SOCKETS: Final = (unix_kind.KIND, tcp.KIND, inet.KIND, *OF_KERNEL)
 NOT_OPEN: Final = (
     mlockall.KIND,
     system_v_memory.KIND,
@@ -225,7 +225,7 @@ def _prepare_sockets(
     table: CallTable, state: Snapshot, first: int, given: Mapping[int, int], disguise: Disguise
 ) -> tuple[Work, dict[int, int]]:
     """Make all sockets at numbers from ``first`` on, in the working directory: names may be relative to it."""
-    of_unix = [held for held in state.resources if _is_own(held, given, unix_sockets.KIND)]
+    of_unix = [held for held in state.resources if _is_own(held, given, unix_kind.KIND)]
     of_internet = [held for held in state.resources if _is_own(held, given, inet.KIND)]
     of_tcp = [held for held in state.resources if _is_own(held, given, tcp.KIND)]
     if of_unix and not procfs.is_gone(state.process.working_directory):

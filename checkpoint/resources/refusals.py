@@ -18,7 +18,7 @@ from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux.memory.tracker import is_orphan
 from checkpoint.linux.procfs import procfs, vm_flags
 from checkpoint.linux.procfs.procfs import MapsLine, Status
-from checkpoint.linux.trace import seccomp as confinement
+from checkpoint.linux.trace import seccomp as trace_seccomp
 from checkpoint.model import Resource
 from checkpoint.resources.files import proc_and_sys
 from checkpoint.resources.ipc import shared_memory
@@ -174,7 +174,7 @@ KERNEL_PLACES: Final = ("/proc/", "/sys/")
 """Where nobody can make a directory."""
 
 _KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
-"""Mappings that the kernel gives every process: they move, see ``restore_memory``."""
+"""Mappings that the kernel gives every process: they move, see `checkpoint.engines.ptrace.restore.memory`."""
 
 
 # --- Descriptors -----------------------------------------------------------------------------------------------------
@@ -318,7 +318,7 @@ def refuse_process(
         lines: its mappings, where they are known.
     """
     lines = procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines
-    yield from refused_threads.refuse(pid, status, kin)
+    yield from refused_threads.refuse(pid, status)
     yield from shared_memory.refuse(pid, lines, kin)
     yield from refuse_entering(pid, status, files_kept=files_kept, lines=lines)
     yield from _refuse_places(pid)
@@ -331,7 +331,7 @@ def refuse_entering(
     """Why a process cannot even be asked; arguments as of `refuse_process`."""
     if status.tracer not in (0, os.getpid()):
         yield f"it is traced by pid {status.tracer}: end that debugger"
-    if status.seccomp and (why := confinement.why_not()):
+    if status.seccomp and (why := trace_seccomp.why_not()):
         yield seccomp.not_ours(why)
     yield from _refuse_image(pid, files_kept)
     yield from _refuse_memory(procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines)

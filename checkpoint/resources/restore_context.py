@@ -41,7 +41,7 @@ class Rebuilding(Struct, frozen=True):
         self.objects[key] = number
 
     def ended(self, table: CallTable, held: Resource) -> int:
-        """A descriptor of what the program holds of a process that has ended: `resources.departed` has made it."""
+        """A descriptor of what the program holds of a process that has ended: `exited_processes` has made it."""
         made = self.objects[ended_place(held)]
         return table.obtain(f"open {held.name} again", "fcntl", made, fcntl.F_DUPFD, 0)
 

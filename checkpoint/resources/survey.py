@@ -18,8 +18,7 @@ from checkpoint.linux.procfs.descriptor_cache import KeptTexts
 from checkpoint.linux.procfs.descriptors import descriptors
 from checkpoint.linux.trace import entry
 from checkpoint.model import Fact, Resource
-from checkpoint.resources import registry, shared_open_file
-from checkpoint.resources import signal_owners as owners
+from checkpoint.resources import registry, shared_open_file, signal_owners
 from checkpoint.resources.descriptor_groups import Grouping
 from checkpoint.resources.devices import by_rule
 from checkpoint.resources.events import epoll, fd_signals
@@ -97,7 +96,7 @@ def with_contents(
         CaptureError: one of them cannot be looked into.
     """
     if recollection and noted is not None and not rules and recollection.are_plain(opened, _is_plain):
-        return owners.asked(opened)
+        return signal_owners.asked(opened)
     found = []
     empty = recollection.empty_pipes(opened) if recollection and not rules else {}
     for held in _with_travelling(opened, noted, recollection):
@@ -115,7 +114,7 @@ def with_contents(
             capacity, pieces = pipes.look_into(held)
             held = pipes.with_content(held, capacity, pieces)
         found.append(held)
-    return owners.asked(found) if noted is not None else tuple(found)
+    return signal_owners.asked(found) if noted is not None else tuple(found)
 
 
 def _is_plain(held: OpenFile) -> bool:
@@ -211,7 +210,7 @@ def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """Sort one process's open files into the kinds: what comes back, and what does not.
 
-    What can be told only of all processes of a component together is told by `kinds.findings_of_all`.
+    What can be told only of all processes of a component together is told by `registry.findings_of_all`.
     """
     resources, findings = [], []
     for held in opened:

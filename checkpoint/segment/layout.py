@@ -13,7 +13,6 @@ from __future__ import annotations
 import enum
 import os
 import struct
-from collections.abc import Sequence
 from itertools import accumulate, pairwise
 from typing import Final
 
@@ -178,11 +177,6 @@ def _check_region(region: Region) -> None:
         raise SegmentError(f"segment: region {region.name!r} has {region.size} bytes; 1 to {MAX_PAGES * PAGE} are possible")
     if region.address % PAGE or not PAGE <= region.address < (MAX_PLACES + 1) * STRIDE:
         raise SegmentError(f"segment: region {region.name!r} begins at {region.address:#x}, which is no address of a page")
-
-
-def numbered(parts: Sequence[tuple[str, int, int]]) -> tuple[Region, ...]:
-    """Regions with addresses by their place: (name, kind, size) each."""
-    return tuple(Region(name, kind, address_of(index), size) for index, (name, kind, size) in enumerate(parts))
 
 
 def address_of(place: int) -> int:

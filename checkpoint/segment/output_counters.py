@@ -18,7 +18,6 @@ from typing import Final
 COUNTERS: Final = struct.Struct("<QQQQQQ")
 FIRSTS: Final = 4
 """Place of the first bytes that the logs had when the guard began."""
-STREAMS: Final = 2
 COUNT_TIMEOUT_S: Final = 0.05
 """How long the guard may be between taking bytes and counting them: microseconds, unless it was preempted."""
 YIELDING_S: Final = 0.0001

@@ -196,11 +196,6 @@ def _listed_at(one: Fact, here: Callable[[str], str]) -> Fact:
     return one
 
 
-def size_of(state: Snapshot) -> int:
-    """Bytes of carried files that hold something, of a base."""
-    return sum(run.size for run in state.runs if run.start >= FIRST_ADDRESS)
-
-
 def pieces(state: Snapshot) -> Mapping[int, list[tuple[int, memoryview]]]:
     """What a base holds of each stretch: (offset in the file, bytes in whole pages), in order."""
     found: dict[int, list[tuple[int, memoryview]]] = {}

@@ -14,7 +14,6 @@ from msgspec.structs import replace
 
 from checkpoint.model import PageCopy, PageRun, Snapshot, Vma
 from checkpoint.pages import page_set
-from checkpoint.pages.page_set import Words
 from checkpoint.runtime.lazy_numpy import NDArray, np
 
 SLOT_SHIFT: Final = 48
@@ -35,13 +34,8 @@ def whole(slot: int) -> PageRun:
     return PageRun(base_of(slot), base_of(slot + 1))
 
 
-def shifted(words: Words, slot: int) -> Words:
-    """Addresses, or extents, of a slot's process as the snapshot has them."""
-    return words + np.uint64(base_of(slot))
-
-
 def shifted_runs(runs: Iterable[PageRun], slot: int) -> tuple[PageRun, ...]:
-    """The same of runs."""
+    """Runs of a slot's process as the snapshot has them."""
     base = base_of(slot)
     return tuple(PageRun(run.start + base, run.end + base) for run in runs)
 

@@ -24,7 +24,7 @@ from checkpoint.snapshot.process_tree import every_mapping
 from checkpoint.snapshot.validity import STREAMS, place
 from checkpoint.store.page_origins import Origins
 
-__all__ = ["append", "applied", "check_continues", "check_state", "fold", "position_of", "state_digest"]
+__all__ = ["applied", "check_continues", "check_state", "fold", "position_of", "state_digest"]
 
 
 def position_of(snapshot: Snapshot, generation: int, sequence: int) -> Position:
@@ -46,26 +46,6 @@ def check_continues(parent: Position, delta: Snapshot) -> None:
     if (delta.parent.generation, delta.parent.sequence) == (parent.generation, parent.sequence):
         raise ChainError(f"{named}, but with another state digest than ours: the histories diverged; ask for a base")
     raise ChainError(f"{named}, not {place(parent)}, which we hold; ask for a base")
-
-
-def append(chain: Sequence[Snapshot], snapshot: Snapshot) -> tuple[Snapshot, ...]:
-    """The chain that ends in ``snapshot``: a base begins a new one, a delta continues this one.
-
-    A delta whose parent stands earlier in the chain replaces what came after it: its sender never heard that
-    those were stored.
-
-    Raises:
-        ChainError: no snapshot of the chain is its parent, or it is of another component.
-    """
-    if snapshot.is_base:
-        return (snapshot,)
-    if not chain:
-        raise ChainError(f"delta {place(snapshot.position)} of {snapshot.component} has no chain to continue; ask for a base")
-    _check_kin(chain[-1], snapshot)
-    places = [index for index, held in enumerate(chain) if held.position == snapshot.parent]
-    if not places:
-        check_continues(chain[-1].position, snapshot)
-    return (*chain[: places[-1] + 1], snapshot)
 
 
 def applied(table: PageTable, snapshot: Snapshot) -> PageTable:

@@ -73,10 +73,6 @@ class Disk:
         """Remove a file; one that is gone already is fine."""
         path.unlink(missing_ok=True)
 
-    def remove_folder(self, path: Path) -> None:
-        """Remove an empty folder."""
-        path.rmdir()
-
 
 class DiskFile:
     """A file being written through the door: what ``format.encode`` needs of a file."""

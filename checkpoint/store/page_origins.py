@@ -8,8 +8,7 @@ from msgspec import Struct
 
 from checkpoint.errors import ChainError
 from checkpoint.model import Snapshot
-from checkpoint.pages import page_set
-from checkpoint.pages import xor_delta as differences
+from checkpoint.pages import page_set, xor_delta
 from checkpoint.pages.merge import gathered_bytes
 from checkpoint.pages.page_set import PageMap, Words
 from checkpoint.pages.xor_delta import Rows
@@ -99,7 +98,7 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap,
     state, mapped_before = PageMap.empty(), np.empty((0, 2), dtype=np.uint64)
     layers: list[_Layer] = []
     for index, snapshot in enumerate(chain):
-        addresses = differences.addresses_of(snapshot.runs, page_size)
+        addresses = xor_delta.addresses_of(snapshot.runs, page_size)
         places = np.empty((len(addresses), 2), dtype=np.uint64)
         places[:, 0] = index
         places[:, 1] = np.arange(len(addresses))
@@ -120,8 +119,8 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap,
 
 
 def _layer_of(snapshot: Snapshot, index: int, carried: Words, page_size: int) -> _Layer:
-    addresses = differences.addresses_of(snapshot.differences, page_size)
-    rows = differences.rows_of(snapshot.contents, page_size)
+    addresses = xor_delta.addresses_of(snapshot.differences, page_size)
+    rows = xor_delta.rows_of(snapshot.contents, page_size)
     return _Layer(index, addresses, np.searchsorted(carried, addresses), rows)
 
 

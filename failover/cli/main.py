@@ -18,9 +18,7 @@ from failover.errors import AgentRefusedError, FailoverError, NoAgentError
 if TYPE_CHECKING:
     import argparse
 
-HEALTHY: Final = 0
 FAILED: Final = 1
-USAGE: Final = 2
 NO_AGENT: Final = 3
 
 REASONS_SHOWN: Final = 8

@@ -54,11 +54,6 @@ class Verb(Struct, frozen=True):
     function: str
 
 
-def verbs() -> tuple[str, ...]:
-    """The names of all verbs."""
-    return tuple(verb.name for verb in VERBS)
-
-
 def build(verb: str = "") -> argparse.ArgumentParser:
     """The whole parser; of one verb's words the part that can read them, which takes a tenth of the time."""
     parser = argparse.ArgumentParser(

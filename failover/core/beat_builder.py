@@ -32,7 +32,7 @@ BEAT_OVERHEAD = 16
 """Bytes by which a beat may grow beyond the sum of its parts: longer array heads, a longer counter."""
 
 
-def entry_of(component: Component, me: str) -> Entry:
+def entry_of(component: Component) -> Entry:
     """One component as this robot holds it."""
     epoch = min(component.epoch, EPOCH_MAX - 1)  # a record that is to be mended spoils no beat
     newest = component.newest if component.epoch == epoch else None

@@ -101,7 +101,6 @@ class Flight(Struct):
 
     started_ns: int
     until_ns: int
-    base: bool
     to: str = ""
     position: Position | None = None
     parent: Position | None = None
@@ -158,7 +157,8 @@ class Component(Struct):
         seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
             met another that does, or went above an epoch that only servers and witnesses know.
         behind_ns: since when this robot would claim it, and a server says that it keeps a newer checkpoint; 0: it does not wait.
-        trail: the last acknowledged positions and their parents, for servers (``archive.py``); ``archives``: on their way there.
+        trail: the last acknowledged positions and their parents, for servers (`failover.core.replication.servers`).
+            archives: on their way there.
         promise: what the journal has been told of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
@@ -354,7 +354,7 @@ class Turn(Struct):
 
     Attributes:
         before: the ballot as the last step left it.
-        late_ns: see ``story.Facts``.
+        late_ns: see `failover.core.event_log.decisions.Facts`.
     """
 
     now_ns: int
@@ -416,7 +416,7 @@ class Turn(Struct):
 
 
 def _newest_checkpoint(component: Component, now_ns: int) -> tuple[int, int]:
-    """Number of the checkpoint from which somebody could go on, and its age; see ``story.Facts``."""
+    """Number of the checkpoint from which somebody could go on, and its age; see `failover.core.event_log.decisions.Facts`."""
     if component.holding and component.acked is not None:
         return component.acked.sequence, now_ns - component.acked_ns
     held = component.held[-1].sequence if component.held else 0

@@ -52,7 +52,7 @@ class Captured(Struct, frozen=True):
     """The act Capture is done. The snapshot is durable in this robot's own store and can be shipped and restored from.
 
     Attributes:
-        dirty_size: bytes of pages carried; ``size``: bytes of the encoded snapshot.
+        size: bytes of the encoded snapshot.
         age_ns: how old the state in it was by then: of a program that commits, since its commit.
     """
 
@@ -62,7 +62,6 @@ class Captured(Struct, frozen=True):
     parent: Position | None
     size: int = 0
     freeze_us: int = 0
-    dirty_size: int = 0
     age_ns: int = 0
 
 
@@ -215,7 +214,7 @@ class Noticed(Struct, frozen=True):
     """Something that belongs in the story and changes nothing: about a component, or ("") about this robot.
 
     Attributes:
-        output_pending: see ``story.Facts``.
+        output_pending: see `failover.core.event_log.decisions.Facts`.
     """
 
     component: str

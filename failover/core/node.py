@@ -289,7 +289,7 @@ class Node:
     def _entries(self) -> dict[str, Entry]:
         starts = self._config.by_majority
         known = (component for component in self._components.values() if component.epoch or (starts and component.autostart))
-        return {component.name: entry_of(component, self._config.robot) for component in known}
+        return {component.name: entry_of(component) for component in known}
 
     def _persist(self) -> Ballot | None:
         ballot = Ballot(tuple(component.record() for component in self._components.values() if component.epoch))

@@ -55,7 +55,7 @@ class OnUnsupported(enum.StrEnum):
 
 
 class State(enum.StrEnum):
-    """Where one component stands on one robot. The arrows between them are the table in ``election.py``."""
+    """Where one component stands on one robot. The arrows between them are `failover.core.component.TABLE`."""
 
     ABSENT = "absent"
     CLAIMING = "claiming"

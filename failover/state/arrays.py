@@ -103,7 +103,7 @@ class ArrayKind(Kind):
             return memoryview(content)
         if type(content) is bytes:
             raise self.misfit(content, place, f"its shape and dtype need {size}")
-        return build.fetch(content, size, self, place)
+        return build.fetch(content, size, place)
 
     def description(self) -> str:
         return self.name if self._dtype is None else f"array of {lower_dtype(self._dtype)} {self._shape}"
@@ -238,7 +238,7 @@ class BytesKind(Kind):
     def _fetched(self, wire: Wire, payload: Wire, build: Build, place: Place) -> bytes | bytearray:
         if type(payload) is not list or len(payload) != 2 or type(payload[0]) is not int or payload[0] < 0:
             raise self.misfit(wire, place, "not a length and a region")
-        return self._cls(build.fetch(payload[1], payload[0], self, place))
+        return self._cls(build.fetch(payload[1], payload[0], place))
 
 
 BYTES_KIND, BYTEARRAY_KIND = BytesKind(bytes), BytesKind(bytearray)

@@ -6,7 +6,7 @@ wire value, the encoder gets the container as it is.
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, defaultdict, deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -260,6 +260,3 @@ class MappingKind(Kind):
 
     def parts(self) -> tuple[Kind, ...]:
         return (self._key, self._value)
-
-
-MAPPINGS: dict[type, type[dict[Any, Any]]] = {dict: dict, OrderedDict: OrderedDict, Counter: Counter, defaultdict: defaultdict}

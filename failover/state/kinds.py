@@ -296,7 +296,7 @@ class Build:
             )
         return made[0]
 
-    def fetch(self, name: object, size: int, kind: Kind, place: Place) -> memoryview:
+    def fetch(self, name: object, size: int, place: Place) -> memoryview:
         """The bytes of a region; each may be used once, so that a small state cannot ask for much memory.
 
         Raises:

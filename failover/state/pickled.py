@@ -75,5 +75,5 @@ def _lift_packed(wire: Wire, kind: Kind, build: Build, place: Place) -> bytes | 
     if type(payload) is bytes:
         return payload
     if type(payload) is list and len(payload) == 2 and type(payload[0]) is int and payload[0] >= 0:
-        return build.fetch(payload[1], payload[0], kind, place)
+        return build.fetch(payload[1], payload[0], place)
     raise kind.misfit(wire, place, "not bytes, nor a length and a region")

@@ -121,7 +121,6 @@ class Structs(Style):
     def __init__(self, cls: type[msgspec.Struct]) -> None:
         self._cls = cls
         self.mutable = not cls.__struct_config__.frozen
-        self._count = len(cls.__struct_fields__)
         self._runs = hasattr(cls, "__post_init__")
 
     def reader(self, names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:

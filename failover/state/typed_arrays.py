@@ -48,7 +48,7 @@ class NumbersKind(Kind):
             raise self.misfit(wire, place, f"of {parts[1]} bytes a number, on this machine {CODES[parts[0]]}")
         content = parts[2]
         if type(content) is list and len(content) == 2 and type(content[0]) is int and content[0] >= 0:
-            content = build.fetch(content[1], content[0], self, place)
+            content = build.fetch(content[1], content[0], place)
         elif type(content) is not bytes:
             raise self.misfit(wire, place, "not its content or a length and a region")
         if len(content) % parts[1]:

@@ -144,7 +144,7 @@ class Task:
 def open_task(
     name: str,
     schema_of: Callable[[str], Schema],
-    begin: Callable[[KeptState, Schema], Any],
+    begin: Callable[[KeptState], Any],
     folder: Path | None = None,
 ) -> Task:
     """Begin a state, or resume it where there is one.
@@ -167,7 +167,7 @@ def open_task(
     state = KeptState(schema)
 
     def first() -> Any:
-        value = begin(state, schema)
+        value = begin(state)
         adopt(value, state.array)
         return value
 
@@ -308,7 +308,7 @@ def resume(
     def schema_of(actual: str) -> Schema:
         return Schema.of(type(default), default, name=actual, version=version, migrations=migrations, pickled=pickled)
 
-    task = open_task(name, schema_of, lambda state, schema: default)
+    task = open_task(name, schema_of, lambda _: default)
     PROCESS.keep(task)
     value: S = task.value
     return value

@@ -16,7 +16,7 @@ from failover.task.period import FINISHED, Activations, Step
 
 
 async def turns(task: Task, period_ns: int) -> AsyncIterator[int]:
-    """The turns of an ``async for``, see `task_loop.Turns`."""
+    """The turns of an ``async for``, see `failover.task.loop.Turns`."""
     stopped = asyncio.Event()
     task.activations = Activations(period_ns, time.monotonic_ns())
     with _sigterm(stopped):
@@ -29,7 +29,7 @@ async def turns(task: Task, period_ns: int) -> AsyncIterator[int]:
 
 
 def run_steps_in_loop(task: Task, step: Step, on_resume: Step | None, period_ns: int) -> None:
-    """As `task_loop.run_steps`, for a step that is a coroutine."""
+    """As `failover.task.loop.run_steps`, for a step that is a coroutine."""
     asyncio.run(_run_steps(task, step, on_resume, period_ns))
 
 

@@ -218,7 +218,7 @@ def run(cls: type[R]) -> R:
     PROCESS.refuse_second(declaration.name)
     attributes = kept_of(cls)
 
-    def begin(state: KeptState, schema: Schema) -> dict[str, Any]:
+    def begin(state: KeptState) -> dict[str, Any]:
         return {key: one.first(state) for key, one in attributes.items()}
 
     task = open_task(declaration.name, lambda name: schema_of(cls, declaration, name), begin)

@@ -93,7 +93,7 @@ class Agent:
 
 
 class GuardProcess:
-    """``python -m agent.guard`` and what it keeps.
+    """``python -m agent.guard.server`` and what it keeps.
 
     Attributes:
         logs: directory of the streams.

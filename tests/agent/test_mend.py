@@ -12,7 +12,7 @@ from checkpoint.store.store import open_store
 from failover.config import team
 from failover.config.team import Robot, Team
 from failover.core import types
-from failover.core import vote_record as core_ballot
+from failover.core import vote_record as core_vote_record
 from failover.core.types import EPOCH_MAX, Launch, Record, State
 
 NAME = "/lab/robot1/mapper"
@@ -45,13 +45,13 @@ def config(tmp_path: Path) -> Path:
     )
     ballot = Ballot(tmp_path / "state", "robot1")
     ballot.open()
-    ballot.keep(core_ballot.encode(types.Ballot((POISONED, OTHER))))
+    ballot.keep(core_vote_record.encode(types.Ballot((POISONED, OTHER))))
     open_store(tmp_path / "state" / "store").close()
     return path
 
 
 def records(config: Path) -> tuple[Record, ...]:
-    return core_ballot.decode(Ballot(config.parent / "state", "robot1").read().core).records
+    return core_vote_record.decode(Ballot(config.parent / "state", "robot1").read().core).records
 
 
 def test_it_tells_the_cost_and_changes_nothing_until_it_is_agreed_to(config: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ from checkpoint.engine import CaptureOrder, ProtectOrder, RestoreOptions, Sessio
 from checkpoint.engines.registry import engine_named
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
 from checkpoint.linux import abi
+from checkpoint.linux.procfs.descendants import children
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.signal_wakeup import waking
 from checkpoint.linux.spawn.namespaces import prctl
@@ -174,6 +175,14 @@ def start_tracee(program: Path, directory: Path, *arguments: str, isolate: bool 
         tracee.kill()
         raise
     return tracee
+
+
+def everybody_below(pid: int) -> list[int]:
+    """Everybody whom a process has given birth to, and they, parents before children."""
+    found = children(pid)
+    for one in found:
+        found += children(one)
+    return found
 
 
 def expect_ok(tracee: Program) -> None:

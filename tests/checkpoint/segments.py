@@ -6,17 +6,22 @@ import os
 import signal
 import socket
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 
-from checkpoint.segment.layout import ARRAY, PAGE, STATE, Committed, Layout, numbered
+from checkpoint.segment.layout import ARRAY, PAGE, STATE, Committed, Layout, Region, address_of
 from checkpoint.segment.writer import SegmentWriter, Source
 
 LINEAGE = bytes(range(16))
 PAGES = 24
 """Of the array that goes with the state."""
+
+
+def numbered(parts: Sequence[tuple[str, int, int]]) -> tuple[Region, ...]:
+    """Regions with addresses by their place: (name, kind, size) each."""
+    return tuple(Region(name, kind, address_of(index), size) for index, (name, kind, size) in enumerate(parts))
 
 
 def layout(*sizes: int) -> Layout:

@@ -32,7 +32,7 @@ from checkpoint.pages import page_set
 
 PAGE = abi.PAGE_SIZE
 COUNT = 256
-"""Pages of the child's mapping: more than what may be a page on the move (`pagetables.MARKER_RUN`)."""
+"""Pages of the child's mapping: more than what may be a page on the move (`pagemap.MARKER_RUN`)."""
 
 CHILD = r"""
 import ctypes, mmap, os, sys

@@ -34,12 +34,12 @@ from agent.guard.messages import Described, Exited, Refused, Started, TaskConnec
 from agent.guard.output_logs import STREAMS, OutputLogs, discard, logs_of
 from agent.guard.output_pump import HOLD_LIMIT
 from agent.system.adopted_process import Guest
+from agent.worker.components.connection import Dialogue
 from agent.worker.components.keeper_client import Following
 from agent.worker.components.paths import Places, log_directory
-from agent.worker.components.process_pool import GuardLink
 from checkpoint.engine import AUTO, COOPERATIVE, PTRACE
 from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
-from checkpoint.keeper import messages as channel
+from checkpoint.keeper import messages as keeper_messages
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import Position
 
@@ -123,14 +123,13 @@ class Component:
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
     """
 
-    def __init__(self, name: str, guard: GuardLink, places: Places) -> None:
+    def __init__(self, name: str, guard: Dialogue, places: Places) -> None:
         self.name = name
         self.pid = self.inner_pid = 0
         self.isolated = False
         self.notes: tuple[str, ...] = ()
         self.logs = OutputLogs(log_directory(name, places))
         self.ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
-        self._places = places
         self._guard = guard
         self.keeper = Following(name, places)
         self.streams: tuple[int, ...] = ()
@@ -150,8 +149,8 @@ class Component:
         self._held = False
         self._output_limited: bool | None = None
         self.guest: Guest | None = None
-        guard.dialogue.heard = self._heard
-        guard.dialogue.ended = self._guard_lost
+        guard.heard = self._heard
+        guard.ended = self._guard_lost
 
     def begin_output(self, owner: int) -> None:
         """Its output begins anew, and is this owner's. A namesake that was let go may still write: to files without a name.
@@ -181,7 +180,7 @@ class Component:
         return sum(stream.size - stream.committed for stream in bounds)
 
     async def resume(self, told: tuple[int, int] | None = None) -> str:
-        """After `births.restore`: commit to it and let it go on.
+        """After `launch.restore`: commit to it and let it go on.
 
         Args:
             told: a signal, and its value, that it gets before its next instruction.
@@ -201,13 +200,13 @@ class Component:
             untold = await self._tell(*told) if told else ""
             if streams:
                 self._take_streams(streams)
-            resumed, _ = await self.keeper.ask(channel.Resume(bool(streams)), streams)
+            resumed, _ = await self.keeper.ask(keeper_messages.Resume(bool(streams)), streams)
         except (CheckpointError, GuardError, KeeperLostError):
             await self.undo()
             raise
         self.notes = (*self.notes, *resumed.notes)
         self.let_go_ns = resumed.let_go_ns
-        if any(note.startswith(channel.UNPROTECTED) for note in resumed.notes):
+        if any(note.startswith(keeper_messages.UNPROTECTED) for note in resumed.notes):
             self._drop_keeper()  # the next capture tries with a new one
         else:
             self.keeper.followed = PTRACE, self.pid
@@ -284,7 +283,7 @@ class Component:
 
     async def capture(
         self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False
-    ) -> Captured | channel.Unchanged:
+    ) -> Captured | keeper_messages.Unchanged:
         """Take a snapshot; a base if the keeper has no acknowledged position to start from.
 
         Args:
@@ -302,11 +301,11 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = channel.Capture(base, generation, sequence, epoch, hold, self.keeper.share())
+        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share())
         async with self._standing_still(is_held_by_guard):
             with self._patience():
                 captured, descriptors = await self.keeper.ask(order)
-        if isinstance(captured, channel.Unchanged):
+        if isinstance(captured, keeper_messages.Unchanged):
             return captured
         self.keeper.note(captured)
         (snapshot,) = descriptors
@@ -341,9 +340,9 @@ class Component:
         if totals is not None:
             self.logs.commit(totals, is_safe=is_safe)
         self.limit_output(self.engine == PTRACE or not is_safe)
-        self.keeper.tell(channel.Acknowledge(position))
+        self.keeper.tell(keeper_messages.Acknowledge(position))
         if (commit := self._commits.pop(position, 0)) and is_safe:
-            self._guard.dialogue.tell(messages.CommitSafe(commit))
+            self._guard.tell(messages.CommitSafe(commit))
 
     def limit_output(self, limited: bool) -> None:
         """Bound how much of held output may wait, or do not.
@@ -351,9 +350,9 @@ class Component:
         A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while nobody stands by,
         for then its checkpoints would not help.
         """
-        if self._guard.dialogue.open and self.logs.is_held and limited != self._output_limited:
+        if self._guard.open and self.logs.is_held and limited != self._output_limited:
             self._output_limited = limited
-            self._guard.dialogue.tell(messages.LimitOutput(HOLD_LIMIT if limited else 0))
+            self._guard.tell(messages.LimitOutput(HOLD_LIMIT if limited else 0))
 
     @contextlib.asynccontextmanager
     async def _standing_still(self, wanted: bool) -> AsyncIterator[None]:
@@ -438,7 +437,7 @@ class Component:
     def close(self) -> None:
         """Let go of guard, keeper and logs without changing anything for the program: what a stopping agent does."""
         self._drop_keeper()
-        self._guard.dialogue.close()
+        self._guard.close()
         if self.prepared is not None:
             os.close(self.prepared.segment)
             self.prepared = None
@@ -467,7 +466,7 @@ class Component:
         Raises:
             GuardError: it refuses, with its sentence; GuardLostError.
         """
-        reply, streams = await self._guard.dialogue.ask(request, descriptors)
+        reply, streams = await self._guard.ask(request, descriptors)
         if isinstance(reply, Refused):
             raise GuardError(f"{self.name}: {reply.message}")
         return reply, streams

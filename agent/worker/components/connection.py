@@ -19,7 +19,12 @@ Answer = tuple[Any, tuple[int, ...]]
 
 
 class Dialogue:
-    """A conversation with a guard or a keeper. Lives in one loop."""
+    """A conversation with a guard or a keeper. Lives in one loop.
+
+    Attributes:
+        heard: takes an event and returns True; False for what answers a request.
+        ended: called once when the other end has gone.
+    """
 
     def __init__(
         self,
@@ -27,23 +32,19 @@ class Dialogue:
         incoming: Any,
         lost: type[AgentError],
         whom: str,
-        heard: Callable[[Any], bool] = lambda _: False,
-        ended: Callable[[], None] = lambda: None,
     ) -> None:
         """
         Args:
             incoming: the union of what may come.
             lost: raised to whoever waits, or asks, when the other end has gone.
             whom: the other end, for messages.
-            heard: takes an event and returns True; False for what answers a request.
-            ended: called once when the other end has gone.
         """
         end.setblocking(False)
         self._channel: Channel[Any] = Channel(end, incoming)
         self._lost = lost
         self._whom = whom
-        self.heard = heard
-        self.ended = ended
+        self.heard: Callable[[Any], bool] = lambda _: False
+        self.ended: Callable[[], None] = lambda: None
         self._waiting: deque[asyncio.Future[Answer]] = deque()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._channel.fileno(), self._readable)

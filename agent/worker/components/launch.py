@@ -29,7 +29,7 @@ from agent.worker.components.restore_limits import bound_of, check_rights
 from checkpoint.engine import COOPERATIVE, COPY_CLOCKS_AHEAD_NS, NO_TERMS, PTRACE, Terms, pid_taken
 from checkpoint.engines.cooperative.session import age_ns as commit_age_ns
 from checkpoint.errors import ChainError, CheckpointError, MismatchError
-from checkpoint.keeper import messages as channel
+from checkpoint.keeper import messages as keeper_messages
 from checkpoint.keeper.messages import Laid
 from checkpoint.linux.spawn.inherited_limits import Inheritance
 from checkpoint.model import Snapshot
@@ -171,7 +171,7 @@ async def restore(
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")
-        order = channel.Restore(
+        order = keeper_messages.Restore(
             component.pid,
             name,
             outage_ns,
@@ -242,7 +242,7 @@ async def lay(
         await _vessel(component, request, keeper)
         if component.inner_pid != outline.process.pid:  # before all of it is read
             raise pid_taken(outline.process.pid)
-        order = channel.Lay(component.pid, name, age_ns, owner != ROOT, places.contents, component.keeper.terms)
+        order = keeper_messages.Lay(component.pid, name, age_ns, owner != ROOT, places.contents, component.keeper.terms)
         laid, _ = await component.keeper.ask(order, tuple(chain))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
@@ -283,7 +283,7 @@ async def finish(
         component.engine_wanted = task.engine if task is not None else PTRACE
         component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
         component.keeper.names = names_of_contents(needs(outline), places.contents)
-        order = channel.Restore(
+        order = keeper_messages.Restore(
             component.pid,
             name,
             outage_ns,
@@ -294,7 +294,7 @@ async def finish(
             terms=component.keeper.terms,
             stood_still=stood_still,
         )
-        restored, _ = await component.keeper.ask(channel.Finish(order, outline.position))
+        restored, _ = await component.keeper.ask(keeper_messages.Finish(order, outline.position))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
@@ -357,7 +357,9 @@ async def begin_again(
     component.keeper.terms = terms_of(outline, terms, bound_of(owner, program.inheritance))
     try:
         await component.keeper.give()
-        filled, (segment,) = await component.keeper.ask(channel.Fill(name, owner != ROOT, terms.carry.places), tuple(chain))
+        filled, (segment,) = await component.keeper.ask(
+            keeper_messages.Fill(name, owner != ROOT, terms.carry.places), tuple(chain)
+        )
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
@@ -406,10 +408,10 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
         with contextlib.suppress(FileNotFoundError):
             socket_path.unlink()
         raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
-    guard.dialogue.heard = lambda message: isinstance(message, messages.Event)  # the end is told by the answer, too
-    described, streams = await guard.dialogue.ask(messages.Describe())
+    guard.heard = lambda message: isinstance(message, messages.Event)  # the end is told by the answer, too
+    described, streams = await guard.ask(messages.Describe())
     if described.state == "none":
-        guard.dialogue.close()
+        guard.close()
         raise GuardLostError(f"the guard of {socket_path.name} guards nothing; it ends")
     component = Component(described.component, guard, places)
     component.take(described, streams)

@@ -54,7 +54,7 @@ def complete_logs(directory: Path, chain: Sequence[int], *, is_safe: bool = Fals
     Args:
         chain: descriptors of encoded snapshots, oldest first.
         is_safe: another robot holds the newest of them, too.
-        owner: user id of whose component it is, see `agent.streams.logs_of`; None: not known here.
+        owner: user id of whose component it is, see `agent.guard.output_logs.logs_of`; None: not known here.
     """
     logs = OutputLogs(directory) if owner is None else logs_of(directory, owner)
     try:

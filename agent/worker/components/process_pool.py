@@ -26,7 +26,7 @@ from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard import messages
 from agent.system.systemd_units import Kind, in_a_unit
 from agent.worker.components.connection import Dialogue
-from checkpoint.keeper import messages as channel
+from checkpoint.keeper import messages as keeper_messages
 from checkpoint.linux.unix_address import address_of
 
 BIRTH_S: Final = 20.0
@@ -42,13 +42,6 @@ REFILL_S: Final = 1.0
 """How long after one was used its successor is started: a takeover has the processor for itself."""
 
 log = logging.getLogger("failover.component")
-
-
-class GuardLink(Struct):
-    """A guard that listens, and our conversation with it."""
-
-    dialogue: Dialogue
-    socket_path: Path
 
 
 class KeeperLink(Struct):
@@ -85,7 +78,7 @@ class Nursery:
         self._starter = starter
         self._expected = self._least = 0
         self._relieved: set[str] = set()
-        self._guards: deque[asyncio.Task[GuardLink]] = deque()
+        self._guards: deque[asyncio.Task[Dialogue]] = deque()
         self._keepers: deque[asyncio.Task[KeeperLink]] = deque()
         self._children: list[subprocess.Popen[bytes]] = []
         self._closed = False
@@ -121,7 +114,7 @@ class Nursery:
         while len(self._keepers) < self._wanted:
             self._keepers.append(asyncio.create_task(self._keeper_waits()))
 
-    async def guard(self) -> GuardLink:
+    async def guard(self) -> Dialogue:
         """A guard that guards nothing yet.
 
         Raises:
@@ -131,9 +124,9 @@ class Nursery:
         self._refill()
         while self._guards:
             with contextlib.suppress(GuardError):
-                link = await self._guards.popleft()
-                if link.dialogue.open:
-                    return link
+                guard = await self._guards.popleft()
+                if guard.open:
+                    return guard
         return await self._guard_born()
 
     async def keeper(self) -> KeeperLink:
@@ -165,7 +158,7 @@ class Nursery:
         self._closed = True
         for guard in self._guards:
             with contextlib.suppress(GuardError):
-                (await guard).dialogue.close()
+                (await guard).close()
         for keeper in self._keepers:
             with contextlib.suppress(KeeperLostError):
                 (await keeper).end()
@@ -183,7 +176,7 @@ class Nursery:
         except (GuardError, KeeperLostError) as error:
             log.warning("no guard and keeper wait in advance, a takeover will take longer: %s", error)
 
-    async def _guard_born(self) -> GuardLink:
+    async def _guard_born(self) -> Dialogue:
         name = _new_name()
         path = self._sockets / f"{name}.guard"
         child = self._spawn("guard", name, ["agent.guard.server", str(path)])
@@ -200,7 +193,7 @@ class Nursery:
             end, pid = await self._keeper_called() if self._starter else self._keeper_forked()
         except GuardError as error:
             raise KeeperLostError(str(error)) from error
-        dialogue = Dialogue(end, channel.Reply, KeeperLostError, "the keeper")
+        dialogue = Dialogue(end, keeper_messages.Reply, KeeperLostError, "the keeper")
         dialogue.watch(pid)
         return KeeperLink(dialogue, pid)
 
@@ -213,7 +206,7 @@ class Nursery:
         return end, _peer_of(end)
 
     def _keeper_forked(self) -> tuple[socket.socket, int]:
-        ours, theirs = channel.pair()
+        ours, theirs = keeper_messages.pair()
         with theirs:
             try:
                 child = self._spawn("keeper", "", ["checkpoint", "keeper", str(theirs.fileno())], (theirs.fileno(),))
@@ -257,7 +250,7 @@ class Nursery:
         self._children = [child for child in self._children if child.poll() is None]
 
 
-def connect(path: Path) -> GuardLink:
+def connect(path: Path) -> Dialogue:
     """Speak to the guard that listens at a path.
 
     Raises:
@@ -266,11 +259,11 @@ def connect(path: Path) -> GuardLink:
     return _guard_at(path, _call(path))
 
 
-def _guard_at(path: Path, end: socket.socket) -> GuardLink:
+def _guard_at(path: Path, end: socket.socket) -> Dialogue:
     incoming = messages.Reply | messages.Event
     dialogue = Dialogue(end, incoming, GuardLostError, f"the guard at {path.name}")
     dialogue.watch(_peer_of(end))
-    return GuardLink(dialogue, path)
+    return dialogue
 
 
 def _peer_of(end: socket.socket) -> int:

@@ -44,7 +44,7 @@ async def brought_back(
         waiting: the program, where it was started to wait.
 
     Raises:
-        CheckpointError, AgentError: as `births.restore` and `births.begin_again`; nothing of it is left.
+        CheckpointError, AgentError: as `launch.restore` and `launch.begin_again`; nothing of it is left.
     """
     name, places, spec = act.component, around.places, act.spec
     terms = terms_here(spec.launch if spec is not None else None, around.here(name))
@@ -91,7 +91,7 @@ async def finished(around: Surroundings, act: acts.Restore, component: Component
         outline: of the snapshot that it stands at.
 
     Raises:
-        CheckpointError, AgentError: as `births.finish`; nothing of it is left.
+        CheckpointError, AgentError: as `launch.finish`; nothing of it is left.
     """
     spec = act.spec
     await launch.finish(

@@ -59,7 +59,6 @@ class Snapshots(Struct, frozen=True):
                 captured.parent,
                 captured.size,
                 captured.freeze_us,
-                captured.dirty_bytes,
                 captured.age_ns,
             )
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import grp
-import logging
 import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -33,8 +32,6 @@ REQUEST_S: Final = 30.0
 
 PIECE_SIZE: Final = 32 << 10
 """Bytes read ahead of a client (asyncio reads twice as many and one more piece); a request takes memory as it arrives."""
-
-log = logging.getLogger("failover.control")
 
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(Request)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import logging
 import os
 from collections.abc import Callable, Iterable
 from typing import Any, Final, Protocol
@@ -18,7 +17,7 @@ from agent.hook_kinds import check_told
 from agent.system import clock
 from agent.system.adopted_process import Guest
 from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for
-from agent.worker.components import prerequisites as lacks
+from agent.worker.components import prerequisites
 from agent.worker.components.paths import Places
 from agent.worker.components.supervisor import Charge
 from agent.worker.control.arguments import (
@@ -51,8 +50,6 @@ STANDING_POLL_S: Final = 0.01
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
-
-log = logging.getLogger("failover.verbs")
 
 
 class Lanes(Lines, Protocol):
@@ -242,7 +239,7 @@ class Verbs(Questions):
         """
         if robot not in await self._reachable():
             return
-        if reasons := await lacks.asked_of(self._lanes.errands, robot, name):
+        if reasons := await prerequisites.asked_of(self._lanes.errands, robot, name):
             sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 

@@ -33,7 +33,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.live_thread import spokesman_of, told_by_spokesman
 from checkpoint.model import Position, Snapshot
 from checkpoint.program import epoch_variable
-from checkpoint.resources.carried import capture as carried_trees
+from checkpoint.resources.carried import capture as carried_capture
 from checkpoint.resources.carried.capture import CarriedTrees
 from checkpoint.resources.process import thread_credentials
 from checkpoint.snapshot.required_files import program_of
@@ -161,7 +161,7 @@ class GuardedTask:
             UnsupportedError: they cannot be carried.
         """
         if self._trees is None and self._terms.carry.paths:
-            trees = told_by_spokesman(self.pid, lambda tid: carried_trees.followed(tid, self._terms))
+            trees = told_by_spokesman(self.pid, lambda tid: carried_capture.followed(tid, self._terms))
             assert trees is not None, "it has paths"
             if reasons := trees.refuse():
                 trees.close()

@@ -12,7 +12,7 @@ from checkpoint.engines.ptrace.capture.session import PtraceSession
 from checkpoint.engines.ptrace.facts.probe import probe
 from checkpoint.engines.ptrace.restore import checks
 from checkpoint.engines.ptrace.restore.restore import restore
-from checkpoint.engines.ptrace.standby_copy import lay as lay_copy
+from checkpoint.engines.ptrace.standby_copy import lay
 from checkpoint.linux.spawn.cpuid import require_supported
 from checkpoint.model import Snapshot
 from checkpoint.store.base_on_disk import StoredBase
@@ -49,4 +49,4 @@ class PtraceEngine:
 
     def lay(self, vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -> Copy:
         """See ``checkpoint.engine.Engine.lay``."""
-        return lay_copy.lay(vessel_pid, base, options)
+        return lay.lay(vessel_pid, base, options)

@@ -126,7 +126,7 @@ class PageScanner:
     """PAGEMAP_SCAN on one process's pagemap.
 
     Args:
-        loop: makes the calls, see ``checkpoint.linux.own_calls``; None: as fast as may be.
+        loop: makes the calls, see `checkpoint.linux.batch_syscalls`; None: as fast as may be.
 
     Raises:
         ProcessGoneError: it ended, or it became another program (exec).

@@ -42,10 +42,8 @@ _TCP_INFO_TOLD: Final = ((0, 1), (24, 32), (128, 136), (144, 148), (200, 216))
 estimates."""
 _CREDENTIALS_SIZE: Final = 12
 _MCAST_MSFILTER: Final = 48
-_GROUP_FILTER_SIZE: Final = 144
 _POLL: Final = struct.Struct("<ihH")
 POLLED: Final = select.POLLIN | select.POLLPRI | select.POLLRDHUP
-_DATAGRAMS: Final = (socket.IPPROTO_UDP, 136)
 _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 
 WORTH_SHARING: Final = 16

@@ -28,7 +28,6 @@ _MINOR_BITS: Final = 20
 """Of a device number as the kernel has it. Source: linux/kdev_t.h."""
 
 ESTABLISHED: Final = 1
-CLOSED: Final = 7
 LISTENING: Final = 10
 
 
@@ -52,7 +51,7 @@ class UnixSocket(Struct, frozen=True):
     """One unix socket.
 
     Attributes:
-        state: `ESTABLISHED`, `CLOSED` or `LISTENING`.
+        state: `ESTABLISHED`, `LISTENING`, or 7: neither.
         name: a path, or a zero byte and an abstract name; b"" when it has none.
         peer: inode number of the socket that it is connected to; 0 when there is none (any more).
         backlog: of one that listens.

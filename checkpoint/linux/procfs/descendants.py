@@ -286,8 +286,3 @@ def others(pid: int, reaper: int) -> list[int]:
 def component(pid: int) -> list[int]:
     """Everybody of the component of a process that nobody guards, but for itself, parents before children."""
     return others(pid, reaper_of(pid, is_guarded=False))
-
-
-def descendants(pid: int) -> list[int]:
-    """Everybody whom a process has given birth to, and they, parents before children."""
-    return list(Kinship._walk(children(pid), ()))

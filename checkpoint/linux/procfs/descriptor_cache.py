@@ -102,12 +102,10 @@ class _Known(Struct):
     """One descriptor as it was at the last look.
 
     Attributes:
-        standing: what must be asked to know that it is the same.
         link, about: what readlinkat(2) and newfstatat(2) answered.
     """
 
     descriptor: Descriptor
-    standing: Standing
     link: bytes | None
     about: bytes | None
 
@@ -222,7 +220,7 @@ class KeptTexts:
             has_all = number in self._texts and (link is not None, about is not None) == (needs.link, needs.about)
             self._follow(number, needs, links, texts)
             if has_all:
-                self._known[number] = _Known(found, needs, link, about)
+                self._known[number] = _Known(found, link, about)
         return found
 
     def _follow(self, number: int, needs: Standing, links: int, texts: int) -> None:

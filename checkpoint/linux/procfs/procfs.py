@@ -297,8 +297,6 @@ class Status(Struct, frozen=True):
     sids: tuple[int, ...]
     resident_size: int
     threads: int
-    caught: int
-    ignored: int
     capabilities: tuple[int, int, int, int, int]
     no_new_privs: bool
     seccomp: int
@@ -345,8 +343,6 @@ def parse_status(text: str) -> Status:
         sids=numbers("NSsid"),
         resident_size=int((fields.get("VmRSS") or "0 kB").split()[0]) * 1024,
         threads=int(fields.get("Threads", "1")),
-        caught=int(fields.get("SigCgt", "0"), 16),
-        ignored=int(fields.get("SigIgn", "0"), 16),
         capabilities=_five(tuple(int(fields.get(f"Cap{which}", "0"), 16) for which in ("Inh", "Prm", "Eff", "Bnd", "Amb"))),
         no_new_privs=fields.get("NoNewPrivs") == "1",
         seccomp=int(fields.get("Seccomp", "0")),

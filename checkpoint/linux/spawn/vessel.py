@@ -94,7 +94,6 @@ class Born(Struct, frozen=True):
         inner_pid: as the process itself sees it.
         init_pid: the first process of its PID namespace, a child of the caller too, to be reaped after it; 0: none.
         isolated: it has PIDs of its own.
-        own_clocks: its clocks go on from ``Birth.clocks``.
         notes: a sentence for each thing that was wanted and is not had.
     """
 
@@ -102,7 +101,6 @@ class Born(Struct, frozen=True):
     inner_pid: int
     init_pid: int = 0
     isolated: bool = False
-    own_clocks: bool = False
     notes: tuple[str, ...] = ()
 
 
@@ -186,7 +184,7 @@ def _read_reports(read_end: int) -> list[dict[str, object]]:
 
 
 def _born_or_raise(facts: dict[str, object]) -> Born:
-    known = {name: facts[name] for name in ("pid", "inner_pid", "init_pid", "isolated", "own_clocks") if name in facts}
+    known = {name: facts[name] for name in ("pid", "inner_pid", "init_pid", "isolated") if name in facts}
     notes = facts.get("notes", [])
     assert isinstance(notes, list)
     if "error" not in facts and {"pid", "inner_pid"} <= set(known):
@@ -243,7 +241,7 @@ def _attend(lines: _Lines, birth: Birth, become: Callable[[], NoReturn], keep_ri
     pid, note = _sibling_with_pid(birth.inner_pid)
     if pid == 0:
         _end_after(_grow_up, lines, birth, watch_write, become, keep_right, entered)
-    lines.say(pid=pid, isolated=entered.pids, own_clocks=entered.clocks, notes=notes + note)
+    lines.say(pid=pid, isolated=entered.pids, notes=notes + note)
 
 
 def _sibling_with_pid(wanted: int) -> tuple[int, list[str]]:

@@ -53,7 +53,6 @@ class Round:
     """The calls for up to so many threads at once. Every call from the thread that traces them."""
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
         self._memory = np.zeros((capacity, _Layout.size), dtype=np.uint8)
         self._words = self._memory.view(np.uint64)
         base = int(self._memory.ctypes.data)

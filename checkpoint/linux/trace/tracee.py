@@ -30,8 +30,7 @@ from checkpoint.linux.spawn import cpuid
 from checkpoint.linux.trace.stop_events import sleep_until_report
 from checkpoint.model import Rseq
 
-PTRACE_EVENT_STOP: Final = 128
-PLAIN_STOP: Final = PTRACE_EVENT_STOP << 16 | signal.SIGTRAP << 8 | 0x7F
+PLAIN_STOP: Final = abi.PTRACE_EVENT_STOP << 16 | signal.SIGTRAP << 8 | 0x7F
 """Wait status of a thread that was asked to stop, and stands for no other reason. Source: wait(2), ptrace(2)."""
 CALL_STOP: Final = 0x80
 """In the signal of a stop at a system call (PTRACE_O_TRACESYSGOOD)."""
@@ -76,7 +75,7 @@ class Stop(Struct, frozen=True):
     @property
     def is_within_a_call(self) -> bool:
         """Whether it is one of those that are asked for by options (PTRACE_O_TRACEEXEC), of which the call is not over yet."""
-        return self.event not in (0, PTRACE_EVENT_STOP)
+        return self.event not in (0, abi.PTRACE_EVENT_STOP)
 
 
 def _is_dead(pid: int) -> bool:
@@ -113,7 +112,7 @@ class Tracee:
     Attributes:
         is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
         left_alone: the registers that it gives itself back if we die while it makes calls of ours; empty: those it stood with.
-        waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`ended_calls`); "" otherwise.
+        waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`interrupted_syscalls`); "" otherwise.
         whereabouts: tells where it runs, of one that is stopped again and again.
         stopped_by: the signal that had stopped its process when it stopped for us last (SIGSTOP, job control); 0: it ran.
 
@@ -315,7 +314,7 @@ class Tracee:
         if not os.WIFSTOPPED(status):
             raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
         stop = Stop(event=status >> 16, signal=os.WSTOPSIG(status))
-        if stop.event == PTRACE_EVENT_STOP:
+        if stop.event == abi.PTRACE_EVENT_STOP:
             self.stopped_by = stop.signal if stop.signal != signal.SIGTRAP else 0
         return stop
 

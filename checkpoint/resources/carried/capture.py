@@ -116,13 +116,11 @@ class Seen(Struct, frozen=True):
         names: of each path, a directory before what is in it.
         links: where symbolic links lead to, by path and name.
         unreadable: why something could not be looked at.
-        read_size: bytes that had to be read.
     """
 
     names: tuple[Name, ...] = ()
     links: Mapping[tuple[int, bytes], bytes] = field(default_factory=dict)
     unreadable: tuple[str, ...] = ()
-    read_size: int = 0
 
 
 class Parcel(Struct, frozen=True):
@@ -230,9 +228,9 @@ class CarriedTrees(Struct):
             try:
                 if behind := tuple(filter(None, map(self._refuse_link, self.paths))):
                     return Seen(unreadable=behind)
-                names = [name for index, path in enumerate(self.paths) for name in self._below(index, path)]
+                names = [name for index in range(len(self.paths)) for name in self._below(index)]
                 links = {(one.tree, one.name): os.readlink(self._place(one)) for one in names if one.kind == stat.S_IFLNK}
-                read_size = self._read_stale(names, mapped, FROZEN_SIZE_MAX if frozen else self.size_max)
+                self._read_stale(names, mapped, FROZEN_SIZE_MAX if frozen else self.size_max)
             except PermissionError as error:
                 return Seen(unreadable=(self._unreadable(error),))
             except OSError as error:
@@ -240,7 +238,7 @@ class CarriedTrees(Struct):
                     f"cannot capture pid {self.pid}: its carried files change while they are looked at ({self._path_of(error)}: "
                     f"{error.strerror}); try again, and let nobody else write there"
                 ) from error
-        return Seen(tuple(names), links, (), read_size)
+        return Seen(tuple(names), links)
 
     def _refuse_link(self, path: str) -> str:
         """Why a path means another one; at each look, for what was a folder may have become a link."""
@@ -256,8 +254,8 @@ class CarriedTrees(Struct):
 
     # Names
 
-    def _below(self, index: int, path: str) -> Iterator[Name]:
-        """The path itself and what lies below it, a directory before what is in it; no more than `ENTRIES_MAX`, and one."""
+    def _below(self, index: int) -> Iterator[Name]:
+        """A path itself and what lies below it, a directory before what is in it; no more than `ENTRIES_MAX`, and one."""
         first = Name(index, b"", os.stat_result(range(10)))
         try:
             first = Name(index, b"", os.lstat(self._place(first)))
@@ -300,8 +298,8 @@ class CarriedTrees(Struct):
 
     # Contents
 
-    def _read_stale(self, names: Sequence[Name], mapped: frozenset[int], size_max: int) -> int:
-        """Read the files that changed since they were last read; bytes read.
+    def _read_stale(self, names: Sequence[Name], mapped: frozenset[int], size_max: int) -> None:
+        """Read the files that changed since they were last read.
 
         Raises:
             CaptureError: that would be more than ``size_max``.
@@ -311,7 +309,7 @@ class CarriedTrees(Struct):
         read_size = sum(held_size_of(name.about) for name in stale.values())
         if read_size > size_max:
             if read_size > self.size_max:
-                return 0  # `reasons` tells
+                return  # `reasons` tells
             raise CaptureError(
                 f"cannot capture pid {self.pid}: {read_size >> 20} MiB of its carried files changed a moment ago; at most "
                 f"{size_max >> 20} MiB are read at a time: carry fewer or smaller files"
@@ -320,7 +318,6 @@ class CarriedTrees(Struct):
         for key, name in stale.items():
             content = self._read(name, places[key], now_ns)
             self._known[key] = replace(content, is_settled=False) if key[1] in mapped else content
-        return read_size
 
     def _is_known(self, about: os.stat_result, mapped: frozenset[int]) -> bool:
         held = self._known.get((about.st_dev, about.st_ino))

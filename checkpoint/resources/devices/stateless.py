@@ -43,7 +43,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Other devices are refused by ``unsupported``."""
+    """Other devices are refused by `refused`."""
     return None
 
 

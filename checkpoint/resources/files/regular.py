@@ -88,7 +88,6 @@ LOOKS: Final = 5
 CHUNK: Final = 1 << 20
 
 O_PATH: Final = 0o10000000
-MEMORY_FILE: Final = "/memfd:"
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:

@@ -177,7 +177,7 @@ def mismatches(held: Resource) -> Iterator[str]:
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     """Open it as it was, without waiting for somebody at its other end, and fill it."""
     path, content, hidden = str(held.facts["path"]), held.facts["content"], -1
-    flags = number_of(held.facts["flags"]) & ~os.O_ASYNC  # opened with it nobody would be told: `signalling` sets it
+    flags = number_of(held.facts["flags"]) & ~os.O_ASYNC  # opened with it nobody would be told: `fd_signals` sets it
     if held.facts.get("deleted"):
         path = f"/proc/self/fd/{_nameless(table, held, rebuilding)}"
     elif held.facts.get("handle"):

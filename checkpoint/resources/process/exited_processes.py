@@ -26,7 +26,7 @@ WALL: Final = 0x40000000
 """Wait for children that send no signal at their end, too. Source: wait4(2)."""
 
 Descriptors = dict[tuple[int, int], int]
-"""A descriptor of each open file that was made, by its place among the nameless objects of `rebuilding.Rebuilding`."""
+"""A descriptor of each open file that was made, by its place among the nameless objects of `restore_context.Rebuilding`."""
 
 
 class Departed(Struct, frozen=True):

@@ -9,7 +9,7 @@ Source: pthreads(7), credentials(7), unshare(2), kcmp(2).
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from msgspec import Struct
@@ -22,7 +22,7 @@ from checkpoint.linux.procfs.live_thread import can_look_through
 from checkpoint.linux.procfs.procfs import Status
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.procfs.timers import parse_timers
-from checkpoint.linux.trace import seccomp as confinement
+from checkpoint.linux.trace import seccomp as trace_seccomp
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.resources.process import seccomp, unshared_threads
 
@@ -89,12 +89,11 @@ OF_SEVERAL: Final = (
 _NAMESPACES: Final = ("net", "ipc", "uts", "cgroup", "mnt", "user", "pid_for_children", "time_for_children")
 
 
-def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]:
+def refuse(pid: int, status: Status) -> Iterator[str]:
     """Why the threads of a process cannot be captured.
 
     Args:
         status: of the first one.
-        kin: all processes of its component, if there are several.
     """
     yield from refuse_shared_memory(pid, status)
     if status.threads == 1:
@@ -191,7 +190,7 @@ def _unlike(pid: int, tid: int, shared: _Shared, first: _Shared, own: unshared_t
     named = f"its thread {tid} ({status.name})"
     if shared.tracer:
         yield f"{named} is traced by pid {shared.tracer}: end that debugger"
-    elif shared.seccomp and (why := confinement.why_not()):
+    elif shared.seccomp and (why := trace_seccomp.why_not()):
         yield seccomp.not_ours(why, named)
     if own:
         yield from unshared_threads.refuse(pid, tid, own)

@@ -116,7 +116,7 @@ def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact], li
     """What else must be known of a TCP socket that is neither fresh nor listens.
 
     Args:
-        facts: as ``internet_sockets`` found them.
+        facts: as `inet.observe` found them.
 
     Raises:
         OSError: it cannot be looked into.

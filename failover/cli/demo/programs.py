@@ -80,11 +80,11 @@ class Program(Struct, frozen=True):
     directory: Path
     expected_size: int
 
-    def undisturbed(self, environment: dict[str, str], priority: int = 10) -> subprocess.Popen[bytes]:
+    def undisturbed(self, environment: dict[str, str]) -> subprocess.Popen[bytes]:
         """Start it as anybody would, politely, its output going to a file: see `reference`."""
         with self.reference.open("wb") as output:
             return subprocess.Popen(
-                ["nice", "-n", str(priority), *self.argv],
+                ["nice", "-n", "10", *self.argv],
                 cwd=self.directory,
                 env=environment,
                 stdin=subprocess.DEVNULL,

@@ -61,7 +61,7 @@ def _send(component: Component, turn: Turn, server: str, has: Position | None) -
         return
     if whole:
         component.archived_ns = turn.now_ns + turn.config.archive_ms * MS
-    component.archives[server] = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, whole, server, position, has)
+    component.archives[server] = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, server, position, has)
     parent = None if whole else has
     turn.order(
         acts.Ship(component.name, component.epoch, position, parent, server, component.spec, whole, acknowledged=component.safe)
@@ -80,7 +80,7 @@ def give_back(component: Component, turn: Turn) -> None:
         return  # also after a refusal: what the other side says and what it takes may differ for a moment
     heir = _heir(component, turn)
     if heir and turn.alive(heir) and _lacks(component, turn.team.peers[heir], mine):
-        component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, True, heir, mine)
+        component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, heir, mine)
         turn.order(
             acts.Ship(component.name, component.epoch, mine, None, heir, component.spec, whole=True, acknowledged=component.shown)
         )

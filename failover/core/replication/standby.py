@@ -70,7 +70,7 @@ def capture(component: Component, turn: Turn, final: bool = False) -> None:
             return
         base = base or entry.position != component.parent or bool(entry.flags & NEEDS_BASE)
     component.sequence += 1
-    component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, base, to, final=final)
+    component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, to, final=final)
     turn.order(acts.Capture(component.name, component.epoch, base, component.generation, component.sequence, final))
 
 

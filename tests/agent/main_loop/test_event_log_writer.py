@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from agent import event_log
 from agent.event_log import StoryFile, packed, read, unpacked
-from agent.main_loop import event_log_writer as scribe_file
+from agent.main_loop import event_log_writer
 from agent.main_loop.event_log_writer import REPEAT_NS, WAITING_MAX, Scribe
 from failover.core.event_log.decisions import Decision, Facts, Line, Sighting
 
@@ -118,7 +118,7 @@ def test_a_disk_that_hangs_delays_nobody_and_is_said(tmp_path: Path, monkeypatch
 
 
 def test_a_full_disk_is_said_and_once_there_is_room_nothing_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scribe_file, "RETRY_S", 0.01)
+    monkeypatch.setattr(event_log_writer, "RETRY_S", 0.01)
     written = StoryFile.append
     full = [True]
 

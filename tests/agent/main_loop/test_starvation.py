@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from agent.main_loop import starvation
+from agent.system import clock
 
 BUSY = "while True: pass"
 ASLEEP = "import time; time.sleep(1_000_000)"
@@ -32,11 +33,11 @@ def program(code: str, policy: int = os.SCHED_OTHER) -> Iterator[int]:
 
 def had_share(pid: int) -> float:
     """The part of a second that it had."""
-    before = starvation.look(pid)
+    before, began_ns = starvation.look(pid), clock.now_ns()
     time.sleep(PERIOD_S)
-    now = starvation.look(pid)
+    now, passed_ns = starvation.look(pid), clock.now_ns() - began_ns
     assert before is not None and now is not None
-    return starvation.had_ns(before, now, now.at_ns - before.at_ns) / (now.at_ns - before.at_ns)
+    return starvation.had_ns(before, now, passed_ns) / passed_ns
 
 
 def test_a_process_that_others_keep_from_running_did_not_have_its_time() -> None:

@@ -13,19 +13,19 @@ import pytest
 
 from checkpoint import resources
 from checkpoint.capability import Area, Verdict, refused
-from checkpoint.engines import capability_table as capabilities
+from checkpoint.engines import capability_table
 from checkpoint.engines.ptrace import capability_rows
-from checkpoint.engines.ptrace.capture import tree as captured_tree
+from checkpoint.engines.ptrace.capture import tree as capture_tree
 from checkpoint.engines.ptrace.facts import birth_order, probe
 from checkpoint.engines.ptrace.restore import process, process_state, restore, threads, vdso_syscalls
-from checkpoint.engines.ptrace.restore import tree as restore_tree
-from tests import capability_table
+from checkpoint.engines.ptrace.restore import tree as restored_tree
+from tests import capability_table as written_table
 
 RESOURCES = Path(resources.__file__).parent
 
 SPEAKS_FOR = {
     capability_rows: (probe, restore, process, threads, process_state, vdso_syscalls),
-    birth_order: (captured_tree, restore_tree),
+    birth_order: (capture_tree, restored_tree),
 }
 """Rows that stand in one file for sentences in others."""
 
@@ -90,22 +90,22 @@ def of(module: ModuleType) -> list[str]:
     return [text for text in sentences(inspect.getsource(module)) if not any(part in text for part in NO_KIND)]
 
 
-@pytest.mark.parametrize("carrier", capabilities.CARRIERS, ids=lambda module: module.__name__)
+@pytest.mark.parametrize("carrier", capability_table.CARRIERS, ids=lambda module: module.__name__)
 def test_every_refusal_in_the_code_belongs_to_a_row(carrier: ModuleType) -> None:
-    said = [part for row in capabilities.carried_by(carrier) for part in row.said]
+    said = [part for row in capability_table.carried_by(carrier) for part in row.said]
     for module in (carrier, *SPEAKS_FOR.get(carrier, ())):
         assert [text for text in of(module) if not any(part in text for part in said)] == []
 
 
-@pytest.mark.parametrize("carrier", capabilities.CARRIERS, ids=lambda module: module.__name__)
+@pytest.mark.parametrize("carrier", capability_table.CARRIERS, ids=lambda module: module.__name__)
 def test_no_row_speaks_of_a_refusal_that_is_gone(carrier: ModuleType) -> None:
     texts = [text for module in (carrier, *SPEAKS_FOR.get(carrier, ())) for text in of(module)]
-    said = [part for row in capabilities.carried_by(carrier) for part in row.said]
+    said = [part for row in capability_table.carried_by(carrier) for part in row.said]
     assert [part for part in said if not any(part in text for text in texts)] == []
 
 
 def test_every_file_that_refuses_carries_rows() -> None:
-    carriers = {Path(str(module.__file__)) for module in capabilities.CARRIERS}
+    carriers = {Path(str(module.__file__)) for module in capability_table.CARRIERS}
     assert [path.name for path in sorted(RESOURCES.rglob("*.py")) if _refuses(path) and path not in carriers] == []
 
 
@@ -117,33 +117,33 @@ def _refuses(path: Path) -> bool:
 def test_a_refusal_without_a_row_is_seen() -> None:
     source = 'def refuse(held):\n    return f"{held.name} is a teapot: use a cup"\n'
     assert list(sentences(source)) == ["{} is a teapot: use a cup"]
-    assert capabilities.row_of("fd 3 is a teapot: use a cup") is None
+    assert written_table.row_of("fd 3 is a teapot: use a cup") is None
 
 
 def test_the_row_of_a_refusal_is_found_by_its_words() -> None:
-    row = capabilities.row_of(
+    row = written_table.row_of(
         "fd 3 is a socket (vsock, socket:[123]), which is not kept yet: protect the program while it has none"
     )
     assert row is not None and row.area == Area.SOCKETS and row.verdict == Verdict.REFUSED
 
 
 def test_every_area_has_rows_and_every_refusal_says_what_to_do() -> None:
-    assert all(capabilities.by_area().values())
-    for row in capabilities.rows():
+    assert {row.area for row in capability_table.rows()} == set(Area)
+    for row in capability_table.rows():
         assert row.kind and row.sentence, row
         assert not row.sentence.endswith("."), row
 
 
 def test_the_documents_hold_exactly_this_table() -> None:
-    for path, text in capability_table.written().items():
+    for path, text in written_table.written().items():
         assert path.read_text() == text, "run ./run table"
 
 
 def test_a_document_without_its_place_for_the_table_is_seen() -> None:
     with pytest.raises(ValueError, match="capabilities:begin"):
-        capability_table.put_into("no marks here", "table")
+        written_table.put_into("no marks here", "table")
 
 
 def test_a_row_says_its_kind_in_the_table() -> None:
     row = refused(Area.DEVICES, "teapots", "use a cup", "is a teapot")
-    assert capability_table.line_of(row) == f"| teapots | {Verdict.REFUSED.value} | use a cup |"
+    assert written_table.line_of(row) == f"| teapots | {Verdict.REFUSED.value} | use a cup |"

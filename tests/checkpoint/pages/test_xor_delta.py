@@ -402,7 +402,7 @@ def captured(keeper: Keeper, sequence: int, cache: int) -> tuple[messages.Captur
     """One snapshot of what a keeper follows, acknowledged."""
     order = messages.Capture(sequence == 1, 1, sequence, xor_cache=cache)
     answer, (content,) = at_last(lambda: keeper.ask(order, messages.Captured))
-    keeper.tell(messages.Acknowledge(answer.position))
+    keeper._link.send(messages.Acknowledge(answer.position))
     try:
         return answer, format.decode(content)
     finally:

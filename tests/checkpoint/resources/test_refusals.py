@@ -16,11 +16,11 @@ import pytest
 
 from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder, ProtectOrder
-from checkpoint.engines import capability_table
 from checkpoint.errors import ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.resources.files import regular
 from checkpoint.resources.open_file import Surroundings
 from checkpoint.resources.survey import gather
+from tests.capability_table import row_of
 from tests.checkpoint.round_trip import (
     ENGINE,
     as_nobody,
@@ -121,7 +121,7 @@ def test_what_only_the_program_itself_knows_is_refused_when_it_is_asked(
 
 
 def _is_in_the_table(reason: str) -> bool:
-    row = capability_table.row_of(reason)
+    row = row_of(reason)
     return row is not None and row.verdict == Verdict.REFUSED
 
 

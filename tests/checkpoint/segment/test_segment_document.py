@@ -6,11 +6,11 @@ import os
 import re
 from pathlib import Path
 
-from checkpoint.segment import layout as segment
+from checkpoint.segment import layout as segment_layout
 from checkpoint.segment.writer import SegmentWriter
 from tests.checkpoint.segments import layout, source
 
-DOCUMENT = (Path(segment.__file__).parent / "SEGMENT.md").read_text()
+DOCUMENT = (Path(segment_layout.__file__).parent / "SEGMENT.md").read_text()
 
 
 def number(content: bytes, offset: int, size: int = 8) -> int:
@@ -43,9 +43,9 @@ def test_a_reader_written_from_the_document_reads_what_was_committed() -> None:
 
 
 def test_the_limits_in_the_document_are_those_of_the_code() -> None:
-    assert f"1 to {segment.MAX_REGIONS}" in DOCUMENT
-    assert f"at most {segment.MAX_PAGES}" in DOCUMENT
-    assert f"3 to {segment.MAX_BANKS}" in DOCUMENT
-    assert f"1 to {segment.MAX_NAME_SIZE}" in DOCUMENT
-    assert bytes.fromhex(re.search(r"magic `([0-9a-f ]+)`", DOCUMENT)[1].replace(" ", "")) == segment.MAGIC  # type: ignore[index]
-    assert (segment.MAX_PLACES, segment.STRIDE) == (1 << 20, 1 << 37)
+    assert f"1 to {segment_layout.MAX_REGIONS}" in DOCUMENT
+    assert f"at most {segment_layout.MAX_PAGES}" in DOCUMENT
+    assert f"3 to {segment_layout.MAX_BANKS}" in DOCUMENT
+    assert f"1 to {segment_layout.MAX_NAME_SIZE}" in DOCUMENT
+    assert bytes.fromhex(re.search(r"magic `([0-9a-f ]+)`", DOCUMENT)[1].replace(" ", "")) == segment_layout.MAGIC  # type: ignore[index]
+    assert (segment_layout.MAX_PLACES, segment_layout.STRIDE) == (1 << 20, 1 << 37)

@@ -94,12 +94,6 @@ def test_a_delta_of_another_component_is_refused() -> None:
     refused((base, replace(second, component="/other")), "/other")
 
 
-def test_a_delta_whose_siblings_were_never_acknowledged_replaces_them() -> None:
-    base, second, third = history(3)
-    other = replace(third, parent=base.position)
-    assert chain.append((base, second), other) == (base, other)
-
-
 def test_a_chain_of_several_processes_folds_to_what_each_of_them_has() -> None:
     snapshots = family(3)
     assert snapshots[0].copies and len(snapshots[0].contents) == 3 * PAGE

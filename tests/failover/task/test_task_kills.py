@@ -65,7 +65,7 @@ def schema_of(name: str) -> Schema:
 
 
 def opened(folder: Path) -> Task:
-    return open_task("voyage", schema_of, lambda state, schema: Voyage(), folder)
+    return open_task("voyage", schema_of, lambda _: Voyage(), folder)
 
 
 def sail_until_killed(folder: Path, reports: int) -> None:

@@ -17,9 +17,9 @@ from checkpoint.linux.spawn import cpuid
 from checkpoint.model import PosixTimer, ProcessState, ThreadState
 
 
-def thread_states(pid: int, standing: Standing) -> tuple[ThreadState, ...]:
+def thread_states(standing: Standing) -> tuple[ThreadState, ...]:
     """Its threads, the first one first."""
-    return (_first_thread(pid, standing), *map(_other_thread, standing.others))
+    return (_first_thread(standing), *map(_other_thread, standing.others))
 
 
 def _other_thread(standing: ThreadStanding) -> ThreadState:
@@ -44,7 +44,7 @@ def _other_thread(standing: ThreadStanding) -> ThreadState:
     )
 
 
-def _first_thread(pid: int, standing: Standing) -> ThreadState:
+def _first_thread(standing: Standing) -> ThreadState:
     place, told, stat, status = standing.place, standing.told, standing.stat, standing.status
     return ThreadState(
         tid=status.pids[-1],

@@ -92,7 +92,7 @@ def _enter_once(
     if dispatching := [one.pid for one in (tracee, *threads.others) if one.dispatches_calls()]:
         reason = refused_threads.of_dispatching(dispatching[0])
         raise UnsupportedError(f"cannot enter pid {tracee.pid}: {reason}", (reason,))
-    confinements = Confinements(threads.pid, interruptions)
+    confinements = Confinements(interruptions)
     mode = seccomp.mode_in(procfs.read_bytes(tracee.pid, "status"))
     confinements.suspended(tracee, mode, (tracee.pid, 0))
     for one in threads.others if mode or modes else ():

@@ -23,12 +23,12 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptors import lending
 from checkpoint.linux.procfs.procfs import KeptFiles, Stat, Status
 from checkpoint.linux.procfs.timers import parse_timers
-from checkpoint.linux.trace import seccomp as confinement
+from checkpoint.linux.trace import seccomp
 from checkpoint.linux.trace.bulk_reads import Readings, Unread, Waiting
 from checkpoint.linux.trace.remote_syscalls import Answers
 from checkpoint.linux.trace.seccomp import FREE, Confinement
 from checkpoint.linux.trace.threads import Threads
-from checkpoint.resources import signal_owners as owners
+from checkpoint.resources import signal_owners
 from checkpoint.resources.open_file import Opened, OpenFile, Owners
 from checkpoint.resources.process.thread_credentials import ThreadRights
 from checkpoint.resources.process.unshared_threads import ThreadTables
@@ -113,7 +113,7 @@ class Onlooker:
         self._files = KeptFiles(threads.pid)
         self._readings = Readings()
         self._waiting = Waiting(threads.leader)
-        self._confinements = Confinements(threads.pid, entered.interruptions)
+        self._confinements = Confinements(entered.interruptions)
         self._others = ThreadOnlooker(threads, entered, self._confinements)
         self._recollection = Recollection()
         self.rights = ThreadRights(threads.pid)
@@ -134,7 +134,7 @@ class Onlooker:
 
     def overlooked(self, opened: Sequence[OpenFile]) -> OpenFile | None:
         """See `checkpoint.resources.signal_owners.overlooked`."""
-        return owners.overlooked(opened, self._kept.owners)
+        return signal_owners.overlooked(opened, self._kept.owners)
 
     def _with_contents(self, opened: Opened) -> tuple[OpenFile, ...]:
         with lending(self._tracee.pid):
@@ -185,7 +185,7 @@ class Onlooker:
         """
         tracee = self._tracee
         status = self._files.read("status")
-        mode = confinement.mode_in(status)
+        mode = seccomp.mode_in(status)
         confined = self._confinements.suspended(tracee, mode, (tracee.pid, 0))
         unread, *of_others = self._readings.read(
             [tracee, *self._threads.others], [self._files.descriptor("stat"), *self._others.name_files()]

@@ -26,7 +26,7 @@ from checkpoint.engines.ptrace.capture.memory_result import Taken, Unacknowledge
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.memory import digest_tracker, pagemap
-from checkpoint.linux.memory import tracker as tracking
+from checkpoint.linux.memory import tracker as memory_tracker
 from checkpoint.linux.memory.digest_tracker import SharedPages
 from checkpoint.linux.memory.guard_pages import Guards
 from checkpoint.linux.memory.remote_memory import Memory
@@ -379,14 +379,18 @@ class MemoryCapture:
     def shared_places(self) -> SharedPlaces:
         """The shared memory that this process tells all of, as `leave_out` takes it."""
         may_look = digest_tracker.may_look_into_mappings()  # of a file with a name each tells what it has in its page tables
-        told = (one for one in self.lines if tracking.is_shared_object(one) or (may_look and tracking.is_shared_anonymous(one)))
+        told = (
+            one
+            for one in self.lines
+            if memory_tracker.is_shared_object(one) or (may_look and memory_tracker.is_shared_anonymous(one))
+        )
         return frozenset(map(_place_of, told))
 
     def _sort_shared(self) -> None:
         self._shared_lines = [
             line
             for line in self.lines
-            if (tracking.is_shared(line) and not _is_within(line, self._told_elsewhere)) or tracking.is_orphan(line)
+            if (memory_tracker.is_shared(line) and not _is_within(line, self._told_elsewhere)) or memory_tracker.is_orphan(line)
         ]
 
     def refresh(self) -> None:
@@ -403,14 +407,14 @@ class MemoryCapture:
     def _sort(self) -> None:
         self._has_moved = True
         self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
-        self._private = [line for line in self.lines if tracking.is_private(line)]
+        self._private = [line for line in self.lines if memory_tracker.is_private(line)]
         self._sort_shared()
         self.has_rings = any(map(aio.is_ring, self._shared_lines))
         self.has_segments = any(map(system_v_memory.is_segment, self.lines))
-        self._followed = tracking.extents_of(self._private)
-        self._orphans = tracking.extents_of([line for line in self.lines if tracking.is_orphan(line)])
-        self._mapped = tracking.extents_of([line for line in self.lines if line.name not in tracking.NOT_CARRIED])
-        self._vdso = tracking.extents_of([line for line in self.lines if line.name == VDSO])
+        self._followed = memory_tracker.extents_of(self._private)
+        self._orphans = memory_tracker.extents_of([line for line in self.lines if memory_tracker.is_orphan(line)])
+        self._mapped = memory_tracker.extents_of([line for line in self.lines if line.name not in memory_tracker.NOT_CARRIED])
+        self._vdso = memory_tracker.extents_of([line for line in self.lines if line.name == VDSO])
 
     def _scan(self, *, everywhere: bool) -> Scan:
         """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
@@ -424,7 +428,7 @@ class MemoryCapture:
             return scan
         self._had_shared = bool(self._shared_lines)
         shared = self._shared.scan(self._shared_lines)
-        orphans = tracking.extents_of([line for line in self._shared_lines if tracking.is_orphan(line)])
+        orphans = memory_tracker.extents_of([line for line in self._shared_lines if memory_tracker.is_orphan(line)])
         # What the tracker says of orphans dates from before their file was deleted.
         cleared = page_set.difference(scan.cleared, orphans)
         return Scan(page_set.union(scan.written, shared.written), page_set.union(cleared, shared.cleared))

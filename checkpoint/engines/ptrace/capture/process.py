@@ -94,7 +94,7 @@ class CapturedProcess:
     Attributes:
         pid: by which it is looked at: its own, or its spokesman's, where its first thread has ended.
         ended_first: who tells of that; None where the first thread lives.
-        slot: see ``checkpoint.tree``.
+        slot: see `checkpoint.snapshot.process_tree`.
         born: when it began, which tells it from a later process with its pid.
         is_new: no snapshot tells of it yet.
     """
@@ -238,7 +238,7 @@ class CapturedProcess:
 
     def thread_states(self, look: Look) -> tuple[ThreadState, ...]:
         """Its threads, the first one first."""
-        living = thread_states(self.pid, look.standing)
+        living = thread_states(look.standing)
         if self.ended_first is None:
             return living
         return (self.ended_first.state(living[0], look.standing.status.tgids[-1], look.taken.lines), *living)

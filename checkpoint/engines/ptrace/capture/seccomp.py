@@ -15,7 +15,7 @@ from checkpoint.arch import cpu as arch
 from checkpoint.engines.ptrace.capture.syscall_restart import Interruptions
 from checkpoint.errors import CheckpointError, UnsupportedError
 from checkpoint.linux.spawn import bpf
-from checkpoint.linux.trace import seccomp as confinement
+from checkpoint.linux.trace import seccomp as trace_seccomp
 from checkpoint.linux.trace.seccomp import FILTERED, FREE, STRICT, Confinement
 from checkpoint.linux.trace.tracee import Tracee
 from checkpoint.resources.process import seccomp
@@ -27,8 +27,7 @@ Life = tuple[int, int]
 class Confinements:
     """Of one process."""
 
-    def __init__(self, pid: int, interruptions: Interruptions) -> None:
-        self._pid = pid
+    def __init__(self, interruptions: Interruptions) -> None:
         self._interruptions = interruptions
         self._known: dict[Life, Confinement] = {}
 
@@ -47,7 +46,7 @@ class Confinements:
         """
         if not mode:
             return FREE
-        if why := confinement.why_not():
+        if why := trace_seccomp.why_not():
             raise _unsupported(tracee.pid, seccomp.not_ours(why))
         tracee.suspend_filters()
         before = self._known.get(life)
@@ -61,11 +60,11 @@ class Confinements:
         if mode == STRICT:
             return Confinement(is_strict=True)
         try:
-            fresh = confinement.newer(tracee, len(before.filters)) if mode == FILTERED else ()
+            fresh = trace_seccomp.newer(tracee, len(before.filters)) if mode == FILTERED else ()
         except CheckpointError as error:
             raise _unsupported(tracee.pid, seccomp.untold(str(error))) from error
         for one in fresh:
-            if confinement.asks_another(one):
+            if trace_seccomp.asks_another(one):
                 raise _unsupported(tracee.pid, seccomp.ASKS_ANOTHER)
         return Confinement(filters=(*before.filters, *fresh))
 

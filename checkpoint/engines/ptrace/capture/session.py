@@ -34,8 +34,7 @@ from checkpoint.engines.ptrace.capture.memory import RunningCopy
 from checkpoint.engines.ptrace.capture.pages import Pages, joined, with_parcel
 from checkpoint.engines.ptrace.capture.process import CapturedProcess, Look
 from checkpoint.engines.ptrace.capture.tree import CapturedTree, MovedError, SeenOthers
-from checkpoint.engines.ptrace.facts import describe, memory_limits
-from checkpoint.engines.ptrace.facts import probe as probing
+from checkpoint.engines.ptrace.facts import describe, memory_limits, probe
 from checkpoint.engines.stream_output import Outputs
 from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError, let_go
 from checkpoint.linux import abi, system_v_ipc
@@ -52,7 +51,7 @@ from checkpoint.pages import page_set
 from checkpoint.pages.page_set import PageTable, Words
 from checkpoint.program import cpu_baseline, epoch_variable
 from checkpoint.resources import registry
-from checkpoint.resources.carried import capture as carried_trees
+from checkpoint.resources.carried import capture as carried_capture
 from checkpoint.resources.carried.capture import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.resources.ipc import system_v_memory
 from checkpoint.resources.open_file import OpenFile, Surroundings
@@ -144,9 +143,9 @@ class PtraceSession:
         try:
             if reasons := thread_credentials.refuse(pid, order.terms.owner):
                 raise UnsupportedError(f"cannot protect pid {pid}: {reasons[0]}", reasons)
-            surroundings = probing.surroundings_of(pid, order.streams, order.terms)
-            report = probing.probe(pid, surroundings, files_kept=order.names is not None)
-            trees = told_by_spokesman(pid, lambda tid: carried_trees.followed(tid, order.terms))
+            surroundings = probe.surroundings_of(pid, order.streams, order.terms)
+            report = probe.probe(pid, surroundings, files_kept=order.names is not None)
+            trees = told_by_spokesman(pid, lambda tid: carried_capture.followed(tid, order.terms))
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
                 raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
@@ -232,7 +231,7 @@ class PtraceSession:
             self._tell_epoch(order.epoch)
         try:
             if self._carried:
-                self._carried.prepare(carried_trees.mapped_shared(self._first.pid))
+                self._carried.prepare(carried_capture.mapped_shared(self._first.pid))
             frozen = self._frozen(order, base=parent is None, may_stay=may_stay)
         except CaptureError as error:
             explained = self._explained(error)
@@ -266,7 +265,7 @@ class PtraceSession:
                 return False
         except ProcessGoneError:
             return False
-        self._refuse(probing.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept))
+        self._refuse(probe.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept))
         first = CapturedProcess.entered_first(self.pid, self._first.order)
         self._first.close()
         self._first = first
@@ -317,7 +316,7 @@ class PtraceSession:
     def _look_from_outside(self) -> None:
         """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
-            reasons = probing.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept)
+            reasons = probe.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept)
             self._refuse(
                 (*thread_credentials.refuse(self.pid, self._owner), *reasons, *(self._carried.refuse() if self._carried else ()))
             )

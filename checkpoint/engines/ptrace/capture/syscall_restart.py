@@ -163,7 +163,7 @@ class Interruptions:
     def __init__(self, *, makes_again: bool = False) -> None:
         """
         Args:
-            makes_again: the program makes calls that EINTR has ended again itself (`waits.makes_calls_again`).
+            makes_again: the program makes calls that EINTR has ended again itself (`eintr_syscalls.makes_calls_again`).
         """
         self._makes_again = makes_again
         self._by_tid: dict[int, Interruption] = {}

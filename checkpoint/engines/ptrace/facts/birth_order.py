@@ -330,11 +330,11 @@ class _Plan(Struct):
     def _give_all(self) -> None:
         """Have those born that were given to their parents, as far as somebody of their session is there."""
         while self.given:
-            parent, child = next((one for one in self.given if self._can_give(*one)), self.given[0])
+            parent, child = next((one for one in self.given if self._can_give(one[1])), self.given[0])
             self.given.remove((parent, child))
             self._give(parent, child)
 
-    def _can_give(self, parent: int, child: Person) -> bool:
+    def _can_give(self, child: Person) -> bool:
         session = self._needed(child)
         return session not in self._everybody or session in self.session
 

@@ -26,8 +26,7 @@ from checkpoint.linux.trace.entry import leftovers
 from checkpoint.program import cpu_baseline
 from checkpoint.resources import refusals, registry, shared_descriptions
 from checkpoint.resources.events import aio
-from checkpoint.resources.ipc import pseudo_terminals, system_v_memory
-from checkpoint.resources.ipc import standard_streams as streams
+from checkpoint.resources.ipc import pseudo_terminals, standard_streams, system_v_memory
 from checkpoint.resources.open_file import Held, Kin, Opened, OpenFile, Surroundings
 from checkpoint.resources.process import refused_threads
 from checkpoint.resources.survey import gather, glance, look, pipes_of
@@ -152,7 +151,9 @@ def _kin(pid: int, first: int, *, is_guarded: bool) -> tuple[int, ...]:
 
 def _looked(opened: shared_descriptions.OpenedByAll, first: int, surroundings: Surroundings) -> dict[int, Held]:
     """What each process has open, sorted into the kinds."""
-    around = replace(surroundings, pipes={**streams.of_first(opened[first], surroundings), **surroundings.pipes}, is_first=False)
+    around = replace(
+        surroundings, pipes={**standard_streams.of_first(opened[first], surroundings), **surroundings.pipes}, is_first=False
+    )
     return {pid: look(held, surroundings if pid == first else around) for pid, held in opened.items()}
 
 

@@ -25,8 +25,6 @@ CLOCK_BOOTTIME: Final = 7
 INTERVAL_TIMER_COUNT: Final = 3
 CHILD_SIZE: Final = 32
 """Bytes of a siginfo that waitid(2) writes: signal, error, code, four unused, pid, uid, status. Source: kernel/exit.c."""
-TIMER_LIMIT: Final = 40
-"""POSIX timers that one batch has room for."""
 
 
 class Told(Struct, frozen=True):

@@ -35,7 +35,7 @@ from checkpoint.model import FileIdentity, Resource, Snapshot
 from checkpoint.program import cpu_baseline
 from checkpoint.resources import rebuild
 from checkpoint.resources.carried import restore
-from checkpoint.resources.devices import by_rule as attached_devices
+from checkpoint.resources.devices import by_rule as devices_by_rule
 from checkpoint.resources.events import aio
 from checkpoint.resources.files import other_writers, overmounted, proc_and_sys
 from checkpoint.resources.restore_context import number_of
@@ -339,12 +339,10 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str],
             yield from (reason + damage for reason in reasons)
 
 
-def of_mapped_files(
-    state: Snapshot, options: RestoreOptions, digest_of: DigestOf = digest_of_file
-) -> tuple[tuple[str, ...], dict[str, str]]:
+def of_mapped_files(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], dict[str, str]]:
     """Why its executable, or what it maps, cannot be had here; and the contents to open for what was brought along, by path."""
     brought: dict[str, str] = {}
-    return tuple(_of_files(state, options, brought, digest_of)), brought
+    return tuple(_of_files(state, options, brought, digest_of_file)), brought
 
 
 def _content(options: RestoreOptions, digest: bytes, digest_of: DigestOf) -> tuple[str, str]:
@@ -407,8 +405,8 @@ def _of_descriptors(state: Snapshot, options: RestoreOptions, brought: dict[str,
                 brought[path] = content
             else:
                 yield from (reason + damage for reason in reasons)
-        elif held.kind == attached_devices.KIND:
-            yield from attached_devices.mismatches(held, options.terms.devices)
+        elif held.kind == devices_by_rule.KIND:
+            yield from devices_by_rule.mismatches(held, options.terms.devices)
         elif "handle" in held.facts and options.own_eyes:
             yield overmounted.refuse_user(held)
         elif held.kind in rebuild.NEEDED:

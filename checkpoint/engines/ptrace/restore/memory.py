@@ -77,7 +77,7 @@ def move_kernel_pages(table: CallTable, vessel: Sequence[MapsLine], program: Seq
     """Move the vdso and its data to where the program has them; where the vdso lies then.
 
     Args:
-        program: empty where it has another kernel's (`restore_vdso`): they stay in the refuge.
+        program: empty where it has another kernel's (`checkpoint.engines.ptrace.restore.vdso`): they stay in the refuge.
         refuge: an address with room for all of them in a hole; they go there first, so that old and new places may overlap.
     """
     places = []

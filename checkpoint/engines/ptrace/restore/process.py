@@ -30,9 +30,9 @@ from checkpoint.arch import extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines.ptrace.facts import prctl_state
 from checkpoint.engines.ptrace.restore import checks, mapping_kinds, process_state, stopped_children, vdso_syscalls
-from checkpoint.engines.ptrace.restore import memory as restore_memory
-from checkpoint.engines.ptrace.restore import threads as restore_threads
-from checkpoint.engines.ptrace.restore import vdso as restore_vdso
+from checkpoint.engines.ptrace.restore import memory as restored_memory
+from checkpoint.engines.ptrace.restore import threads as restored_threads
+from checkpoint.engines.ptrace.restore import vdso as restored_vdso
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
 from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel, pending_traps
@@ -70,7 +70,7 @@ from checkpoint.resources.process.exited_processes import Departed
 from checkpoint.resources.rebuild import deleted_directory, open_here, rebuild_all, rebuild_last
 from checkpoint.resources.restore_context import number_of
 from checkpoint.runtime import parallel
-from checkpoint.snapshot import credentials as rights
+from checkpoint.snapshot import credentials as snapshot_credentials
 
 OPTIONS: Final = abi.PTRACE_O_EXITKILL | abi.PTRACE_O_TRACESYSGOOD | abi.PTRACE_O_TRACEEXEC | abi.PTRACE_O_TRACECLONE
 
@@ -84,7 +84,7 @@ REFUGE_SIZE: Final = 1 << 20
 
 
 class Estate(Struct, frozen=True):
-    """What a process of a component of several finds when it is born, and shares with others (`restore_tree`).
+    """What a process of a component of several finds when it is born, and shares with others (`tree`).
 
     Attributes:
         base, size: the stretch of addresses that is ours in all of them; the stub lies at its beginning.
@@ -140,7 +140,7 @@ class ProcessRestore:
         options: RestoreOptions,
         brought: Brought,
         estate: Estate | None = None,
-        legacy: Legacy = restore_memory.NOTHING,
+        legacy: Legacy = restored_memory.NOTHING,
         source: PageSource | None = None,
     ) -> None:
         self._source = source
@@ -153,7 +153,7 @@ class ProcessRestore:
         self._estate = estate
         self._thread = state.threads[0]
         self._filters_of_all = seccomp.of_all(state.resources, [thread.tid for thread in state.threads])
-        shared = restore_memory.extents_shared(state.vmas, options.terms)
+        shared = restored_memory.extents_shared(state.vmas, options.terms)
         self._untouched = page_set.union(clean_private_pages.of(state.resources), shared)
         self._tracee = tracee
         self._others: list[tuple[Tracee, ThreadState]] = []
@@ -167,7 +167,7 @@ class ProcessRestore:
 
     def end(self) -> None:
         """Kill what will be no program."""
-        restore_threads.end(self._tracee, [tracee for tracee, _ in self._others])
+        restored_threads.end(self._tracee, [tracee for tracee, _ in self._others])
         self._segments.undo()
 
     def held(self) -> Threads:
@@ -212,11 +212,11 @@ class ProcessRestore:
 
     def _adapt(self, mappings: tuple[procfs.MapsLine, ...]) -> None:
         """Have a program of another kernel use this one's vdso."""
-        ours = restore_memory.kernel_pages(mappings)
-        if restore_vdso.fits(self._state, ours):
+        ours = restored_memory.kernel_pages(mappings)
+        if restored_vdso.fits(self._state, ours):
             return
         image = self._tracee.memory.read(ours[-1].start, ours[-1].size)
-        self._state, self._foreign = restore_vdso.with_own_image(self._state)
+        self._state, self._foreign = restored_vdso.with_own_image(self._state)
         self._own_functions = vdso.functions(image)
 
     def _require_identity(self, vessel: Vessel) -> None:
@@ -271,7 +271,7 @@ class ProcessRestore:
         state = self._state
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
         self._segments.make(state.resources)
-        shared_size = sum(restore_memory.anonymous_sizes(state.vmas).values())
+        shared_size = sum(restored_memory.anonymous_sizes(state.vmas).values())
         return self._estate.base if self._estate else call_table.find_hole(taken, AREA_SIZE + REFUGE_SIZE + shared_size)
 
     def _later_tables(self, base: int, descriptors: set[int], vessel: Vessel) -> LaterTables:
@@ -295,7 +295,7 @@ class ProcessRestore:
 
     def _lay_stub(self, base: int, mappings: tuple[procfs.MapsLine, ...], size: int) -> None:
         self._stub = Stub(self._tracee, base)
-        image = restore_memory.kernel_pages(mappings)[-1]
+        image = restored_memory.kernel_pages(mappings)[-1]
         if self._estate is None:
             self._stub.install(vdso_syscalls.instruction_in(self._tracee.memory, image.start, image.size), size)
         self._area_size = self._estate.size if self._estate else size
@@ -307,20 +307,20 @@ class ProcessRestore:
         self.notes += self._segments.notes
         if self._rings:
             self._make_rings(self._stub, self._rings, first.descriptors)
-        restore_threads.open_what_is_left(self._tracee, self._start_registers, self._stub, self._ended, first.descriptors)
+        restored_threads.open_what_is_left(self._tracee, self._start_registers, self._stub, self._ended, first.descriptors)
         threads = parallel.thread_count()
         memory, state = self._tracee.memory, self._state
         if self._source is not None:
-            restore_memory.fill_from(memory, state, self._source, self._legacy, self._untouched, threads)
+            restored_memory.fill_from(memory, state, self._source, self._legacy, self._untouched, threads)
         else:
-            restore_memory.fill(memory, state, self._legacy, self._untouched, threads)
+            restored_memory.fill(memory, state, self._legacy, self._untouched, threads)
 
     def _complete(self, later: LaterTables) -> None:
         """Everything but mappings and pages, which are there."""
         tracee, state = self._tracee, self._state
         if self._own_functions:
             self._leave_old_vdso()
-            tracee.memory.write_each(restore_vdso.jumps(state, self._content_at, self._vdso, self._own_functions))
+            tracee.memory.write_each(restored_vdso.jumps(state, self._content_at, self._vdso, self._own_functions))
         if self._options.epoch:
             layout = state.process.layout
             epoch_variable.renew(tracee.memory, layout.env_start, layout.env_end, self._options.epoch)
@@ -347,7 +347,7 @@ class ProcessRestore:
         """Lead whatever thread stands in the middle of another kernel's vdso out of it."""
         if not self._foreign:
             return
-        threads = restore_vdso.led_out(self._tracee, self._calls_of_vdso(), self._foreign, self._state.threads)
+        threads = restored_vdso.led_out(self._tracee, self._calls_of_vdso(), self._foreign, self._state.threads)
         self._state = replace(self._state, threads=threads)
         self._thread = threads[0]
 
@@ -360,18 +360,18 @@ class ProcessRestore:
         self._make_directories(table)
         if self._estate is not None:
             process_state.begin_member(table)
-        restore_memory.clear(table, mappings, self._legacy)
-        ours, theirs = restore_memory.kernel_pages(mappings), restore_memory.kernel_pages_of(vmas)
-        self._vdso = restore_memory.move_kernel_pages(table, ours, theirs, refuge)
+        restored_memory.clear(table, mappings, self._legacy)
+        ours, theirs = restored_memory.kernel_pages(mappings), restored_memory.kernel_pages_of(vmas)
+        self._vdso = restored_memory.move_kernel_pages(table, ours, theirs, refuge)
         self._vdso_size = ours[-1].size
         mapping_kinds.allocate_keys(table, mapping_kinds.keys_of(self._state))
         self.notes += mapping_kinds.ordinary_by_now(vmas)
         attached = [vma for vma in vmas if system_v_memory.is_segment(vma)]
         system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
-        sizes = {} if self._estate else restore_memory.anonymous_sizes(vmas)
-        ours_alone = restore_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
+        sizes = {} if self._estate else restored_memory.anonymous_sizes(vmas)
+        ours_alone = restored_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
         inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
-        self._objects |= restore_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy, self._untouched)
+        self._objects |= restored_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy, self._untouched)
         self._objects |= inherited[0]
         for key, place in ours_alone.items():
             table.call("unmap shared memory, which is mapped elsewhere now", "munmap", place, sizes[key])
@@ -399,7 +399,7 @@ class ProcessRestore:
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         process, thread = self._state.process, self._thread
-        restore_memory.settle(table, self._state.vmas, self._carried())
+        restored_memory.settle(table, self._state.vmas, self._carried())
         process_state.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
@@ -448,7 +448,7 @@ class ProcessRestore:
     def _thread_table(self, table: CallTable, thread: ThreadState, vessel: Vessel) -> CallTable:
         """What each thread must say for itself; its notes about rights are those of the first."""
         process = self._state.process
-        credentials = rights.of_thread(self._state.resources, thread.tid, process.credentials)
+        credentials = snapshot_credentials.of_thread(self._state.resources, thread.tid, process.credentials)
         process_state.thread_marks(table, thread)
         process_state.scheduling(table, thread, vessel, f" for thread {thread.tid} ({thread.name})")
         scheduling.rebuild(table, self._state.resources, thread.tid, bool(thread.policy & os.SCHED_RESET_ON_FORK))
@@ -469,7 +469,7 @@ class ProcessRestore:
     def _start_threads(self, base: int, tables: list[CallTable]) -> None:
         """Give birth to the other threads, and have each make the calls of its table."""
         for thread in self._state.threads[1:]:
-            born = restore_threads.spawn(self._tracee, self._start_registers, base, thread.tid)
+            born = restored_threads.spawn(self._tracee, self._start_registers, base, thread.tid)
             self._others.append((born, thread))
         if self._others and not self.has_table_of_parent:
             table = CallTable(base, descriptors=set(open_here(self._state)))
@@ -546,7 +546,7 @@ class ProcessRestore:
         """Bytes of the program's memory as it was captured; None where no page is carried."""
         if self._source is not None:
             return self._source.content_at(address, size)
-        return restore_memory.content_at(self._state, address, size)
+        return restored_memory.content_at(self._state, address, size)
 
 
 def _write_oom_score(pid: int, score: int, notes: list[str]) -> None:

@@ -28,7 +28,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.trace.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Credentials, IntervalTimer, PosixTimer, ProcessState, SignalAction, ThreadState
 from checkpoint.resources.files import proc_and_sys, unlinked
-from checkpoint.resources.process import scheduling as deadlines
+from checkpoint.resources.process import scheduling as thread_scheduling
 
 _NO_FILE: Final = 0xFFFFFFFF
 _MM_MAP: Final = struct.Struct("<12Q2I")
@@ -159,7 +159,7 @@ def memory_layout(table: CallTable, process: ProcessState, *, with_executable: b
 
 
 def signal_actions(table: CallTable, actions: Iterable[SignalAction]) -> None:
-    """Set what every signal does, but SIGTRAP: the table's own end resets that one, see `signal_action`."""
+    """Set what every signal does, but SIGTRAP: the table's own end resets that one, see `trap_action`."""
     for action in actions:
         if action.signal not in (*_UNCHANGEABLE, _SIGTRAP):
             what = f"set the action of signal {action.signal}"
@@ -241,7 +241,7 @@ def scheduling(table: CallTable, thread: ThreadState, vessel: Vessel, whose: str
         whose: added to the notes.
     """
     table.attempt(f"nice {thread.nice} is not kept{whose}", "setpriority", 0, 0, thread.nice)
-    if thread.policy & ~os.SCHED_RESET_ON_FORK != deadlines.SCHED_DEADLINE and thread.policy:
+    if thread.policy & ~os.SCHED_RESET_ON_FORK != thread_scheduling.SCHED_DEADLINE and thread.policy:
         priority = table.place(struct.pack("<i", thread.priority))
         table.attempt(f"scheduling policy {thread.policy} is not kept{whose}", "sched_setscheduler", 0, thread.policy, priority)
     allowed = vessel.affinity & set(thread.affinity)
@@ -346,7 +346,7 @@ def make_directories(table: CallTable, directories: Iterable[str]) -> None:
 
 
 def enter_directory(table: CallTable, directory: str, opened: int | None) -> None:
-    """Make a directory the working one; one that is gone is made again, and goes again; `departed` has entered one of /proc.
+    """Make a directory the working one; one that is gone is made again, and goes again; `exited_processes` has entered /proc's.
 
     Args:
         opened: a descriptor that the program has of it, if it is gone.
@@ -388,7 +388,7 @@ def surroundings(table: CallTable, process: ProcessState) -> None:
     table.call("set the umask", "umask", process.umask)
     table.call("set the execution domain", "personality", process.personality)
     if process.sid == process.pid:
-        table.attempt("", "setsid")  # of several processes each has come to its session when it was born (`births`)
+        table.attempt("", "setsid")  # of several processes each has come to its session when it was born (`birth_order`)
     elif process.pgid == process.pid:
         table.attempt("", "setpgid", 0, 0)
     if process.child_subreaper:

@@ -28,7 +28,7 @@ from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from checkpoint.model import Position, Snapshot
 from checkpoint.resources.carried import file_numbers
-from checkpoint.resources.carried import restore as laying
+from checkpoint.resources.carried import restore as carried_restore
 from checkpoint.resources.sockets import tcp_handover
 from checkpoint.resources.sockets.tcp_handover import Arriving
 from checkpoint.snapshot import carried_files, credentials
@@ -81,7 +81,7 @@ def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOption
     if program is not state:
         options = replace(options, accept_changed=(*options.accept_changed, *carried_files.every_path(state)))
     brought = checks.require(program, options, vessel_pid)
-    laid = laying.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
+    laid = carried_restore.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
     program, _ = file_numbers.renewed(program, laid.identities)
     arriving, program = tcp_handover.arriving(program, wanted=options.stood_still)
     try:

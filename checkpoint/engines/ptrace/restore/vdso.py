@@ -62,7 +62,7 @@ def fits(state: Snapshot, ours: Sequence[MapsLine]) -> bool:
     """Whether this kernel's vdso can stand where the program had its own: the same code, laid out alike.
 
     Args:
-        ours: of a process here, as `restore_memory.kernel_pages` finds them.
+        ours: of a process here, as `checkpoint.engines.ptrace.restore.memory.kernel_pages` finds them.
     """
     alike = [line.size for line in ours] == [vma.size for vma in kernel_pages_of(state.vmas)]
     return alike and state.machine.vdso_digest == this_machine().vdso_digest

@@ -22,7 +22,7 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint.engines.ptrace.restore import memory as restore_memory
+from checkpoint.engines.ptrace.restore import memory as restored_memory
 from checkpoint.engines.ptrace.restore.memory import KERNEL_KINDS, Carried, Object, first_protection, is_file_mapping
 from checkpoint.errors import RestoreError
 from checkpoint.linux.memory.remote_memory import Memory
@@ -113,11 +113,11 @@ class Change(Struct, frozen=True):
 
         Args:
             brought: descriptors of what is mapped in place of this machine's files, by path.
-            objects, anonymous: memory that several processes share, as `restore_memory.map_program` takes it.
+            objects, anonymous: memory that several processes share, as `map_program` takes it.
         """
         for start, end in self.gone.tolist():
             table.call(f"unmap {start:#x} of the copy", "munmap", start, end - start)
-        restore_memory.map_program(table, self.fresh, self.carried, brought, objects, anonymous)
+        restored_memory.map_program(table, self.fresh, self.carried, brought, objects, anonymous)
         for advice, extents in ((MADV_DONTNEED, self.dropped), (MADV_REMOVE, self.removed)):
             for start, end in extents.tolist():
                 table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, advice)
@@ -136,7 +136,7 @@ def _is_partly(vma: Vma, some: Words) -> bool:
 
 def is_of_object(vma: Vma) -> bool:
     """Whether it shows memory that several processes may share, and that stays when it is unmapped here."""
-    return restore_memory.is_anonymous_object(vma) or restore_memory.is_object_mapping(vma)
+    return restored_memory.is_anonymous_object(vma) or restored_memory.is_object_mapping(vma)
 
 
 def held_of_objects(vmas: Iterable[Vma], held: Words) -> dict[Object, Words]:
@@ -145,7 +145,7 @@ def held_of_objects(vmas: Iterable[Vma], held: Words) -> dict[Object, Words]:
     for vma in filter(is_of_object, vmas):
         part = page_set.intersection(held, _extents([vma]))
         if len(part):
-            key = restore_memory.object_of(vma)
+            key = restored_memory.object_of(vma)
             found[key] = page_set.union(found.get(key, NO_PAGES), part - np.uint64(vma.start) + np.uint64(vma.offset))
     return found
 
@@ -165,7 +165,7 @@ def backing(vma: Vma) -> Backing:
     if is_file_mapping(vma):
         assert vma.file is not None
         return vma.file.path, vma.file.device, vma.file.inode, vma.start - vma.offset, *marks
-    of_object = restore_memory.object_of(vma) if is_of_object(vma) else None
+    of_object = restored_memory.object_of(vma) if is_of_object(vma) else None
     return vma.shared, vma.start - vma.offset if vma.shared else 0, of_object, *marks
 
 

@@ -86,7 +86,7 @@ class MemberCopy(ReadyCopy):
 
     @property
     def held_of_objects(self) -> dict[Object, Words]:
-        """See `copy_mappings.held_of_objects`."""
+        """See `mappings.held_of_objects`."""
         return held_of_objects(self._state.vmas, self._extents)
 
     def lay_among(self, descriptors: Iterable[int]) -> None:

@@ -291,11 +291,17 @@ def test_a_program_that_its_lease_has_frozen_can_be_captured_when_it_is_held_for
 # The agent's death
 
 
+def guard_socket(component: Component, places: Places) -> Path:
+    """Where its guard listens."""
+    return places.sockets / component._guard._whom.removeprefix("the guard at ")
+
+
 def test_an_agent_that_comes_back_finds_its_component_by_the_socket(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
         component = await launch.start(NAME, program(COUNT), places)
         component.close()  # all that an agent leaves when it is killed: closed sockets
-        (path,) = [path for path in guard_sockets(places) if path == component._guard.socket_path]
+        path = guard_socket(component, places)
+        assert path in guard_sockets(places)
         again = await launch.reconnect(path, places)
         try:
             assert (again.name, again.pid) == (NAME, component.pid)
@@ -313,7 +319,7 @@ def test_an_agent_that_comes_back_finds_its_component_by_the_socket(tmp_path: Pa
 def test_an_agent_that_comes_back_too_late_is_told_how_it_ended(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
         component = await launch.start(NAME, program("import os; os._exit(5)"), places)
-        path = component._guard.socket_path
+        path = guard_socket(component, places)
         component.close()
         again = await launch.reconnect(path, places)
         assert await again.ended == 5 << 8
@@ -331,7 +337,7 @@ def test_a_restore_that_nobody_resumes_leaves_nothing(tmp_path: Path) -> None:
             captures = Captures(first)
             await captures.take()
         second = await launch.restore(NAME, captures.chain, places, outage_ns=0)
-        pid, path = second.pid, second._guard.socket_path
+        pid, path = second.pid, guard_socket(second, places)
         second.close()
         await until(lambda: not lives(pid) and not path.exists(), "vessel and guard to end")
         captures.close()
@@ -401,7 +407,7 @@ def test_a_program_that_was_released_runs_on_unprotected(tmp_path: Path) -> None
         await captures.take()
         captures.close()
         await component.release()
-        pid, path = component.pid, component._guard.socket_path
+        pid, path = component.pid, guard_socket(component, places)
         await more(component)
         counted(output(component))
         assert not path.exists()

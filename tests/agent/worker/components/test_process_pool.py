@@ -10,7 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
-from agent.worker.components import process_pool as nursery_module
+from agent.worker.components import process_pool
 from agent.worker.components.process_pool import Nursery
 
 PATIENCE_S = 60.0
@@ -58,13 +58,13 @@ def test_with_the_first_guard_that_is_given_a_keeper_is_born(tmp_path: Path) -> 
         await until({"agent.guard.server": 1, "keeper": 1})
         nursery.expect(0)
         await until({"agent.guard.server": 2, "keeper": 1})  # one more than the one that was given
-        guard.dialogue.close()
+        guard.close()
 
     live(tmp_path, story)
 
 
 def test_what_has_a_ready_copy_needs_no_pair_besides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nursery_module, "REFILL_S", 0.0)
+    monkeypatch.setattr(process_pool, "REFILL_S", 0.0)
 
     async def story(nursery: Nursery) -> None:
         for name in ("one", "other"):

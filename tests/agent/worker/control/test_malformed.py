@@ -20,7 +20,7 @@ from agent.guard import messages as guard_messages
 from agent.worker.components import prerequisites
 from agent.worker.control.arguments import ProtectArguments, RunArguments, StopArguments, arguments_of
 from agent.worker.network.remote_orders import Errands
-from checkpoint.keeper import messages as channel
+from checkpoint.keeper import messages as keeper_messages
 from checkpoint.keeper.messages import Channel, ChannelError
 from checkpoint.model import Position
 from failover.core.types import ComponentSpec
@@ -75,10 +75,10 @@ def test_a_bulk_message_of_hostile_form_is_none(body: bytes) -> None:
 # --- Local sockets: keeper, guard, lanes ---
 
 
-KINDS = [channel.Request, channel.Reply, guard_messages.Request, guard_messages.Reply]
+KINDS = [keeper_messages.Request, keeper_messages.Reply, guard_messages.Request, guard_messages.Reply]
 WHOLE = [
-    channel.Protect(7, "/lab/a"),
-    channel.Captured(Position(1, 1, b""), None, 10, 10, 10),
+    keeper_messages.Protect(7, "/lab/a"),
+    keeper_messages.Captured(Position(1, 1, b""), None, 10, 10, 10),
     guard_messages.Start("/lab/a", (b"bc",), (b"A=B",), b"/", 18, True, "/logs"),
     guard_messages.Refused("no"),
 ]
@@ -86,12 +86,12 @@ WHOLE = [
 
 @pytest.mark.parametrize(("incoming", "message"), list(zip(KINDS, WHOLE, strict=True)), ids=["asked", "told", "guard", "guarded"])
 def test_a_damaged_packet_is_a_message_or_an_error(incoming: Any, message: msgspec.Struct) -> None:
-    ours, theirs = channel.pair()
+    ours, theirs = keeper_messages.pair()
     receiver: Channel[Any] = Channel(theirs, incoming)
     theirs.setblocking(False)
 
     @settings(max_examples=100, deadline=None)
-    @given(damaged(channel.INLINE + msgspec.msgpack.encode(message)).filter(bool))
+    @given(damaged(keeper_messages.INLINE + msgspec.msgpack.encode(message)).filter(bool))
     def received(packet: bytes) -> None:
         ours.send(packet)
         with contextlib.suppress(ChannelError):  # any other error is a mistake
@@ -106,18 +106,18 @@ def memory_file(content: bytes, seal: bool) -> int:
     descriptor = os.memfd_create("message", os.MFD_ALLOW_SEALING)
     os.write(descriptor, content)
     if seal:
-        channel.seal(descriptor)
+        keeper_messages.seal(descriptor)
     return descriptor
 
 
 def huge() -> int:
     descriptor = os.memfd_create("message", os.MFD_ALLOW_SEALING)
     os.truncate(descriptor, 1 << 40)
-    channel.seal(descriptor)
+    keeper_messages.seal(descriptor)
     return descriptor
 
 
-BODY = msgspec.msgpack.encode(channel.Probe(7))
+BODY = msgspec.msgpack.encode(keeper_messages.Probe(7))
 FILES: dict[str, Callable[[], int]] = {
     "not sealed": lambda: memory_file(BODY, seal=False),
     "a terabyte": huge,
@@ -129,12 +129,12 @@ FILES: dict[str, Callable[[], int]] = {
 
 @pytest.mark.parametrize("file", FILES)
 def test_a_message_in_a_file_that_is_none_is_refused_and_its_descriptors_are_closed(file: str) -> None:
-    ours, theirs = channel.pair()
-    receiver: Channel[Any] = Channel(theirs, channel.Request)
+    ours, theirs = keeper_messages.pair()
+    receiver: Channel[Any] = Channel(theirs, keeper_messages.Request)
     descriptors = [FILES[file](), os.open("/dev/null", os.O_RDONLY)]
     with ours:
-        ours.sendmsg([channel.IN_MEMFD], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))])
-        channel.close_all(tuple(descriptors))
+        ours.sendmsg([keeper_messages.IN_MEMFD], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))])
+        keeper_messages.close_all(tuple(descriptors))
         before = len(os.listdir("/proc/self/fd"))
         with pytest.raises(ChannelError, match="no message"):
             receiver.receive()
@@ -143,11 +143,12 @@ def test_a_message_in_a_file_that_is_none_is_refused_and_its_descriptors_are_clo
 
 
 @pytest.mark.parametrize(
-    "packet", [b"\x07" + BODY, channel.IN_MEMFD + BODY, channel.IN_MEMFD, channel.INLINE, b"\x00" + DEEP[:60_000]]
+    "packet",
+    [b"\x07" + BODY, keeper_messages.IN_MEMFD + BODY, keeper_messages.IN_MEMFD, keeper_messages.INLINE, b"\x00" + DEEP[:60_000]],
 )
 def test_a_packet_of_no_known_form_is_refused(packet: bytes) -> None:
-    ours, theirs = channel.pair()
-    receiver: Channel[Any] = Channel(theirs, channel.Request)
+    ours, theirs = keeper_messages.pair()
+    receiver: Channel[Any] = Channel(theirs, keeper_messages.Request)
     with ours:
         ours.send(packet)
         with pytest.raises(ChannelError, match="no message"):

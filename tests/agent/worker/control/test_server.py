@@ -18,7 +18,7 @@ import pytest
 
 from agent.errors import RefusedError
 from agent.worker.control import quotas
-from agent.worker.control import server as control
+from agent.worker.control import server as control_server
 from agent.worker.control.quotas import Admission
 from agent.worker.control.server import ControlServer, Conversation
 from failover.client.control import LENGTH, REQUEST_LIMIT, Control, Refused, Reply, Request, Result
@@ -170,7 +170,7 @@ def test_bytes_of_requests_are_counted_until_they_are_answered() -> None:
 
 
 def test_a_connection_without_a_request_is_hung_up_on_with_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control, "IDLE_S", 0.05)
+    monkeypatch.setattr(control_server, "IDLE_S", 0.05)
 
     async def body() -> None:
         async with server() as path:
@@ -182,7 +182,7 @@ def test_a_connection_without_a_request_is_hung_up_on_with_a_word(monkeypatch: p
 
 @pytest.mark.parametrize("begun", [b"\0", LENGTH.pack(100), LENGTH.pack(100) + b"half"])
 def test_a_request_that_was_begun_must_come_to_its_end(monkeypatch: pytest.MonkeyPatch, begun: bytes) -> None:
-    monkeypatch.setattr(control, "REQUEST_S", 0.05)
+    monkeypatch.setattr(control_server, "REQUEST_S", 0.05)
 
     async def body() -> None:
         async with server() as path:
@@ -194,8 +194,8 @@ def test_a_request_that_was_begun_must_come_to_its_end(monkeypatch: pytest.Monke
 
 
 def test_who_waits_for_an_answer_may_wait_as_long_as_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control, "IDLE_S", 0.05)
-    monkeypatch.setattr(control, "REQUEST_S", 0.05)
+    monkeypatch.setattr(control_server, "IDLE_S", 0.05)
+    monkeypatch.setattr(control_server, "REQUEST_S", 0.05)
 
     async def body() -> None:
         async with server() as path:
@@ -223,7 +223,7 @@ def test_requests_one_after_another_on_one_connection_are_served() -> None:
 
 
 def test_a_client_that_was_hung_up_on_hears_why_at_its_next_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control, "IDLE_S", 0.05)
+    monkeypatch.setattr(control_server, "IDLE_S", 0.05)
 
     def late(path: Path) -> str:
         with Control.open(path) as agent:

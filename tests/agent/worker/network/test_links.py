@@ -22,7 +22,7 @@ def scene(*links: KernelLink) -> Scene:
 
 
 def interface(index: int, name: str, *, hardware: int = ETHERNET, kind: str = "", lower: int = 0, master: int = 0) -> KernelLink:
-    return KernelLink(index, name, hardware, kind, lower, master, up=True, carrier=True)
+    return KernelLink(index, name, hardware, kind, lower, master, carrier=True)
 
 
 class Sysfs:
@@ -135,7 +135,7 @@ def test_a_pulled_cable_is_said_once_and_again_when_it_is_back(sysfs: Sysfs, mon
         "beats travel over wlan0, which is wired",
     ]
     assert links.hindrance() == ""
-    at(monkeypatch, KernelLink(2, "eth0", ETHERNET, up=True, carrier=False), air)
+    at(monkeypatch, KernelLink(2, "eth0", ETHERNET, carrier=False), air)
     assert links.refresh() == ["eth0 has no carrier any more (is its cable out?): it carried snapshots, orders and beats"]
     assert links.refresh() == []
     assert links.hindrance() == "eth0, which carries snapshots, has no carrier: is its cable out?"

@@ -28,7 +28,7 @@ from checkpoint.linux.procfs import mounts, procfs
 from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.linux.procfs.descriptors import descriptor as procfs_descriptor
 from checkpoint.resources.events import aio, eventfd
-from checkpoint.resources.events import timerfd as timerfds
+from checkpoint.resources.events import timerfd as timerfd_kind
 from checkpoint.resources.files import overmounted
 from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.restore_context import number_of
@@ -131,7 +131,7 @@ def test_a_timer_that_goes_off_between_two_questions_has_gone_off(interval_ms: i
         assert seen is not None and "ticks: 0" in seen.text
         arm(timer, 20, interval_ms)
         time.sleep(0.07)
-        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        found = timerfd_kind.observe(OpenFile(os.getpid(), (seen,)), ())
         assert found["ticks"] == ticks or (interval_ms and number_of(found["ticks"]) > ticks)
         assert (number_of(found["value_ns"]) > 0) == bool(interval_ms)
     finally:
@@ -144,7 +144,7 @@ def test_a_timer_that_has_not_gone_off_has_all_that_is_left(interval_ms: int) ->
     try:
         seen = procfs_descriptor(os.getpid(), timer)
         assert seen is not None
-        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        found = timerfd_kind.observe(OpenFile(os.getpid(), (seen,)), ())
         assert found["ticks"] == 0 and 0 < number_of(found["value_ns"]) <= 50_000_000_000
     finally:
         os.close(timer)
@@ -154,22 +154,22 @@ def test_a_periodic_timer_that_is_due_and_has_not_gone_off_yet_is_not_taken_for_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The kernel says of both that nothing is left: it notes that one goes off a moment after it should, on a busy machine."""
-    genuine = timerfds._times
+    genuine = timerfd_kind._times
 
     def of_a_late_one(timer: int) -> tuple[int, int, int]:
         interval_ns, value_ns, asked_ns = genuine(timer)
         return interval_ns, 0 if value_ns < 1_000_000 else value_ns, asked_ns
 
-    monkeypatch.setattr(timerfds, "_times", of_a_late_one)
+    monkeypatch.setattr(timerfd_kind, "_times", of_a_late_one)
     timer = timerfd(1_000_000, 60_000)
     try:
         seen = procfs_descriptor(os.getpid(), timer)
         assert seen is not None
         arm(timer, 1, 60_000)
-        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        found = timerfd_kind.observe(OpenFile(os.getpid(), (seen,)), ())
         assert found["ticks"] == 1 and 59_000_000_000 < number_of(found["value_ns"]) <= 60_000_000_000
         arm(timer, 0, 60_000)
-        found = timerfds.observe(OpenFile(os.getpid(), (seen,)), ())
+        found = timerfd_kind.observe(OpenFile(os.getpid(), (seen,)), ())
         assert (found["ticks"], found["value_ns"]) == (0, 0)
     finally:
         os.close(timer)

@@ -21,11 +21,12 @@ import pytest
 from checkpoint.engines import capability_table
 from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError, UnsupportedError
 from checkpoint.keeper.messages import Capture, Captured, Restore, Restored, Resume, Resumed, close_all
-from checkpoint.linux.procfs import descendants, procfs
+from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.spawn.vessel import Birth, discard, spawn_vessel
 from failover.cli.keeper_client import Keeper
 from failover.cli.verbs import one_shot
+from tests.checkpoint.round_trip import everybody_below
 from tests.failover.cli.test_verbs import failover
 
 PYTHON = getattr(sys, "_base_executable", sys.executable)
@@ -158,7 +159,7 @@ def taken(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[int,
     """A program that knows itself by several PIDs and runs on: its PID, and its snapshot."""
     with subprocess.Popen([PYTHON, "-c", request.param], stdout=subprocess.DEVNULL, start_new_session=True) as process:
         try:
-            wait_for("its other half", lambda: len(descendants.descendants(process.pid)) + len(thread_ids(process.pid)) == 2)
+            wait_for("its other half", lambda: len(everybody_below(process.pid)) + len(thread_ids(process.pid)) == 2)
             captured = failover("capture", "--leave-running", str(process.pid), "-o", str(tmp_path / "snapshot"))
             assert captured.returncode == 0, captured.stderr
             yield process.pid, tmp_path / "snapshot"

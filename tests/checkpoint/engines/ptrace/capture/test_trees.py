@@ -20,7 +20,7 @@ from checkpoint.engines.ptrace.capture.process import CapturedProcess, Look
 from checkpoint.engines.ptrace.capture.tree import SeenOthers
 from checkpoint.engines.ptrace.facts.probe import probe
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
-from checkpoint.linux.procfs import descendants, procfs
+from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.vessel import Birth, spawn_vessel
 from checkpoint.model import ProcessState, Resource, Snapshot
 from checkpoint.resources.events import pidfd
@@ -32,6 +32,7 @@ from tests.checkpoint.round_trip import (
     captured,
     captured_at_last,
     ended,
+    everybody_below,
     expect_ok,
     protected,
     restored,
@@ -140,7 +141,7 @@ def test_a_family_comes_back_in_its_session_from_a_vessel_that_leads_none(tmp_pa
     program.wait_for_line("ready")
     for _ in range(2):
         snapshot = captured(program)
-        (child,) = descendants.descendants(program.pid)
+        (child,) = everybody_below(program.pid)
         program.kill()
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)  # it has come to us
@@ -155,7 +156,7 @@ def test_a_family_comes_back_in_its_session_from_a_vessel_that_leads_none(tmp_pa
 def processor_time(pid: int) -> int:
     """In ticks, of a process and its descendants."""
     total = 0
-    for one in (pid, *descendants.descendants(pid)):
+    for one in (pid, *everybody_below(pid)):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             words = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
             total += int(words[11]) + int(words[12])
@@ -171,7 +172,7 @@ def test_a_pipeline_of_the_shell_computes_the_same(tmp_path: Path) -> None:
         assert alone.finish() == 0
 
     def has_worked(program: Program) -> bool:
-        return processor_time(program.pid) > 10 and len(descendants.descendants(program.pid)) >= 2
+        return processor_time(program.pid) > 10 and len(everybody_below(program.pid)) >= 2
 
     program, taken = three_lives(start(["/bin/sh", "-c", pipeline], disturbed, isolate=True), has_worked)
     with ended(program):
@@ -255,7 +256,7 @@ def test_captures_that_race_with_births_and_ends_of_processes_lose_nothing(tmp_p
                     session.acknowledge(snapshot.position)
         now = {n: os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if os.path.lexists(f"/proc/self/fd/{n}")}
         assert sorted(os.listdir("/proc/self/fd")) == before, {n: w for n, w in now.items() if n not in before}
-        assert not any(tracers((program.pid, *descendants.descendants(program.pid))))
+        assert not any(tracers((program.pid, *everybody_below(program.pid))))
         size = (tmp_path / "lines").stat().st_size
         program.wait_until(lambda: (tmp_path / "lines").stat().st_size > size + 20, "that it goes on")
         last = captured_and_ended(program)

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 
 from checkpoint.capability import Verdict
 from checkpoint.engine import CaptureOrder
-from checkpoint.engines import capability_table
 from checkpoint.engines.ptrace.facts.probe import probe
 from checkpoint.errors import CheckpointError
 from checkpoint.linux import system_v_ipc
@@ -24,6 +23,7 @@ from checkpoint.linux.memory.tracker import is_shared_object
 from checkpoint.linux.procfs import procfs
 from checkpoint.resources import refusals
 from checkpoint.resources.ipc import system_v_memory
+from tests.capability_table import row_of
 from tests.checkpoint.round_trip import (
     NOBODY,
     captured,
@@ -215,7 +215,7 @@ def test_memory_that_this_machine_may_not_have_is_named(name: str, flags: tuple[
     line = procfs.parse_maps_line(f"7f0000000000-7f0008000000 rw-p 00000000 00:11 99 {name}")
     reason = refusals.refuse_mapping(line, flags)
     assert reason is not None and said in reason
-    row = capability_table.row_of(reason)
+    row = row_of(reason)
     assert row is not None and row.verdict == Verdict.REFUSED
 
 

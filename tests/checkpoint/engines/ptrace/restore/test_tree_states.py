@@ -22,6 +22,7 @@ from tests.checkpoint.round_trip import (
     Program,
     captured_at_last,
     ended,
+    everybody_below,
     expect_ok,
     protected,
     restored,
@@ -513,7 +514,7 @@ def test_processes_that_have_lost_their_parent_are_told_by_their_session(crowded
     program = start([sys.executable, "-c", PREAMBLE + STRAYS], tmp_path)
     with ended(program):
         program.wait_for_line("ready")
-        strays = set(descendants.component(program.pid)) - set(descendants.descendants(program.pid))
+        strays = set(descendants.component(program.pid)) - set(everybody_below(program.pid))
         with protected(program) as session:
             snapshot = transported(captured_at_last(session, CaptureOrder(hold=True)))
             everybody = [member.process.pid for member in snapshot.members]
@@ -575,7 +576,7 @@ def test_an_orphan_of_a_session_that_has_lost_its_leader_is_told_by_its_standard
     with ended(start([sys.executable, "-c", PREAMBLE + LEFT_BEHIND], tmp_path)) as program:
         program.wait_for_line("ready")
         (stray,) = set(descendants.component(program.pid)) - {program.pid}
-        assert stray not in descendants.descendants(program.pid)
+        assert stray not in everybody_below(program.pid)
         program.tell()
         expect_ok(program)
         os.waitpid(stray, 0)
@@ -624,7 +625,7 @@ def test_memory_that_a_family_has_in_common_since_a_fork_is_there_once(tmp_path:
     program = start([sys.executable, "-c", PREAMBLE + FORKED, str(FAMILY_MIB)], tmp_path, isolate=True)
     last, taken = three_lives(program, lambda one: "ready\n" in one.output)
     with ended(last):
-        everybody = [last.pid, *descendants.descendants(last.pid)]
+        everybody = [last.pid, *everybody_below(last.pid)]
         assert len(everybody) == 6
         once = FAMILY_MIB * MIB
         assert shared_out(everybody) < 1.2 * once + 16 * MIB
@@ -732,8 +733,8 @@ def test_the_other_half_of_a_pipeline_of_a_shell_is_nobody_s_orphan(tmp_path: Pa
     pipeline = "set -m; sleep 60 | sleep 60 & jobs -p; wait"
     program = start(["/bin/bash", "-c", pipeline], tmp_path, isolate=True)
     with ended(program):
-        program.wait_until(lambda: len(descendants.descendants(program.pid)) == 2, "both halves")
-        leader, _ = descendants.descendants(program.pid)
+        program.wait_until(lambda: len(everybody_below(program.pid)) == 2, "both halves")
+        leader, _ = everybody_below(program.pid)
         assert os.getpgid(leader) == leader
         assert descendants.component(leader) == []
 

@@ -18,8 +18,8 @@ import pytest
 from msgspec.structs import replace
 
 from checkpoint.engine import CaptureOrder, RestoreOptions
-from checkpoint.engines.ptrace.restore import memory as restore_memory
-from checkpoint.engines.ptrace.restore import threads as restore_threads
+from checkpoint.engines.ptrace.restore import memory as restored_memory
+from checkpoint.engines.ptrace.restore import threads as restored_threads
 from checkpoint.engines.ptrace.restore.memory import KERNEL_NAMES
 from checkpoint.engines.ptrace.restore.restore import RestoredProgram
 from checkpoint.engines.ptrace.standby_copy import lay
@@ -233,7 +233,7 @@ def from_chain(snapshots: Sequence[Snapshot], directory: Path) -> Iterator[Resto
             yield restored
         finally:
             for threads in (*restored.others, restored.threads):
-                restore_threads.end(threads.leader, threads.others)
+                restored_threads.end(threads.leader, threads.others)
     finally:
         discard(born)
 
@@ -307,7 +307,7 @@ def test_a_delta_that_breaks_off_in_the_middle_leaves_all_of_them_torn(tmp_path:
         with laid(base, tmp_path) as standby:
             first, second = deltas_of(session, random.Random(2), 2)
             filled: list[object] = []
-            fill = restore_memory.fill
+            fill = restored_memory.fill
 
             def breaks(*arguments: object) -> None:
                 if filled:
@@ -315,7 +315,7 @@ def test_a_delta_that_breaks_off_in_the_middle_leaves_all_of_them_torn(tmp_path:
                 filled.append(fill(*arguments))  # type: ignore[arg-type,func-returns-value]
 
             with monkeypatch.context() as patched:
-                patched.setattr(restore_memory, "fill", breaks)
+                patched.setattr(restored_memory, "fill", breaks)
                 with pytest.raises(CaptureError):
                     standby.copy.advance(first)
             assert standby.copy.torn
@@ -342,14 +342,14 @@ def killed_while_it_fills(vessel_pid: int, base: Snapshot, delta: Snapshot) -> l
         copy = lay.lay(vessel_pid, base, RestoreOptions())
         assert isinstance(copy, FamilyCopy)
         os.write(write_end, " ".join(map(str, copy.pids())).encode())
-        fill, filled = restore_memory.fill, []
+        fill, filled = restored_memory.fill, []
 
         def dies(*arguments: Any) -> None:
             if filled:
                 os.kill(os.getpid(), signal.SIGKILL)
             filled.append(fill(*arguments))  # type: ignore[func-returns-value]
 
-        restore_memory.fill = dies
+        restored_memory.fill = dies
         copy.advance(delta)
         os._exit(1)
     os.close(write_end)
