@@ -56,7 +56,7 @@ def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the
     by_robot = {one["robot"]: one for one in why(second)["robots"]}
     assert not by_robot["robot1"]["answered"] and by_robot["robot1"]["reason"]
     shown = robots.failover(second, "why", "count").stdout
-    assert "robot1: counted as dead, silent for" in shown and "robot1 did not tell its part:" in shown, shown
+    assert "robot1: counted as dead, silent for" in shown and "robot1 did not send its event log:" in shown, shown
 
     before = why(second, "count", "--robot", "robot2")["story"]
     robots.keep_on(second)

@@ -187,7 +187,7 @@ def test_a_program_whose_pids_are_taken_goes_on_in_pids_of_its_own(taken: tuple[
     back = int(restored.stdout)
     try:
         assert back != pid
-        assert "it goes on in PIDs of its own" in restored.stderr
+        assert "it runs in a PID namespace of its own" in restored.stderr
         assert procfs.status(back).pids[-1] == pid
     finally:
         os.kill(back, signal.SIGKILL)
