@@ -284,7 +284,7 @@ class Control:
         try:
             return _reply_decoder.decode(self._exactly(size, verb))
         except UNDECODABLE as error:
-            raise LostAgentError(f"{self._path} answered {verb} in a way not understood: {error}; same version?") from error
+            raise LostAgentError(f"cannot understand the answer of {self._path} to {verb}: {error}; same version?") from error
 
     def _exactly(self, size: int, verb: str) -> bytes:
         parts = bytearray()
@@ -294,7 +294,7 @@ class Control:
             except OSError as error:
                 raise LostAgentError(f"lost the agent at {self._path} during {verb}: {error.strerror}") from error
             if not part:
-                raise LostAgentError(f"the agent at {self._path} went away during {verb}; components run on, see failover status")
+                raise LostAgentError(f"the agent at {self._path} ended during {verb}; components run on, see failover status")
             parts += part
         return bytes(parts)
 
@@ -317,7 +317,7 @@ ODD_SHOWN: Final = 60
 def _why_not(path: Path, error: OSError) -> str:
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
-        ConnectionRefusedError: "the socket is a left-over of an agent that ended; start failover-agent again",
+        ConnectionRefusedError: "the agent of this socket has ended; start failover-agent again",
         BlockingIOError: f"it has taken no connection for {CONNECT_TIMEOUT_S} s; too many others wait, or it hangs: see its log",
         PermissionError: "this user may not; use sudo, or join the group that owns the socket",
     }.get(type(error), error.strerror or str(error))

@@ -13,10 +13,10 @@ NO_FIELDS: Final = (
 )
 
 _LOCK: Final = "a lock belongs to the threads of one process; make it anew at each start, outside what is kept"
-_RUNNING: Final = "what runs does not go on in another process; keep what it works on, and start it anew in on_resume"
+_RUNNING: Final = "a running one cannot move to another process; keep what it works on, and start it anew in on_resume"
 _FILE: Final = "an open file belongs to one process; keep its path and position, and open it anew in on_resume"
 _SOCKET: Final = "a connection belongs to one process; keep the address, and connect anew in on_resume"
-_SUSPENDED: Final = "nobody can tell where it stands; keep the numbers that say it in a dataclass, and make it anew in on_resume"
+_SUSPENDED: Final = "its position cannot be read; keep the numbers that say it in a dataclass, and make it anew in on_resume"
 _FUNCTION: Final = "code is no data; keep a name or a member of an Enum, and look the function up by it"
 _QUEUE: Final = "it has locks inside; keep a collections.deque, and fill the queue from it in on_resume"
 _DICE: Final = "keep the numpy.random.Generator over it: numpy.random.default_rng(seed)"

@@ -44,7 +44,7 @@ def consider(component: Component, turn: Turn) -> None:
         return
     mine = component.newest
     if _chosen(component, turn, mine) and majority.may_claim(component, turn, mine):
-        claim(component, turn, mine, "nobody runs it, and a majority is free to vote")
+        claim(component, turn, mine, "no robot runs it, and a majority is free to vote")
 
 
 def _chosen(component: Component, turn: Turn, mine: Position | None) -> bool:

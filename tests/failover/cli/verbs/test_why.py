@@ -26,7 +26,7 @@ CLAIM: dict[str, Any] = {
     "doubt_ms": 0.0,
     "robot": "robot2",
     "component": "/lab/robot1/mapper",
-    "did": "robot2 claims epoch 2, to run it from its newest checkpoint: nobody runs it",
+    "did": "robot2 claims epoch 2, to run it from its newest checkpoint: no robot runs it",
     "life": 1,
     "number": 9,
     "repeats": 0,
@@ -94,13 +94,13 @@ def test_who_did_not_answer_and_whose_clock_is_wrong_is_said() -> None:
             {**exact, "robot": "robot1"},
             {**exact, "robot": "robot2", "clock_offset_ms": -5_002.0},
             {**exact, "robot": "robot3", "damaged": 2},
-            {**exact, "robot": "robot4", "answered": False, "reason": "the bulk lane is connecting"},
+            {**exact, "robot": "robot4", "answered": False, "reason": "the replication link is connecting"},
         ]
     )
     assert told.splitlines() == [
         "robot2: its clock is 5.002 s behind this robot's (± 0.3 ms); all times above are this robot's",
         "robot3: 2 lines of its event log cannot be read any more",
-        "robot4 did not send its event log: the bulk lane is connecting",
+        "robot4 did not send its event log: the replication link is connecting",
     ]
 
 
