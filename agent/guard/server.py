@@ -309,7 +309,7 @@ class Guard:
 
     def _check_free(self) -> None:
         if self._ward is not None:
-            raise WardError(f"this guard already looks after pid {self._ward.born.pid}; a guard has one program in its life")
+            raise WardError(f"this guard already looks after pid {self._ward.born.pid}; a guard serves one program only")
 
     def _all_notes(self) -> tuple[str, ...]:
         return (*(self._ward.notes if self._ward else ()), *self._notes)

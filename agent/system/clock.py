@@ -80,7 +80,7 @@ def become_realtime() -> tuple[str, ...]:
     try:
         syscalls.lock_memory()
     except OSError as error:
-        notes.append(f"the heart's memory can be swapped out: {error.strerror}; give the agent CAP_IPC_LOCK")
+        notes.append(f"the main loop's memory can be swapped out: {error.strerror}; give the agent CAP_IPC_LOCK")
     return tuple(notes)
 
 

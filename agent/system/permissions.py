@@ -77,7 +77,7 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
         RefusedError: it is somebody else's.
     """
     if not may(uid, owner):
-        whose = f"belongs to uid {owner}" if owner is not None else "is not known well enough here to say whose it is"
+        whose = f"belongs to uid {owner}" if owner is not None else "has no owner on record at this robot"
         raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
 
 

@@ -158,7 +158,7 @@ def test_beats_recorded_in_an_earlier_life_are_not_believed_in_the_next(pair: Pa
 
 def test_a_stranger_at_the_bulk_lane_is_refused_and_disturbs_nobody(pair: Pair) -> None:
     assert "REFUSED" in stranger.knock(pair[0], "robot2").upper()
-    until_said(pair[0], "a key that is not in this robot's team.toml was refused on the bulk lane", "1 of 1 connected")
+    until_said(pair[0], "a key that is not in this robot's team.toml was refused on the replication link", "1 of 1 connected")
 
 
 @contextlib.contextmanager
