@@ -121,7 +121,7 @@ def command_line() -> argparse.ArgumentParser:
     )
     parser.add_argument("component", nargs="?", default="", metavar="COMPONENT", help="of mend: its whole name")
     parser.add_argument("--epoch", type=int, metavar="N", help="of mend: the epoch that its record is to have")
-    parser.add_argument("--yes", action="store_true", help="of mend: do what it costs without asking")
+    parser.add_argument("--yes", action="store_true", help="of mend: do not ask for confirmation")
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help=f"default {DEFAULT_CONFIG}")
     return parser
 

@@ -397,8 +397,8 @@ def _settle() -> tuple[str, ...]:
     try:
         if (priority := syscalls.become_realtime(REALTIME_PRIORITY)) < REALTIME_PRIORITY:
             notes.append(
-                f"the guard has real-time priority {priority}, as keepers have while a program stands still, so its lease may be "
-                f"late by what they do then: allow {REALTIME_PRIORITY} (LimitRTPRIO, ulimit -r)"
+                f"the guard has real-time priority {priority}, as keepers have while a program stands still, so they may "
+                f"delay its lease then: allow {REALTIME_PRIORITY} (LimitRTPRIO, ulimit -r)"
             )
     except OSError as error:
         notes.append(f"the guard has no real-time priority, so its lease may be late on a busy machine: {error.strerror}")

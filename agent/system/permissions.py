@@ -85,7 +85,7 @@ def without_output(told: Any) -> Any:
     """The same without what programs said, in all of its sentences: for somebody who may not read their output."""
     if isinstance(told, str):
         sentence, said, _ = told.partition(SAID)
-        return f"{sentence}; what it said is shown to its owner and root" if said else told
+        return f"{sentence}; only its owner and root may read what it said" if said else told
     if isinstance(told, Mapping):
         return {key: without_output(value) for key, value in told.items()}
     return [without_output(value) for value in told] if isinstance(told, list | tuple) else told

@@ -193,7 +193,7 @@ class Switchboard:
         try:
             return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
         except TimeoutError:
-            raise AgentError(f"no decision in {ANSWER_PATIENCE_S:.0f} s; failover why tells what it waits for") from None
+            raise AgentError(f"no decision in {ANSWER_PATIENCE_S:.0f} s; see failover why") from None
         finally:
             self._commands.pop(number, None)
 

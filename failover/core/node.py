@@ -226,7 +226,9 @@ class Node:
         component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
         if component is None:
             if isinstance(event, Command):
-                turn.order(acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists what is"))
+                turn.order(
+                    acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists the components")
+                )
             return []
         _tell(component, turn, event)
         return [component]

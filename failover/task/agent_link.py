@@ -170,7 +170,7 @@ class Guarded:
         while self.durable < number:
             left = None if deadline is None else deadline - time.monotonic()
             if left is not None and left <= 0:
-                why = self.trouble or f"the standby holds commit {self.durable}; failover status says how it stands"
+                why = self.trouble or f"the standby holds commit {self.durable}; see failover status"
                 raise NotCommittedError(f"commit {number} is not safe after {timeout} s: {why}")
             if self._hearing.acquire(timeout=LOOK_S if left is None else min(left, LOOK_S)):
                 try:

@@ -398,7 +398,7 @@ class Verbs(Questions):
         if end.done() and end.result().failed:
             raise RefusedError(f"cannot start {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
         if not charge.started.is_set():
-            raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; failover why {name} tells what it waits for")
+            raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; see failover why {name}")
         return charge
 
     async def _command(self, make: Callable[[int], events.Command]) -> acts.Answer:

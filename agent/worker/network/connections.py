@@ -71,7 +71,7 @@ class Ways:
             except LaneError as error:
                 if way == BULK:
                     raise
-                self.troubles.append(f"orders do not travel over a further link: {error}")
+                self.troubles.append(f"orders cannot use a further link: {error}")
                 log.warning("%s", self.troubles[-1])
 
     async def close(self) -> None:

@@ -117,7 +117,7 @@ class Facts:
         if one.hardware in RADIO_HARDWARE:
             return f"its hardware type is {one.hardware}"
         if one.name in self._listed():
-            return "it stands in /proc/net/wireless"
+            return "/proc/net/wireless lists it"
         if because := self._sysfs_radio(one):
             return because
         if one.kind in TUNNELS or one.hardware in NONE_HARDWARE:

@@ -238,7 +238,7 @@ def _unknown(seen: Mapping[str, Any]) -> str:
     primary = seen.get("primary")
     if primary:
         return f"{primary}, which runs it, has not answered, so its protection is not known; ask there, or ask again"
-    return "no robot that answered runs it; failover why tells what was decided"
+    return "no robot that answered runs it; see failover why"
 
 
 PASSING: Final = frozenset({"unknown key", "seen before, or too old", "from an earlier life of its sender"})

@@ -111,7 +111,7 @@ def withdraw(component: Component, turn: Turn, why: str) -> None:
     component.ordered = False
     place = sorted((turn.me, *turn.config.peers), key=weight).index(turn.me) + 1
     component.retry_ns = turn.now_ns + place * WITHDRAWN_BEATS * turn.config.beat_ns
-    refuse_request(component, turn, f"cannot run {component.name}: {why}; failover status tells who is heard")
+    refuse_request(component, turn, f"cannot run {component.name}: {why}; failover status tells which robots {turn.me} hears")
     turn.say(component, f"{turn.me} withdraws its claim of epoch {component.epoch}: {why}")
 
 
@@ -121,7 +121,7 @@ def step_down(component: Component, turn: Turn) -> None:
     component.handing = component.flight = None
     component.until_ns = turn.now_ns + turn.config.retry_ms * MS
     turn.order(acts.Stop(component.name, component.epoch))
-    turn.say(component, f"{turn.me} gives its copy up: what it handed over is claimed anew")
+    turn.say(component, f"{turn.me} gives its copy up: the component that it handed over is claimed anew")
 
 
 # Hearing

@@ -87,7 +87,10 @@ def test_what_cannot_be_kept_is_refused_when_it_is_declared(declared: Any, sente
     [
         (threading.Lock, "it holds a lock: a lock belongs to the threads of one process; make it anew at each start"),
         (threading.Event, "it holds an Event: a lock belongs to the threads"),
-        (threading.Thread, "it holds a Thread: a running one cannot move to another process; keep what it works on, and start"),
+        (
+            threading.Thread,
+            "it holds a Thread: a running one cannot move to another process; keep the values that it works on, and start",
+        ),
         (lambda: Path(os.devnull).open(), "it holds a TextIOWrapper: an open file .*; keep its path and position, and open it"),  # noqa: SIM115 - it is closed below
         (io.BytesIO, r"it holds a BytesIO: keep its bytes, getvalue\(\)"),
         (socket.socket, "it holds a socket: a connection belongs to one process; keep the address, and connect anew"),
@@ -136,7 +139,11 @@ def test_a_component_names_the_field_that_cannot_be_kept(field: Field, sentence:
 @pytest.mark.parametrize(
     ("declared", "value", "sentence"),
     [
-        (Pose, Pose(1, "north"), r"kept\.y: it holds a str, declared float; assign what is declared, or change the declaration"),  # type: ignore[arg-type]
+        (
+            Pose,
+            Pose(1, "north"),
+            r"kept\.y: it holds a str, declared float; assign a value of the declared type, or change the declaration",
+        ),  # type: ignore[arg-type]
         (list[Pose], [Pose(), Cell(1, 2)], r"kept\[1\]: it holds a Cell, declared Pose"),
         (list[Pose], [SpecialPose()], r"kept\[0\]: it holds a SpecialPose, declared Pose"),
         (list[int], (1, 2), r"kept: it holds a tuple, declared list\[int\]"),
