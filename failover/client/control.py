@@ -55,8 +55,8 @@ realtime: the main loop runs at real-time priority with its memory locked
 rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
 memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of main loop and worker, and of the keepers of
-    components that run here; remembered: of these, what pages are remembered in, of all components together, and its bound (xor_cache of
-    agent.toml); None of a witness
+    components that run here; remembered: of these, what pages are remembered in, of all components together, and its bound
+    (xor_cache of agent.toml); None of a witness
 healthy: nothing is degraded, nothing has failed, no robot is silent, as far as this robot knows; with ``team`` as far as any
     robot that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
 notes: [sentence, …]: what is missing or degraded on this robot
