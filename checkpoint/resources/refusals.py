@@ -45,7 +45,7 @@ CAPABILITIES: Final = (
         "a pipe ({})",
         "a named pipe (fifo {})",
         "an open {}",
-        "of a kind that we do not know",
+        "of a kind that failover does not know",
     ),
     refused(
         Area.SOCKETS,
@@ -199,7 +199,7 @@ def _called(held: OpenFile) -> str:
     match = re.fullmatch(r"anon_inode:\[?([a-z_-]+)\]?", target)
     if match:
         return ANONYMOUS_INODES.get(match[1], f"an open {match[1]}")
-    return f"{target}, of a kind that we do not know"
+    return f"{target}, of a kind that failover does not know"
 
 
 SOCKET_FAMILIES: Final[Mapping[int, str]] = {

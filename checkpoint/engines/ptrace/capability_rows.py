@@ -49,7 +49,7 @@ CAPABILITIES: Final = (
         Area.PROCESS,
         "user, groups, capabilities",
         "as far as the agent has them; the program of an ordinary user comes back with that user's rights and no more",
-        "of the program are not kept: we do not have them",
+        "of the program are not kept: failover does not have them",
     ),
     preserved(
         Area.THREADS,
@@ -60,7 +60,7 @@ CAPABILITIES: Final = (
         Area.THERE,
         "a PID or thread id that is taken, if the program has several threads or one of its locks names the id",
         "free the id, or start the program with `failover run`, which gives it PIDs of its own",
-        "by which they know it, cannot be had",
+        "by which they know it, is not available",
         "it holds a lock that names its own pid",
         "and a lock that the program holds names it",
         "that id is in use",

@@ -237,8 +237,8 @@ class CarriedTrees(Struct):
                 return Seen(unreadable=(self._unreadable(error),))
             except OSError as error:
                 raise CaptureError(
-                    f"cannot capture pid {self.pid}: its carried files change while they are looked at ({self._path_of(error)}: "
-                    f"{error.strerror}); try again, and let nobody else write there"
+                    f"cannot capture pid {self.pid}: its carried files change while failover reads them ({self._path_of(error)}: "
+                    f"{error.strerror}); try again, and let no other program write there"
                 ) from error
         return Seen(tuple(names), links, (), read_size)
 

@@ -195,7 +195,7 @@ class Segments(Struct):
             raise RestoreError(f"cannot make {what}: {error.strerror}; see kernel.shmmax, kernel.shmmni, or ipcs") from error
         self._made.append(made)
         if made != wanted.identifier:
-            self.notes.append(f"its System V shared memory {wanted.identifier} is {made} here: that id could not be had")
+            self.notes.append(f"its System V shared memory {wanted.identifier} is {made} here: that id was not available")
         return made
 
     def attached(self) -> None:

@@ -115,7 +115,10 @@ def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]
             except (ProcessGoneError, ProbeError, FileNotFoundError):
                 continue  # this one has ended
     if any(timer.clock == CLOCK_THREAD_CPUTIME for timer in parse_timers(procfs.read_text(pid, "timers"))):
-        yield "it has a timer that counts the processor time of one of its threads, and nobody tells which: use another clock"
+        yield (
+            "it has a timer that counts the processor time of one of its threads, and the kernel does not tell which: "
+            "use another clock"
+        )
 
 
 def refuse_ended_first(status: Status) -> Iterator[str]:

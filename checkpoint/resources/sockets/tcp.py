@@ -94,7 +94,7 @@ MAY_MOVE: Final = "may_move"
 LEFT: Final = "left"
 """Why one is not taken along that was to be."""
 
-ON_ITS_WAY: Final = "it was on its way in a unix socket: received, it is taken along"
+ON_ITS_WAY: Final = "it was on its way in a unix socket; once received, it is taken along"
 """Of one that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
 
 READ_ENDED: Final = 1

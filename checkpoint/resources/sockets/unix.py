@@ -187,7 +187,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if 0 in _list(seen["clients"]):
         return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"
     if number_of(seen["not_accepted"]) > 0:
-        return f"{what} whose connection waits to be accepted with data in it, which nobody can look at: {_ACCEPTED}"
+        return f"{what} whose connection waits to be accepted with data in it, which failover cannot read: {_ACCEPTED}"
     if seen["urgent"]:
         return f"{what} in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
     if seen["too_long"]:

@@ -317,7 +317,7 @@ class Naming:
         made_file = table.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)  # a link may have taken its place meanwhile
         owner = one.facts.get("file_owner")
         if isinstance(owner, list) and owner:
-            lost = f"the name of the unix socket {path} belongs to whom the program runs as"
+            lost = f"the name of the unix socket {path} belongs to the user that the program runs as"
             ids = number_of(owner[0]), number_of(owner[1])
             table.attempt(lost, "fchownat", made_file, table.place_path(""), *ids, AT_EMPTY_PATH)
         again = table.place_path(f"/proc/self/fd/{made_file}")

@@ -171,7 +171,7 @@ def test_a_restore_that_comes_to_nothing_in_the_middle_leaves_a_vessel_that_can_
     file = os.open(snapshot, os.O_RDONLY | os.O_CLOEXEC)
     born = spawn_vessel(Birth())
     with Keeper.spawn() as keeper:
-        with pytest.raises(CheckpointError, match=f"pid {pid}, by which they know it, cannot be had"):
+        with pytest.raises(CheckpointError, match=f"pid {pid}, by which they know it, is not available"):
             keeper.ask(Restore(born.pid, "/test/taken", 0), Restored, (file,))
         with contextlib.suppress(ProcessLookupError):
             os.kill(born.pid, signal.SIGKILL)
