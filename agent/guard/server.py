@@ -294,7 +294,7 @@ class Guard:
 
     def _forget(self, _: Forget, __: tuple[int, ...]) -> None:
         if self._ward is not None and self._ward.exited is None:
-            raise WardError("the program still runs; stop it or let it go first")
+            raise WardError("the program still runs; stop or release it first")
         self._reply(Done())
         self._over = True
 

@@ -74,7 +74,8 @@ def become_realtime() -> tuple[str, ...]:
             )
     except OSError as error:
         notes.append(
-            f"beats run at normal priority: SCHED_FIFO was refused ({error.strerror}); under load a live robot may be taken for "
+            f"beats run at normal priority: the system refused SCHED_FIFO ({error.strerror}); "
+            "under load a live robot may be taken for "
             "dead; give the agent CAP_SYS_NICE or a LimitRTPRIO, see systemd/failover-agent.service"
         )
     try:

@@ -356,7 +356,7 @@ def _refuse_places(pid: int) -> Iterator[str]:
     directory = procfs.read_link(pid, "cwd")
     is_kernels = directory.startswith(KERNEL_PLACES) and not proc_and_sys.left_by_ended(directory)
     if procfs.is_gone(directory) and is_kernels:
-        yield f"its working directory {directory} is gone: let it change to another one"
+        yield f"its working directory {directory} is gone: let the program change to another one"
     root = procfs.read_link(pid, "root")
     if procfs.is_gone(root):
         yield f"its root directory {root} is gone: run it in one that stays"

@@ -436,7 +436,7 @@ class BulkLane:
         told.extend(self._mismatch.values())
         if self.strangers:
             told.append(
-                f"a key that is not in this robot's team.toml was refused on the replication link, {self.strangers} times, "
+                f"this robot refused a key that is not in its team.toml on the replication link, {self.strangers} times, "
                 f"last from {self._stranger}; bring the same team.toml to every robot if it is one of yours"
             )
         return told

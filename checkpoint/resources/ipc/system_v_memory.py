@@ -108,7 +108,7 @@ def refuse(lines: Iterable[MapsLine], known: Mapping[int, Segment]) -> Iterator[
         if segment.attached > len(pieces):
             yield f"{what} attached by other processes, too, which stay behind: protect the program when they have ended"
         if not _is_whole(pieces, segment.size):
-            yield f"{what} one of which it has unmapped a part: let it keep the whole"
+            yield f"{what} one of which it has unmapped a part: let the program keep the whole"
 
 
 def _is_whole(pieces: Sequence[MapsLine], size: int) -> bool:

@@ -102,7 +102,7 @@ def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]
     if pid != status.tgid and not can_look_through(pid):
         yield "its first thread has ended while others live, and this kernel lends no descriptors through another: Linux 6.9 does"
     if status.threads > THREAD_LIMIT:
-        yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let it start fewer"
+        yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let the program start fewer"
         return
     if status.state in "ZX":
         yield from refuse_ended_first(status)
@@ -124,7 +124,10 @@ def refuse(pid: int, status: Status, kin: Collection[int] = ()) -> Iterator[str]
 def refuse_ended_first(status: Status) -> Iterator[str]:
     """Why a process whose first thread has ended cannot be captured; nothing stands against one that has ended as a whole."""
     if status.state in "ZX" and status.threads > 1:
-        yield f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: let it wait for them"
+        yield (
+            f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: "
+            "let the first thread wait for them"
+        )
 
 
 def refuse_kin(threads: Threads) -> tuple[str, ...]:

@@ -243,7 +243,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     name = kinds.get(number_of(seen["type"]), "a raw socket")
     if seen["unfinished"]:
         return (
-            f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): it is kept as soon as it is"
+            f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): "
+            "failover captures it as soon as it is sent"
         )
     return sockets.refuse_filter(held) or other_holders.refuse(held, name)
 

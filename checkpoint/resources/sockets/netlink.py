@@ -121,7 +121,10 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
             "let the program close it"
         )
     if seen["busy"]:
-        return f"{held.name} is a netlink socket in which an answer of the kernel waits: it is kept as soon as that is read"
+        return (
+            f"{held.name} is a netlink socket in which an answer of the kernel waits: "
+            "failover captures it as soon as the program has read that"
+        )
     return sockets.refuse_filter(held) or other_holders.refuse(held, "a netlink socket")
 
 

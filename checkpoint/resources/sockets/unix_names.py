@@ -148,7 +148,10 @@ def refuse(held: OpenFile) -> str | None:
     if not path:
         return None
     if seen["directory"] and ".." in told.split("/"):
-        return f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: let it bind a whole path"
+        return (
+            f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: "
+            "let the program bind a whole path"
+        )
     if seen["mode"] == GONE and os.geteuid() and os.path.isabs(told) and _is_something_else(f"{procfs.outlook(held.pid)}{path}"):
         return f"{held.name} is a unix socket whose name is something else by now ({path}): bind another, or protect it as root"
     is_reached_by_name = seen["state"] != ESTABLISHED or seen["type"] == socket.SOCK_DGRAM

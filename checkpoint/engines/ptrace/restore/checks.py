@@ -112,7 +112,7 @@ CAPABILITIES: Final = (
 )
 
 _FAR: str = "bring it here from the machine that ran the program"
-_CARRIED: str = f"{_FAR}; or, as the program writes to it, let it travel: --carry, for it or its folder"
+_CARRIED: str = f"{_FAR}; or, as the program writes to it, carry it: --carry, for it or its folder"
 """While the program runs no copy would do for long."""
 
 
