@@ -84,17 +84,17 @@ CAPABILITIES: Final = (
     preserved(
         Area.TIME,
         "interval timers, POSIX timers and sleeps, relative or absolute, of the realtime, monotonic, boot and TAI clocks",
-        "go on with the time that was left, and count the outage; if the clock is set later, a POSIX timer does not follow",
+        "continue with the time that was left, and count the outage; if the clock is set later, a POSIX timer does not follow",
     ),
     preserved(
         Area.TIME,
         "timers of processor time (setitimer, CLOCK_PROCESS_CPUTIME_ID, CLOCK_THREAD_CPUTIME_ID)",
-        "go on with the time that was left; the clocks themselves, and the figures of getrusage, begin anew",
+        "continue with the time that was left; the clocks themselves, and the figures of getrusage, begin anew",
     ),
     by_rule(
         Area.TIME,
         "monotonic and boot clocks",
-        "never go back; they go on from their reading where `failover run` gave the program a time namespace. The time of "
+        "never go back; they continue from their reading where `failover run` gave the program a time namespace. The time of "
         "day is the machine's",
     ),
 )
