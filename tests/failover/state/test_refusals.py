@@ -141,9 +141,9 @@ def test_a_component_names_the_field_that_cannot_be_kept(field: Field, sentence:
     [
         (
             Pose,
-            Pose(1, "north"),
+            Pose(1, "north"),  # type: ignore[arg-type]
             r"kept\.y: it holds a str, declared float; assign a value of the declared type, or change the declaration",
-        ),  # type: ignore[arg-type]
+        ),
         (list[Pose], [Pose(), Cell(1, 2)], r"kept\[1\]: it holds a Cell, declared Pose"),
         (list[Pose], [SpecialPose()], r"kept\[0\]: it holds a SpecialPose, declared Pose"),
         (list[int], (1, 2), r"kept: it holds a tuple, declared list\[int\]"),
