@@ -39,4 +39,6 @@ def check_told(commands: Mapping[Any, Sequence[str]]) -> None:
     """
     for kind, command in commands.items():
         if signal_in(command) and kind != "after_resume":
-            raise ValueError(f"{kind} = {command[0]!r}: nobody could wait for what its handler does; only after_resume takes one")
+            raise ValueError(
+                f"{kind} = {command[0]!r}: failover cannot wait for a signal's handler; only after_resume takes a signal"
+            )

@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 DEFAULT_CONFIG: Final = Path("/etc/failover/agent.toml")
 FAILED: Final = 1
-INSECURE: Final = "INSECURE: running without keys: anybody on the network can read programs' memory and start programs here"
+INSECURE: Final = "INSECURE: running without keys: every machine on the network can read programs' memory and start programs here"
 
 DESCRIPTION: Final = """
-Protect the programs of this robot and of its neighbours. Runs in the foreground, logs to standard error, leaves on SIGTERM;
-components outlive it, and the next agent finds them again. People talk to it by `failover`.
+Protect the programs of this robot and of its neighbours. Runs in the foreground, logs to standard error, ends on SIGTERM;
+components run on, and the next agent finds them again. The command `failover` gives it orders.
 
   failover-agent --config /etc/failover/agent.toml           run
   failover-agent check --config /etc/failover/agent.toml     read configuration, team file and key, and say what is wrong
   failover-agent keypair                                     a new pair as JSON; the secret half stays on this robot, in
                                                              /etc/failover/team/keys/ROBOT.secret, mode 600
   failover-agent mend /lab/robot1/mapper --epoch 12          a record whose epoch leaves none above it (failover status says so)
-                                                             is set right; says what that costs, and asks
+                                                             gets a lower one; says what that costs, and asks
 """
 
 EPILOG: Final = """
@@ -121,7 +121,7 @@ def command_line() -> argparse.ArgumentParser:
     )
     parser.add_argument("component", nargs="?", default="", metavar="COMPONENT", help="of mend: its whole name")
     parser.add_argument("--epoch", type=int, metavar="N", help="of mend: the epoch that its record is to have")
-    parser.add_argument("--yes", action="store_true", help="of mend: do what it costs without asking")
+    parser.add_argument("--yes", action="store_true", help="of mend: do not ask for confirmation")
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help=f"default {DEFAULT_CONFIG}")
     return parser
 

@@ -25,7 +25,7 @@ from failover.errors import NoAgentError
 
 COSTS: Final = """\
 failover-agent: {name}: this member's record has epoch {old}; it would be {new}, with no vote in it. That costs:
-  - its vote of a later epoch: if another member counts on it, two copies may be let run. Stop every copy first (failover status).
+  - its vote of a later epoch: if another member counts on it, two copies may run. Stop every copy first (failover status).
   - its checkpoints of later epochs: {lost} of {held} go to its store's aside folder, and no program goes on from them by itself.
   - fencing: a gateway or actuator that has seen a later epoch obeys none up to it. Have it forget that one.
 Mend every member that has such a record, to the same epoch, before any agent is started again."""

@@ -48,7 +48,7 @@ BURST: Final = "128kb"
 QUEUE_MS: Final = 10
 """Of the token bucket at each end of the cable."""
 
-LEASE_OVER: Final = "holds it still"
+LEASE_OVER: Final = "freezes it"
 
 TAKEOVERS: Final = "false takeovers"
 TAKEN_FOR_DEAD: Final = "robots falsely taken for dead"

@@ -109,4 +109,4 @@ def missing(rules: Iterable[DeviceRule]) -> tuple[str, ...]:
 
 
 def _lack(rule: DeviceRule) -> str:
-    return f"lacks {rule.place}: " + ("it would be found hung up" if rule.optional else "the program could not go on here")
+    return f"lacks {rule.place}: " + ("it would be found hung up" if rule.optional else "the program could not resume here")

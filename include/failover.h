@@ -730,7 +730,7 @@ static inline int failover_connect_(failover_task_ *task)
         return code == ECONNREFUSED ? 0 : failover_fail_(code, "cannot keep a state under the agent: no way to its guard: %s", strerror(code));
     }
     if (getsockopt(task->guard, SOL_SOCKET, SO_PEERCRED, &listener, &room) != 0 || (listener.uid != 0 && listener.uid != geteuid()))
-        return failover_fail_(EPERM, "cannot keep a state under the agent: who listens at FAILOVER_TASK is neither this user nor root");
+        return failover_fail_(EPERM, "cannot keep a state under the agent: the listener at FAILOVER_TASK is neither this user nor root");
     return 1;
 }
 
@@ -739,20 +739,20 @@ static inline int failover_hear_begin_(failover_task_ *task, failover_packet_ *p
 {
     int failed = failover_say_(task->guard, FAILOVER_HELLO_);
     if (failed != 0)
-        return failover_fail_(-failed, "cannot keep a state under the agent: its guard does not hear: %s", strerror(-failed));
+        return failover_fail_(-failed, "cannot keep a state under the agent: no way to its guard: %s", strerror(-failed));
     ssize_t size;
     do
         size = failover_take_(task->guard, 0, packet, descriptors);
     while (size == -EINTR);
     if (size <= 0)
         return failover_fail_(size < 0 ? (int)-size : ECONNRESET, "cannot keep a state under the agent: its guard does not say how to begin: %s",
-                              size < 0 ? strerror((int)-size) : "it has hung up");
+                              size < 0 ? strerror((int)-size) : "it closed the connection");
     if (packet->head.kind == FAILOVER_REFUSED_ && size == (ssize_t)sizeof packet->refused)
         return failover_fail_(EACCES, "cannot keep a state under the agent: %.503s", packet->refused.why);
     const failover_begin_ *begin = &packet->begin;
     if (begin->kind != FAILOVER_BEGIN_ || size != (ssize_t)sizeof *begin || begin->why > 3 || descriptors[0] < 0 ||
         (descriptors[1] < 0) != (begin->why == 0) || memchr(begin->robot, 0, sizeof begin->robot) == NULL)
-        return failover_fail_(EPROTO, "cannot keep a state under the agent: its guard says something else than how to begin");
+        return failover_fail_(EPROTO, "cannot keep a state under the agent: its guard does not say how to begin");
     return 0;
 }
 
@@ -804,7 +804,7 @@ static inline int failover_wait_for_standby_(failover_task_ *task, uint64_t numb
             return failover_fail_(ETIMEDOUT, "commit %llu is not safe yet: its output pipe is full, the guard takes nothing from it; a later commit "
                                   "will do", (unsigned long long)number);
         if (now >= limit)
-            return failover_fail_(ETIMEDOUT, "commit %llu is not safe yet: the standby holds commit %llu; failover status says how it stands",
+            return failover_fail_(ETIMEDOUT, "commit %llu is not safe yet: the standby holds commit %llu; see failover status",
                                   (unsigned long long)number, (unsigned long long)durable);
         struct pollfd wanted = {task->guard, POLLIN, 0};
         const uint64_t left = (limit - now) / 1000000u + 1;
@@ -1041,7 +1041,8 @@ static inline int failover_read_layout_(int file, const char *name, failover_lay
     if (failover_read_(file, head, sizeof *head, 0) != 0 || memcmp(head->magic, FAILOVER_MAGIC_, sizeof head->magic) != 0)
         return failover_fail_(EBADMSG, "cannot resume from %s: it is no segment; to begin anew, move it away", name);
     if (head->version != FAILOVER_VERSION_ || head->page_size != FAILOVER_PAGE_)
-        return failover_fail_(EPROTONOSUPPORT, "cannot resume from %s: it is of version %u with pages of %u bytes, we read version %d with 4096",
+        return failover_fail_(EPROTONOSUPPORT,
+                              "cannot resume from %s: it is of version %u with pages of %u bytes, this header reads version %d with 4096",
                               name, head->version, head->page_size, FAILOVER_VERSION_);
     if (head->regions < 1 || head->regions > FAILOVER_MAX_REGIONS_ || head->banks < FAILOVER_BANKS_ || head->banks > FAILOVER_MAX_BANKS_ ||
         head->pages > FAILOVER_MAX_PAGES_)
@@ -1400,7 +1401,7 @@ static inline int failover_own_file_(failover_task_ *task)
         close(task->file); /* its owner has put another one in its place meanwhile */
         task->file = -1;
     }
-    return failover_fail_(EBUSY, "cannot keep a state in %s: others put files in its place again and again", task->file_name);
+    return failover_fail_(EBUSY, "cannot keep a state in %s: other processes replace it again and again", task->file_name);
 }
 
 __attribute__((format(printf, 2, 3))) static inline void failover_note_(failover_task_ *task, const char *format, ...)
@@ -1544,7 +1545,7 @@ static inline int failover_load_handed_(failover_task_ *task, const failover_beg
     if (failed == 0) {
         failed = failover_hold_newest_(file, stored.head.banks, &bank, &record);
         if (failed != 0)
-            failover_fail_(-failed, "cannot resume from %s: no commit is to be had from it: %s", task->file_name, strerror(-failed));
+            failover_fail_(-failed, "cannot resume from %s: cannot read a commit from it: %s", task->file_name, strerror(-failed));
     }
     if (failed == 0)
         failed = failover_fill_regions_(task, file, &stored, bank);

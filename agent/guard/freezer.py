@@ -267,7 +267,7 @@ def choose(place: str, name: str) -> tuple[Freezer, tuple[str, ...]]:
             reason = (
                 f"cannot make a cgroup in {parent}: {error.strerror}; delegate one to the agent's user (Delegate=yes in a unit)"
             )
-    return SignalFreezer(), (f"it is frozen by SIGSTOP, which it can notice: {reason}",)
+    return SignalFreezer(), (f"the guard freezes it by SIGSTOP, which it can notice: {reason}",)
 
 
 def _children() -> dict[int, list[int]]:

@@ -196,7 +196,9 @@ class Pump:
             try:
                 written = self.logs.write(stream, offset, rest)
             except OSError as error:
-                self.blocked = f"output of the program is held back: cannot write {self.logs.directory}: {error.strerror}"
+                self.blocked = (
+                    f"the guard holds the program's output back: it cannot write {self.logs.directory}: {error.strerror}"
+                )
                 self._make_room(error)
                 continue
             offset, rest = offset + written, rest[written:]

@@ -46,8 +46,8 @@ DRAIN_S: Final = 2.0
 
 NO_TRIM: Final = "its logs grow without bound: their filesystem cannot give the beginning of a file back"
 UNFINISHED: Final = "the restore was not finished: agent or keeper ended before it was committed"
-NOBODY_LEFT: Final = "it waited to begin, and the agent that would have told it has ended"
-WATCHED: Final = "it was started by somebody else: its exit status will not be known, its output is not kept"
+NOBODY_LEFT: Final = "it waited for its agent's order to begin, and that agent has ended"
+WATCHED: Final = "failover did not start it: its exit status will not be known, its output is not kept"
 
 
 class WardError(Exception):
@@ -137,7 +137,7 @@ class Ward(Struct):
         pidfd = os.dup(pidfd)
         hold = freezing.SignalFreezer()
         hold.add(order.pid, pidfd)
-        notes = [WATCHED, "it is frozen by SIGSTOP, which it can notice: it keeps the cgroup that it was started in"]
+        notes = [WATCHED, "the guard freezes it by SIGSTOP, which it can notice: it keeps the cgroup that it was started in"]
         return cls(order.component, Born(order.pid, _inner_pid(order.pid)), hold, pidfd=pidfd, notes=notes)
 
     @classmethod
@@ -249,7 +249,7 @@ class Ward(Struct):
         try:
             task = TaskEnd(self.component, self.offered.user[0] if self.offered.user is not None else os.geteuid(), name)
         except OSError as error:
-            self.notes.append(f"nobody would hear it say that it keeps its state: cannot listen at {name}: {error.strerror}")
+            self.notes.append(f"it cannot report that it keeps its state: the guard cannot listen at {name}: {error.strerror}")
             return
         first, second = (self.pump.read_ends[stream] for stream in STREAMS)
         task.flows_into(self.pump.counters.descriptor, (first, second))
@@ -330,10 +330,12 @@ class Ward(Struct):
         try:
             fields = procfs.parse_fields(procfs.read_text(self.born.pid, "status"))
             if not (int(fields["SigCgt"], 16) | int(fields["SigBlk"], 16)) >> (number - 1) & 1:
-                raise WardError(f"it neither handles nor blocks {signal.Signals(number).name}, which may end it: not told")
+                raise WardError(
+                    f"it neither handles nor blocks {signal.Signals(number).name}, which may end it: the guard does not send it"
+                )
             queue_signal(self.born.pid, number, value)
         except (OSError, ProbeError) as error:
-            raise WardError(f"it cannot be told by {signal.Signals(number).name}: {error}") from error
+            raise WardError(f"the guard cannot send it {signal.Signals(number).name}: {error}") from error
 
     def abandon(self) -> None:
         """Agent or keeper are gone before it was the component: nothing of it stays."""
@@ -362,7 +364,7 @@ class Ward(Struct):
         if self.pump is not None and not self.pump.is_open:
             self.notes.extend([said] if (said := self.pump.last_line()) else [])
         elif self.pump is not None and not self.pump.drain(DRAIN_S):
-            self.notes.append("its last output may be incomplete: " + (self.pump.blocked or "something else still writes to it"))
+            self.notes.append("its last output may be incomplete: " + (self.pump.blocked or "another process still writes to it"))
         if self.task is not None:
             self.task.close()
         self.frozen_by = ""

@@ -294,7 +294,7 @@ class Guard:
 
     def _forget(self, _: Forget, __: tuple[int, ...]) -> None:
         if self._ward is not None and self._ward.exited is None:
-            raise WardError("the program still runs; stop it or let it go first")
+            raise WardError("the program still runs; stop or release it first")
         self._reply(Done())
         self._over = True
 
@@ -309,7 +309,7 @@ class Guard:
 
     def _check_free(self) -> None:
         if self._ward is not None:
-            raise WardError(f"this guard already looks after pid {self._ward.born.pid}; a guard has one program in its life")
+            raise WardError(f"this guard already looks after pid {self._ward.born.pid}; a guard serves one program only")
 
     def _all_notes(self) -> tuple[str, ...]:
         return (*(self._ward.notes if self._ward else ()), *self._notes)
@@ -397,8 +397,8 @@ def _settle() -> tuple[str, ...]:
     try:
         if (priority := syscalls.become_realtime(REALTIME_PRIORITY)) < REALTIME_PRIORITY:
             notes.append(
-                f"the guard has real-time priority {priority}, as keepers have while a program stands still, so its lease may be "
-                f"late by what they do then: allow {REALTIME_PRIORITY} (LimitRTPRIO, ulimit -r)"
+                f"the guard has real-time priority {priority}, as keepers have while a program stands still, so they may "
+                f"delay its lease then: allow {REALTIME_PRIORITY} (LimitRTPRIO, ulimit -r)"
             )
     except OSError as error:
         notes.append(f"the guard has no real-time priority, so its lease may be late on a busy machine: {error.strerror}")

@@ -180,7 +180,7 @@ class TaskEnd:
         if uid not in self._users:
             return f"a process of uid {uid} may not keep the state of a program of uid {self._users[-1]}; run both as one user"
         if not pid:
-            return "the process that keeps its state cannot be seen from outside; start it in this PID namespace or one inside"
+            return "the guard cannot see the process that keeps its state; start it in this PID namespace or one inside"
         if self._program is not None:
             return f"pid {self._caller_pid} keeps its state already; run each program that keeps one as a component of its own"
         if self.keeps:
@@ -213,7 +213,7 @@ class TaskEnd:
             self._say_begin()
             return [TaskConnected(self.pid)]
         if not self._has_begun:
-            raise TaskPacketError("a commit was made before it was said how to begin")
+            raise TaskPacketError("the program made a commit before the guard told it how to begin")
         self.keeps = True
         self._drop(self._segment)
         self._segment = -1

@@ -113,9 +113,9 @@ class Scribe:
         try:
             self._file.append(batch)
         except OSError as error:
-            self.trouble = f"the story of its decisions cannot be written: {error.strerror}; failover why forgets them"
+            self.trouble = f"this robot cannot write its event log: {error.strerror}; failover why will not show its decisions"
             return False
         self._written = batch[-1].number
         lost = self._given_up
-        self.trouble = f"{lost} decisions are missing in the story: the disk did not take them in time" if lost else ""
+        self.trouble = f"{lost} decisions are missing in the event log: the disk did not take them in time" if lost else ""
         return True

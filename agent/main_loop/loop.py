@@ -81,8 +81,8 @@ LANES_TRIES: Final = 5
 STARTED: Final = "protecting this robot and its neighbours"
 
 OUTLIVED: Final = (
-    "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy. What it voted and kept since is "
-    "lost; it begins again as life %d"
+    "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy. Its votes and checkpoints since "
+    "then are lost; it begins again as life %d"
 )
 
 log = logging.getLogger("failover.heart")
@@ -232,9 +232,7 @@ class Heart:
         self._lanes_silent_ns += starvation.had_ns(before, self._lanes_turns, self._lanes_unseen_ns)
         self._lanes_unseen_ns = 0
         if self._lanes_silent_ns > self._lanes_allowed_ns:
-            self._replace_lanes(
-                f"it said nothing for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s in which it could have"
-            )
+            self._replace_lanes(f"it was silent for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s of processor time")
 
     def _lanes_spoke(self, allowed_ns: int) -> None:
         """Their silence counts from now on, and may last so long."""
@@ -351,7 +349,7 @@ class Heart:
         durable = self._outbox.durable
         self._node = Node(config, boot, durable, clock.now_ns(), inventory.held, inventory.found)
         self._notifier.ready(STARTED)
-        log.info("robot %s beats, life %d", self._me, boot)
+        log.info("robot %s sends heartbeats, life %d", self._me, boot)
 
     def _replace_lanes(self, why: str) -> None:
         """Start another lanes process; one that never gets as far as an inventory is not tried for ever.
@@ -361,8 +359,8 @@ class Heart:
         """
         self._lanes_deaths += 1
         if self._lanes_deaths > LANES_TRIES:
-            raise AgentError(f"the lanes process ended {LANES_TRIES} times at once ({why}); what it said stands above")
-        log.error("the lanes process has gone (%s); guards and programs live on, another one starts", why)
+            raise AgentError(f"the worker process ended {LANES_TRIES} times at once ({why}); its last words stand above")
+        log.error("the worker process is gone (%s); guards and programs run on, and another worker starts", why)
         self._poll.unregister(self._lanes.fileno())
         self._lanes.replace()
         self._expect_lanes()

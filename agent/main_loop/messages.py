@@ -213,5 +213,5 @@ def _unpacked(decoders: dict[str, Any], message: Order | Happened) -> Any:
         return decoders[message.kind].decode(message.body)
     except (KeyError, msgspec.MsgspecError) as error:
         raise AgentError(
-            f"the two halves of the agent do not understand each other: {message.kind}: {error}; restart it"
+            f"main loop and worker process do not understand each other: {message.kind}: {error}; restart it"
         ) from error

@@ -130,7 +130,8 @@ class Ballot:
             with contextlib.suppress(OSError):
                 aside.unlink(missing_ok=True)
             raise BallotError(
-                f"cannot keep an epoch in {self._path}: {error.strerror}; until then this robot gives no vote, takes nothing over"
+                f"cannot write an epoch to {self._path}: {error.strerror}; "
+                "until then this robot gives no vote and takes nothing over"
             ) from error
         self._record = record
         self._take_reserve()

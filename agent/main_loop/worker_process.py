@@ -31,7 +31,7 @@ MESSAGES_A_TURN: Final = 64
 
 END_PATIENCE_S: Final = 5.0
 
-LOST: Final = "the agent's lanes process was restarted in the middle of it"
+LOST: Final = "the agent's worker process restarted in the middle of it"
 
 log = logging.getLogger("failover.heart")
 
@@ -126,7 +126,7 @@ class LanesProcess:
             )
         except OSError as error:
             raise AgentError(
-                f"cannot start the lanes process: {error.strerror}; is memory or the process limit used up?"
+                f"cannot start the worker process: {error.strerror}; is memory or the process limit used up?"
             ) from error
         finally:
             theirs.close()
@@ -139,7 +139,7 @@ class LanesProcess:
     def send(self, message: ToLanes) -> None:
         """Queue a message; it leaves in `flush`, as soon as the process reads."""
         if len(self._waiting) >= WAITING_LIMIT:
-            log.error("the lanes process does not read; it is ended")
+            log.error("the worker process does not read; the main loop ends it")
             self._waiting.clear()
             if self._wanted > self._begun:
                 self._is_doomed = True  # it will miss what was for it
@@ -228,7 +228,7 @@ class LanesProcess:
         try:
             self._child.wait(END_PATIENCE_S)
         except subprocess.TimeoutExpired:
-            log.warning("the lanes process did not end in %.0f s; it is ended", END_PATIENCE_S)
+            log.warning("the worker process did not end in %.0f s; the main loop kills it", END_PATIENCE_S)
         self._kill()
         self._child.wait()
         if self._channel is not None:

@@ -74,13 +74,14 @@ def become_realtime() -> tuple[str, ...]:
             )
     except OSError as error:
         notes.append(
-            f"beats run at normal priority: SCHED_FIFO was refused ({error.strerror}); under load a live robot may be taken for "
+            f"beats run at normal priority: the system refused SCHED_FIFO ({error.strerror}); "
+            "under load a live robot may be taken for "
             "dead; give the agent CAP_SYS_NICE or a LimitRTPRIO, see systemd/failover-agent.service"
         )
     try:
         syscalls.lock_memory()
     except OSError as error:
-        notes.append(f"the heart's memory can be swapped out: {error.strerror}; give the agent CAP_IPC_LOCK")
+        notes.append(f"the main loop's memory can be swapped out: {error.strerror}; give the agent CAP_IPC_LOCK")
     return tuple(notes)
 
 

@@ -79,7 +79,8 @@ class Arrivals:
             return ""
         return (
             f"{self.turned_away} connections to port {self._port} were turned away, last from {self.last}: more than "
-            f"{ADDRESS_MAX} of one address or {OTHERS_MAX} of addresses that are not the team's, at a time; find out who connects"
+            f"{ADDRESS_MAX} of one address or {OTHERS_MAX} of addresses that are not the team's, at a time; "
+            "find the machine that connects"
         )
 
     def _has_room(self, address: str) -> bool:

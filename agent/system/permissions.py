@@ -77,7 +77,7 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
         RefusedError: it is somebody else's.
     """
     if not may(uid, owner):
-        whose = f"belongs to uid {owner}" if owner is not None else "is not known well enough here to say whose it is"
+        whose = f"belongs to uid {owner}" if owner is not None else "has no owner on record at this robot"
         raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
 
 
@@ -85,7 +85,7 @@ def without_output(told: Any) -> Any:
     """The same without what programs said, in all of its sentences: for somebody who may not read their output."""
     if isinstance(told, str):
         sentence, said, _ = told.partition(SAID)
-        return f"{sentence}; what it said is shown to its owner and root" if said else told
+        return f"{sentence}; only its owner and root may read what it said" if said else told
     if isinstance(told, Mapping):
         return {key: without_output(value) for key, value in told.items()}
     return [without_output(value) for value in told] if isinstance(told, list | tuple) else told

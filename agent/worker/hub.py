@@ -57,7 +57,7 @@ SIGN_S: Final = 1.0
 """Between two signs of one kind from a peer that cannot be authenticated: ZeroMQ tries twenty times a second."""
 
 UNFIT_KEY: Final = (
-    "this robot's secret key does not belong to its public key in team.toml: no other robot lets it in; failover team enrol "
+    "this robot's secret key does not belong to its public key in team.toml: no other robot accepts it; failover team enrol "
     "makes a fresh pair"
 )
 
@@ -180,7 +180,7 @@ class Switchboard:
         try:
             return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
         except TimeoutError:
-            raise AgentError(f"the agent's heart did not answer for {ANSWER_PATIENCE_S:.0f} s; see its log") from None
+            raise AgentError(f"the agent's main loop did not answer for {ANSWER_PATIENCE_S:.0f} s; see its log") from None
         finally:
             self._questions.pop(number, None)
 
@@ -193,7 +193,7 @@ class Switchboard:
         try:
             return await asyncio.wait_for(answer, ANSWER_PATIENCE_S)
         except TimeoutError:
-            raise AgentError(f"no decision in {ANSWER_PATIENCE_S:.0f} s; failover why tells what it waits for") from None
+            raise AgentError(f"no decision in {ANSWER_PATIENCE_S:.0f} s; see failover why") from None
         finally:
             self._commands.pop(number, None)
 
@@ -253,7 +253,7 @@ class Switchboard:
 
     def _way_changed(self, way: int, peer: str, state: LinkState, reason: str) -> None:
         """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
-        lane = "bulk lane" if way == BULK else f"lane {way}"
+        lane = "replication link" if way == BULK else f"link {way}"
         log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
         had_words = self._ways.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
@@ -283,7 +283,7 @@ class Switchboard:
         try:
             await self._lane.hold_to_devices()
         except LaneError as error:
-            log.critical("%s; the lanes begin anew", error)
+            log.critical("%s; the worker process starts anew", error)
             self._end.set()
 
     def hindrance(self, peer: str) -> str:

@@ -38,7 +38,7 @@ class Witness(Switchboard):
         if isinstance(act, acts.Answer):
             self.answered(act)
         else:
-            log.debug("%s is nothing that a witness does", type(act).__name__)
+            log.debug("a witness does not do %s", type(act).__name__)
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
         """Nobody should offer one."""

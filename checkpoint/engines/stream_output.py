@@ -39,7 +39,7 @@ class Outputs:
         """
         totals = self._counts.totals()
         if totals is None:
-            raise CaptureError("the guard stands in the middle of reading the component's output; capture it again")
+            raise CaptureError("the guard is just reading the component's output; capture it again")
         return totals
 
     def pieces(self, since: Totals, until: Totals) -> tuple[OutputPiece, ...]:

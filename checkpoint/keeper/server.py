@@ -249,9 +249,9 @@ class Keeper:
     def _lay(self, request: messages.Lay, descriptors: Descriptors) -> Answer:
         try:
             if self._is_busy:
-                raise RestoreError(f"cannot lay a ready copy in pid {request.pid}: this keeper follows a process already")
+                raise RestoreError(f"cannot build a ready copy in pid {request.pid}: this keeper follows a process already")
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
-            with untrusted.facts(f"lay a ready copy of {request.component}"):
+            with untrusted.facts(f"build a ready copy of {request.component}"):
                 is_whole = _has_several_processes(descriptors)  # who came or went within the chain is not followed
                 if is_whole:
                     self._copy = self._tracer.lay(request.pid, folded(descriptors), options)
@@ -265,7 +265,7 @@ class Keeper:
     def _advance(self, request: messages.Advance, descriptors: Descriptors) -> Answer:
         try:
             if self._copy is None:
-                raise RestoreError("cannot bring a ready copy on: this keeper has none")
+                raise RestoreError("cannot advance a ready copy: this keeper has none")
             return self._brought_on(self._copy, descriptors, request.elapsed_ns)
         finally:
             messages.close_all(descriptors)
@@ -273,7 +273,7 @@ class Keeper:
     def _brought_on(self, copy: Copy, deltas: Descriptors, elapsed_ns: int) -> Answer:
         """Apply deltas to the copy, each as soon as it is verified; what does not come as far as the last is ended."""
         try:
-            with untrusted.facts("bring a ready copy on"):
+            with untrusted.facts("advance a ready copy"):
                 for delta in deltas:
                     copy.advance(format.decode(delta))
             copy.require_clocks(elapsed_ns)
@@ -317,13 +317,13 @@ class Keeper:
 
     def _compare(self, request: messages.Compare, descriptors: Descriptors) -> Answer:
         try:
-            with untrusted.facts("compare a snapshot with what is here"):
+            with untrusted.facts("compare a snapshot with this machine"):
                 outline = carried_files.relocated(format.read_outline(descriptors[-1]), dict(request.terms.carry.places))
         finally:
             messages.close_all(descriptors)
         chosen = self._tracer if outline.engine == self._tracer.name else registry.engine_named(outline.engine)
         digests = DigestsOfFiles(request.known)
-        with untrusted.facts(f"compare {outline.component} with what is here"):
+        with untrusted.facts(f"compare {outline.component} with this machine"):
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
             if request.running:
                 return messages.Compared(chosen.contested(outline, options, request.running, request.components)), ()
@@ -331,7 +331,7 @@ class Keeper:
         return messages.Compared(found, tuple(digests.used.values())), ()
 
     def _open_file(self, request: messages.OpenFile, _: Descriptors) -> Answer:
-        session = self._following("open a file of what is followed")
+        session = self._following("open a file of the program")
         return messages.Opened(), (session.open_file(request.path, request.digest),)
 
     def _resume(self, request: messages.Resume, descriptors: Descriptors) -> Answer:
@@ -512,7 +512,7 @@ def main(arguments: list[str]) -> int:
     try:
         end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
     except OSError as error:
-        sys.stderr.write(f"keeper: nobody to serve at {arguments[1]}: {error.strerror or error}\n")
+        sys.stderr.write(f"keeper: no agent to serve at {arguments[1]}: {error.strerror or error}\n")
         return 1
     link: Channel[Request] = Channel(end, Request)
     Keeper(link, registry.engine_named(engine.PTRACE)).serve()

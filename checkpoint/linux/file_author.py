@@ -62,9 +62,9 @@ def author_of(file: int, path: str) -> Author:
     """
     about = os.fstat(file)
     if not stat.S_ISREG(about.st_mode):
-        raise _unknown(path, "it is no regular file, so nobody can tell who wrote its bytes")
+        raise _unknown(path, "it is no regular file, so its author cannot be known")
     if not about.st_nlink:
-        raise _unknown(path, "no name leads to it any more, so only who holds it open can tell what it is")
+        raise _unknown(path, "no name leads to it any more, so its author cannot be known")
     if about.st_mode & WRITABLE_BY_OTHERS:
         raise _unknown(
             path, f"others than its owner may write to it (mode {stat.S_IMODE(about.st_mode):o})", f"chmod go-w {path}"
@@ -103,7 +103,7 @@ def _author(uid: int, why: str) -> Author:
 def _unknown(path: str, why: str, cure: str = "") -> AuthorError:
     first = f"{cure}, or " if cure else "copy it to a directory of root's, as root, "
     first = first if cure else f"{first}if you know where it comes from, or "
-    return AuthorError(f"whose rights {path} may have cannot be told: {why}; {first}trust it with all rights of root (--trust)")
+    return AuthorError(f"cannot tell whose rights {path} may have: {why}; {first}trust it with all rights of root (--trust)")
 
 
 def _is_being_written(file: int, path: str) -> bool:
@@ -145,7 +145,9 @@ def _chosen_by(about: os.stat_result, path: str) -> Author:
                 continue
             folder = os.stat(place)
             if folder.st_mode & WRITABLE_BY_OTHERS and not folder.st_mode & stat.S_ISVTX:
-                raise _unknown(path, f"anybody who may write to {place} could have put another file there", f"chmod go-w {place}")
+                raise _unknown(
+                    path, f"every user who may write to {place} could have put another file there", f"chmod go-w {place}"
+                )
             shared = shared or (place if folder.st_mode & WRITABLE_BY_OTHERS else "")
             choosers.setdefault(folder.st_uid, place)
             full = os.path.join(place, part)
@@ -162,11 +164,11 @@ def _chosen_by(about: os.stat_result, path: str) -> Author:
                 place = full
         reached = os.stat(place, follow_symlinks=False)
     except OSError as error:
-        raise _unknown(path, f"{error.filename} cannot be looked at ({error.strerror})") from error
+        raise _unknown(path, f"cannot examine {error.filename} ({error.strerror})") from error
     if (reached.st_dev, reached.st_ino) != (about.st_dev, about.st_ino):
         raise _unknown(path, "another file has just taken its place")
     if about.st_nlink > 1 and shared:
-        raise _unknown(path, f"it has {about.st_nlink} names, and anybody may have made the one in {shared}")
+        raise _unknown(path, f"it has {about.st_nlink} names, and any user may have made the one in {shared}")
     choosers.pop(ROOT, None)
     if not choosers:
         return Author(None, "root", f"{path} belongs to root")

@@ -398,7 +398,7 @@ def _finish(table: CallTable, made: int, held: Resource, mode: int) -> None:
         _fill(table, made, held)
     if "uid" in facts:
         owner = number_of(facts["uid"]), number_of(facts["gid"])
-        lost = f"the deleted file {path} belongs to whom the program runs as"
+        lost = f"the deleted file {path} belongs to the user that the program runs as"
         table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
         table.attempt("", "fchmodat", -1, table.place_path(again), stat.S_IMODE(mode))  # a change of owner takes set-user-ID away
     attributes = facts.get("attributes", {})

@@ -45,7 +45,7 @@ CAPABILITIES: Final = (
         "a pipe ({})",
         "a named pipe (fifo {})",
         "an open {}",
-        "of a kind that we do not know",
+        "of a kind that failover does not know",
     ),
     refused(
         Area.SOCKETS,
@@ -199,7 +199,7 @@ def _called(held: OpenFile) -> str:
     match = re.fullmatch(r"anon_inode:\[?([a-z_-]+)\]?", target)
     if match:
         return ANONYMOUS_INODES.get(match[1], f"an open {match[1]}")
-    return f"{target}, of a kind that we do not know"
+    return f"{target}, of a kind that failover does not know"
 
 
 SOCKET_FAMILIES: Final[Mapping[int, str]] = {
@@ -356,7 +356,7 @@ def _refuse_places(pid: int) -> Iterator[str]:
     directory = procfs.read_link(pid, "cwd")
     is_kernels = directory.startswith(KERNEL_PLACES) and not proc_and_sys.left_by_ended(directory)
     if procfs.is_gone(directory) and is_kernels:
-        yield f"its working directory {directory} is gone: let it change to another one"
+        yield f"its working directory {directory} is gone: let the program change to another one"
     root = procfs.read_link(pid, "root")
     if procfs.is_gone(root):
         yield f"its root directory {root} is gone: run it in one that stays"

@@ -157,7 +157,9 @@ class SegmentReader:
         if magic != MAGIC:
             raise SegmentError(f"segment: it begins with {magic!r}, not with {MAGIC!r}")
         if (version, page) != (VERSION, PAGE):
-            raise SegmentError(f"segment: version {version} with pages of {page} bytes; we read version {VERSION} with {PAGE}")
+            raise SegmentError(
+                f"segment: version {version} with pages of {page} bytes; this release reads version {VERSION} with {PAGE}"
+            )
         if not 1 <= region_count <= MAX_REGIONS:
             raise SegmentError(f"segment: {region_count} regions where 1 to {MAX_REGIONS} are possible")
         packed = self._exactly(region_count * ENTRY.size, TABLE_OFFSET)

@@ -258,12 +258,12 @@ def _tree(held: Resource) -> Tree:
     listed, held_size = held.facts.get("entries"), held.facts.get("size")
     is_known = set(held.facts) == {"entries", "size"} and isinstance(held_size, int)
     if not is_known or not isinstance(listed, list):
-        raise RestoreError(f"cannot lay down {held.name!r}: its snapshot does not tell of carried files as we know them")
+        raise RestoreError(f"cannot write {held.name!r}: its snapshot describes carried files in an unknown form")
     if not is_carriable(held.name):
-        raise RestoreError(f"cannot lay down {held.name!r}: its snapshot does not name the path in full, as itself")
+        raise RestoreError(f"cannot write {held.name!r}: its snapshot does not name the path in full, as itself")
     tree = Tree(held.name, tuple(_entry(held.name, fact) for fact in listed), int(str(held_size)))
     if reason := _what_cannot_be(tree.entries):
-        raise RestoreError(f"cannot lay down {held.name}: its snapshot {reason}")
+        raise RestoreError(f"cannot write {held.name}: its snapshot {reason}")
     return tree
 
 
@@ -284,7 +284,7 @@ def _entry(path: str, fact: Fact) -> Entry:
         ]:
             about = mode, uid, gid, mtime_ns, device, inode, size, place
             return Entry(name, *about, target, tuple(_attributes(path, attributes)))
-    raise RestoreError(f"cannot lay down {path}: its snapshot has an entry of another form")
+    raise RestoreError(f"cannot write {path}: its snapshot has an entry of another form")
 
 
 def _attributes(path: str, listed: Iterable[Fact]) -> Iterator[tuple[str, bytes]]:
@@ -293,7 +293,7 @@ def _attributes(path: str, listed: Iterable[Fact]) -> Iterator[tuple[str, bytes]
             case [str() as name, bytes() as value]:
                 yield name, value
             case _:
-                raise RestoreError(f"cannot lay down {path}: its snapshot has an extended attribute of another form")
+                raise RestoreError(f"cannot write {path}: its snapshot has an extended attribute of another form")
 
 
 def _what_cannot_be(entries: Sequence[Entry]) -> str:

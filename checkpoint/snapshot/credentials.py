@@ -38,7 +38,7 @@ RLIMIT_NICE: Final = 13
 RLIMIT_RTPRIO: Final = 14
 LIMITS_OF_PRIORITY: Final = {RLIMIT_NICE: "RLIMIT_NICE", RLIMIT_RTPRIO: "RLIMIT_RTPRIO"}
 NOTHING: Final = (0, 0, 0, 0, 0)
-MALFORMED: Final = "the rights of its threads are told in a way that this version does not know: use the version that captured it"
+MALFORMED: Final = "this version does not understand the rights of its threads: use the version that captured it"
 
 
 class Owner(Struct, frozen=True):

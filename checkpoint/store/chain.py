@@ -44,8 +44,8 @@ def check_continues(parent: Position, delta: Snapshot) -> None:
         return
     named = f"delta {place(delta.position)} of {delta.component} continues {place(delta.parent)}"
     if (delta.parent.generation, delta.parent.sequence) == (parent.generation, parent.sequence):
-        raise ChainError(f"{named}, but with another state digest than ours: the histories diverged; ask for a base")
-    raise ChainError(f"{named}, not {place(parent)}, which we hold; ask for a base")
+        raise ChainError(f"{named}, but with another state digest than the one here: the histories diverged; ask for a base")
+    raise ChainError(f"{named}, not {place(parent)}, which is held here; ask for a base")
 
 
 def applied(table: PageTable, snapshot: Snapshot) -> PageTable:

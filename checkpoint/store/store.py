@@ -581,7 +581,9 @@ def open_store(
             raise StoreError(f"cannot open the store {root}: {why}; give it to this user alone (chown, chmod go-w)")
         lock = lock_exclusively(root / LOCK_NAME)
     except OSError as error:
-        raise StoreError(f"cannot open the store {root}: {error.strerror}; it must be a folder that we may write") from error
+        raise StoreError(
+            f"cannot open the store {root}: {error.strerror}; it must be a folder that this user may write"
+        ) from error
     if lock is None:
         raise StoreError(f"cannot open the store {root}: another process has it open; one agent uses one store")
     store = Store(root, disk, lock, retention, budget or PageBudget(CACHE_SIZE))

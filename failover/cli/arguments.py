@@ -37,9 +37,9 @@ def _name(room: argparse.ArgumentParser) -> None:
 
 
 HOOKS: Final = {
-    "before_capture": "before a whole snapshot is taken of it, and before the last one of a handover",
-    "before_resume": "on a robot where it is about to go on",
-    "after_resume": "on a robot where it went on; told which robot, epoch, generation and why in FAILOVER_* variables",
+    "before_capture": "before the agent takes a whole snapshot of it, and before the last one of a handover",
+    "before_resume": "on a robot, before it resumes there",
+    "after_resume": "on a robot, after it resumed there; FAILOVER_* variables tell robot, epoch, generation and reason",
 }
 """Occasions for a command that comes with a program, and when they are."""
 
@@ -83,8 +83,8 @@ def run(room: argparse.ArgumentParser) -> None:
         "--engine",
         choices=("auto", "ptrace", "cooperative"),
         default="auto",
-        help="ptrace: captured from outside, for a program that nobody prepared; cooperative: the program says by itself what "
-        "must survive (failover.resume, failover.component), and is started again from that (default: auto, as it turns out)",
+        help="ptrace: the agent captures the program from outside; cooperative: the program itself says what "
+        "must survive (failover.resume, failover.component), and starts again from that (default: auto: the agent detects it)",
     )
     room.add_argument(
         "--portable",
@@ -93,15 +93,15 @@ def run(room: argparse.ArgumentParser) -> None:
         const=cpu_baseline.DEFAULT,
         default="",
         metavar="LEVEL",
-        help="have libraries choose code that every processor of a level can run, so that it can go on at robots with less: "
+        help="have libraries choose code that every processor of a level can run, so that it can resume at lesser processors: "
         f"{', '.join(cpu_baseline.LEVELS)}, or no (default: as agent.toml says; without LEVEL: {cpu_baseline.DEFAULT})",
     )
     room.add_argument(
         "--output",
         choices=("immediate", "committed"),
         default="immediate",
-        help="committed: show output once another robot holds a checkpoint that contains it, so that no takeover takes back or "
-        "repeats what was seen (default: immediate, as it is written)",
+        help="committed: show output only once another robot holds a checkpoint that contains it; then no takeover takes back or "
+        "repeats output that you saw (default: immediate: show it as the program writes it)",
     )
     for hook, when in HOOKS.items():
         option = f"--{hook.replace('_', '-')}"
@@ -121,7 +121,7 @@ def _carry(room: argparse.ArgumentParser) -> None:
         metavar="PATH",
         action="append",
         default=[],
-        help="let this file, or folder with all that is in it, travel with the program, as it was at each checkpoint; may be "
+        help="send this file, or this folder with all its content, with the program, as it was at each checkpoint; may be "
         "given again (see docs/files.md)",
     )
 
@@ -132,8 +132,8 @@ def _shared(room: argparse.ArgumentParser) -> None:
         metavar="PATH",
         action="append",
         default=[],
-        help="others write to this file, or to what is in this folder, as well: it keeps the content that it has where the "
-        "program goes on, and only the program's offset is set; may be given again (see docs/files.md)",
+        help="other programs write to this file, or to files in this folder, too: where the program resumes, the file keeps "
+        "its content there, and the restore sets only the program's offset; may be given again (see docs/files.md)",
     )
 
 
@@ -145,8 +145,8 @@ def _devices(room: argparse.ArgumentParser) -> None:
         action="append",
         type=device,
         default=[],
-        help="what becomes of a device that it has open: reopen, hook, optional, or the path of what is opened in its place; may "
-        "be given again (see docs/devices.md)",
+        help="the rule for a device that it has open: reopen, hook, optional, or the path of the device to open in its place; "
+        "may be given again (see docs/devices.md)",
     )
 
 
@@ -158,7 +158,7 @@ def device(text: str) -> tuple[str, str]:
     """A path and its rule, which the agent reads."""
     path, is_there, rule = text.rpartition("=")
     if not is_there or not path.startswith("/"):
-        raise argparse.ArgumentTypeError(f"{text!r}: say which device and what becomes of it: /dev/ttyUSB0=reopen")
+        raise argparse.ArgumentTypeError(f"{text!r}: name the device and its rule: /dev/ttyUSB0=reopen")
     return path, rule
 
 
@@ -189,7 +189,7 @@ def stop(room: argparse.ArgumentParser) -> None:
 def logs(room: argparse.ArgumentParser) -> None:
     """Of ``failover logs``."""
     _name(room)
-    room.add_argument("-f", "--follow", action="store_true", help="go on until the program ends, or Ctrl-C")
+    room.add_argument("-f", "--follow", action="store_true", help="follow until the program ends, or Ctrl-C")
     room.add_argument("--stream", type=int, choices=(1, 2), help="standard output (1) or standard error (2) alone")
     _agent(room)
 
@@ -203,25 +203,27 @@ def status(room: argparse.ArgumentParser) -> None:
 
 def why(room: argparse.ArgumentParser) -> None:
     """Of ``failover why``."""
-    room.add_argument("name", metavar="NAME", nargs="?", help="one component alone, with what its robots noticed of each other")
-    room.add_argument("--robot", metavar="ROBOT", help="only what that robot saw and decided")
-    room.add_argument("--since", metavar="AGO", type=ago, help="only what is younger: 90s, 10min, 2h, 3d")
-    room.add_argument("-b", "--brief", action="store_true", help="one line each, without what stands behind it")
+    room.add_argument("name", metavar="NAME", nargs="?", help="only this component, and how its robots saw each other")
+    room.add_argument("--robot", metavar="ROBOT", help="only the entries of that robot")
+    room.add_argument("--since", metavar="AGO", type=ago, help="only younger entries: 90s, 10min, 2h, 3d")
+    room.add_argument("-b", "--brief", action="store_true", help="one line each, without the facts below it")
     _agent(room)
 
 
 def handover(room: argparse.ArgumentParser) -> None:
     """Of ``failover handover``."""
     _name(room)
-    room.add_argument("--to", metavar="ROBOT", help="where to (default: its standby)")
+    room.add_argument("--to", metavar="ROBOT", help="the target robot (default: its standby)")
     _agent(room)
 
 
 def promote(room: argparse.ArgumentParser) -> None:
     """Of ``failover promote``."""
     _name(room)
-    room.add_argument("--robot", metavar="ROBOT", help="who shall run it (default: the robot with the newest checkpoint)")
-    room.add_argument("-y", "--yes", action="store_true", help="do not ask, whatever is at risk")
+    room.add_argument(
+        "--robot", metavar="ROBOT", help="the robot that shall run it (default: the one with the newest checkpoint)"
+    )
+    room.add_argument("-y", "--yes", action="store_true", help="do not ask for confirmation, at any risk")
     _agent(room)
 
 
@@ -256,7 +258,7 @@ def capture(room: argparse.ArgumentParser) -> None:
         help="the snapshot's file; written whole or not at all, readable by you alone",
     )
     room.add_argument(
-        "--leave-running", action="store_true", help="let the program run on (default: it is ended once the snapshot is safe)"
+        "--leave-running", action="store_true", help="leave the program running (default: end it once the snapshot is safe)"
     )
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
     _shared(room)
@@ -291,7 +293,7 @@ def check(room: argparse.ArgumentParser) -> None:
     """Of ``failover check``."""
     either = room.add_mutually_exclusive_group()
     _pid(either, optional=True)
-    either.add_argument("--table", action="store_true", help="show what comes back of any program, and what is refused")
+    either.add_argument("--table", action="store_true", help="show what failover preserves of any program, and what it refuses")
     _agent(room)
 
 
@@ -309,10 +311,13 @@ def team(room: argparse.ArgumentParser) -> None:
     enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_STORY)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
-        "address", metavar="HOST[:PORT]", nargs="+", help="where it hears beats: one address for each of its links (port 7420)"
+        "address",
+        metavar="HOST[:PORT]",
+        nargs="+",
+        help="where it receives heartbeats: one address for each of its links (port 7420)",
     )
     enrol.add_argument(
-        "--bulk", metavar="HOST[:PORT]", help="where it takes snapshots, on the wired link (default: first HOST, port 7421)"
+        "--bulk", metavar="HOST[:PORT]", help="where it receives snapshots, on the wired link (default: first HOST, port 7421)"
     )
     enrol.add_argument(
         "--role",
@@ -327,7 +332,7 @@ def team(room: argparse.ArgumentParser) -> None:
 
 
 CREATE_STORY: Final = """
-    Make the team directory with a team file that knows nobody yet. Do this once, anywhere; failover team enrol adds the robots.
+    Make the team directory with an empty team file. Do this once, anywhere; failover team enrol adds the robots.
 
       failover team create lab
     """

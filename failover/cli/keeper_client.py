@@ -55,8 +55,8 @@ class Keeper:
             answer, found = self._link.receive()
         except ChannelClosedError as error:
             raise CheckpointError(
-                f"the keeper (the tracer's process) ended during {type(request).__name__}; what it traced runs on unharmed. "
-                f"It said: {self._last_words()}"
+                f"the keeper (the tracer's process) ended during {type(request).__name__}; the program runs on, "
+                f"unharmed. It said: {self._last_words()}"
             ) from error
         if isinstance(answer, Failed):
             messages.close_all(found)

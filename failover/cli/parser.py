@@ -17,12 +17,12 @@ from failover import __version__
 from failover.cli import arguments
 
 DESCRIPTION: Final = """
-A program outlives its robot: it goes on elsewhere, from where it stood a fraction of a second ago.
+When a robot dies, its programs resume at another robot, from where they were a fraction of a second ago.
 
   failover demo                    see it happen on this machine, in half a minute
-  failover check                   what this machine offers, and what is missing
+  failover check                   what this machine offers, and what it lacks
   failover run -- CMD              start a program under protection (needs an agent)
-  failover status                  how the team stands
+  failover status                  the robots, their components, and what is degraded
   failover VERB --help             a verb with examples
 """
 
@@ -82,11 +82,11 @@ def build(verb: str = "") -> argparse.ArgumentParser:
 VERBS: Final = (
     Verb(
         "demo",
-        "two robots on this machine, real programs, a power cut: the programs go on",
+        "two robots on this machine, real programs, a power cut: the programs resume",
         """
-        Start two agents on this machine, run ordinary programs under protection on the first, cut its power, and see them go on
+        Start two agents on this machine, run ordinary programs under protection on the first, cut its power, and see them resume
         at the second. Exit status 0 only if their whole output equals an undisturbed run, byte for byte. Takes under a minute
-        and removes everything it made. Root gives each robot a network of its own.
+        and removes everything it made. Run as root, it gives each robot a network of its own.
 
           failover demo
           failover demo --json | jq .programs[0].outage_ms
@@ -96,43 +96,45 @@ VERBS: Final = (
     ),
     Verb(
         "run",
-        "start a program under protection; its output and exit status become ours",
+        "start a program under protection; show its output, and end with its exit status",
         """
-        Start a program as a component of this robot. Snapshots of it go to its standby; when this robot dies, it goes on there.
-        Ctrl-C is passed on to the program. Its exit status becomes ours (128 + N if signal N ended it). --json prints how it was
-        started on standard error.
+        Start a program as a component of this robot. The agent sends snapshots of it to its standby. When this robot dies, the
+        program resumes there. This command passes Ctrl-C on to the program and ends with its exit status (128 + N if signal N
+        ended it). With --json it prints on standard error how the program was started.
 
-        While it waits, the agent may be restarted and the program may go to another robot and end there: it goes on waiting, and
-        shows each byte once. An agent that does not come back within half a minute is status 3; the program runs on.
+        This command keeps waiting, and shows each byte once, while the agent restarts, and while the program moves to another
+        robot and ends there. If no agent answers for half a minute, the exit status is 3; the program runs on.
 
-        A takeover goes on from the newest checkpoint: what was written after it is written again, and may differ from what you
-        saw. With --output=committed nothing is shown before another robot holds it, here and by failover logs. While nobody
-        stands by it waits, and failover status says so; when 8 MiB of a stream wait, the program waits in its next write.
+        After a takeover the program resumes from the newest checkpoint. It writes again what it wrote since then, and that may
+        differ from what you saw. With --output=committed this command and failover logs show output only once another robot
+        holds it. While the component has no standby, that output waits, and failover status says so. When 8 MiB of a stream
+        wait, the program waits in its next write.
 
-        It runs as you, with your groups, limits, priorities, environment, directory and umask, as if your shell had started it.
-        Besides root only you may read its output, stop, release or move it, on any robot that knows you by the same number.
+        The program runs as you, with your groups, limits, priorities, environment, directory and umask, as if your shell had
+        started it. Only you and root may read its output, stop, release or move it, on any robot that knows you by the same
+        number.
 
-        Its standard output and error are pipes that belong to it, not to this terminal, and its standard input is empty: it does
-        not see a terminal even where you have one. Many programs then write by the block and not by the line; python3 -u, or
-        stdbuf -oL before other commands, shows their output at once.
+        Its standard output and error are pipes of its own, not this terminal, and its standard input is empty: it does not see a
+        terminal even where you have one. Many programs then write by the block and not by the line; python3 -u, or stdbuf -oL
+        before other commands, shows their output at once.
 
           failover run -- python3 mapper.py --map hall.yaml
           failover run --name /lab/robot1/mapper --detach -- ./mapper
           failover run -- sh -c 'python3 counter.py --from hall; true'
 
-        A program that says what must survive (docs/decorator.md) is recognised, also below a shell or a launcher; until it says
-        so it is captured from outside, like a program that never does.
+        The agent detects a program that says what must survive (docs/decorator.md), also below a shell or a launcher. Until the
+        program says so, the agent captures it from outside, like any other program.
         """,
         arguments.run,
         "failover.cli.verbs.components:run",
     ),
     Verb(
         "protect",
-        "protect a process that runs already",
+        "protect a process that already runs",
         """
-        Take a running process under protection. It keeps its standard streams: where they are files, they go on at the other
-        robot; what it writes to a terminal or a pipe is not kept, and its exit status will not be known. What cannot be preserved
-        is refused by name, and the process is not touched then (failover check PID shows the whole list).
+        Protect a running process. It keeps its standard streams. Streams that are files continue at the other robot. failover
+        does not keep output to a terminal or a pipe, and will not know the exit status. If the process holds something that
+        failover cannot preserve, failover names it, refuses, and leaves the process untouched (failover check PID lists it all).
 
           failover protect 4711 --name /lab/robot1/mapper
         """,
@@ -141,10 +143,10 @@ VERBS: Final = (
     ),
     Verb(
         "release",
-        "let a component go: its program runs on, unprotected",
+        "end protection; the program runs on, unprotected",
         """
-        End protection. The program is not touched and runs on; its checkpoints are forgotten at every robot, so that nobody takes
-        it over. A component that has ended or failed is forgotten, and status shows it no more. May be given at any robot.
+        End protection. The program runs on, untouched. Every robot forgets its checkpoints, so no robot takes it over. The team
+        also forgets a component that has ended or failed, and status no longer shows it. Give this order at any robot.
 
           failover release /lab/robot1/mapper
         """,
@@ -155,8 +157,8 @@ VERBS: Final = (
         "stop",
         "end a component's program; no robot runs it again",
         """
-        Send the program a signal and wait for its end, which is recorded on its standby too; after 10 seconds it is killed.
-        May be given at any robot.
+        Send the program a signal and wait for its end, which the standby records too. After 10 seconds the agent kills it.
+        Give this order at any robot.
 
           failover stop /lab/robot1/mapper
           failover stop /lab/robot1/mapper --signal INT
@@ -166,12 +168,12 @@ VERBS: Final = (
     ),
     Verb(
         "status",
-        "the team as a tree: role, epoch, lag, freeze, standby, links, and what is promised now",
+        "the team as a tree: role, epoch, lag, freeze, standby, links, and the promise that holds now",
         """
         Show every robot, its components, how old their newest checkpoint is (lag), how long a snapshot stops them (freeze), and
-        in one sentence what holds if this robot dies now. Exit status 1 says that something is degraded: a program that cannot be
-        captured, checkpoints that do not arrive, a component without protection, a robot that is silent. Each is named below the
-        tree. Colours go with NO_COLOR=1; a narrow terminal gets a list instead of a table.
+        in one sentence what holds if this robot dies now. Exit status 1 says that something is degraded: failover cannot capture
+        a program, checkpoints do not arrive, a component has no protection, a robot is silent. Notes below the tree name each.
+        NO_COLOR=1 switches colours off. A narrow terminal shows a list instead of a table.
 
           failover status
           failover status --watch
@@ -182,10 +184,11 @@ VERBS: Final = (
     ),
     Verb(
         "logs",
-        "what a component wrote, without gap or repetition, from any robot",
+        "output of a component, without gap or repetition, from any robot",
         """
         Show standard output and standard error of a component from its beginning (at most the last 256 MB of each), as far as no
-        takeover can take it back; all of it once it has ended. May be given at any robot; --follow goes on through a takeover.
+        takeover can take it back, and all of it once the component has ended. Give this order at any robot. --follow continues
+        through a takeover.
 
           failover logs /lab/robot1/mapper
           failover logs --follow --stream 2 /lab/robot1/mapper
@@ -195,12 +198,12 @@ VERBS: Final = (
     ),
     Verb(
         "why",
-        "the story of the last decisions",
+        "the event log: the last decisions and their reasons",
         """
-        Tell what was seen, by whom, when, and what was done about it: the stories of all robots that answer, in one, in the order
-        in which it happened, whatever their clocks say. Below each decision stands what the robot knew: how long every peer had
-        been silent on which link, and after how long it counts as dead; whether its own loop had been late; which checkpoint it
-        could go on from, and how old that was. Kept on disk, so it goes back over restarts (about 4 MB a robot).
+        Show what each robot saw and decided, and when. This command merges the event logs of all robots that answer, in the order
+        of events, even if a clock is wrong. Below each decision stands what the robot knew: how long every peer had been silent
+        on which link, and after how long it counts as dead; whether the robot's own loop had been late; from which checkpoint it
+        could resume the component, and how old that was. Each robot keeps its log on disk, over restarts (about 4 MB a robot).
 
           failover why
           failover why /lab/robot1/mapper --since 10min
@@ -213,8 +216,9 @@ VERBS: Final = (
         "handover",
         "move a component to another robot, planned: nothing is lost",
         """
-        The last changes are sent, then the other robot goes on where this one stopped; answered when it runs there. Only the
-        standby can take it: it has the checkpoints. Whatever goes wrong, it stays where it is. May be given at any robot.
+        This robot sends the last changes, then the other robot resumes the component; this command ends when it runs there. Only
+        the standby can take it, because it has the checkpoints. If the move fails, the component stays where it is. Give this
+        order at any robot.
 
           failover handover /lab/robot1/mapper
           failover handover /lab/robot1/mapper --to robot2
@@ -224,10 +228,10 @@ VERBS: Final = (
     ),
     Verb(
         "failback",
-        "move a component back to where it belongs",
+        "move a component back to its preferred robot",
         """
-        To the robot that is preferred, or else to the one that it was started on; planned, as a handover.
-        May be given at any robot.
+        Move the component to the robot that it prefers, or else to the one where it was started; planned, as a handover.
+        Give this order at any robot.
 
           failover failback /lab/robot1/mapper
         """,
@@ -236,14 +240,15 @@ VERBS: Final = (
     ),
     Verb(
         "promote",
-        "run what is held still, without waiting for robots that are silent",
+        "run a component that is held, without waiting for silent robots",
         """
-        Have a robot run the component now, from the checkpoint that it holds, or on from where it stands still: after the loss of
-        a robot under on_loss = "hold", or where when_alone = "freeze" holds it, or where a majority waits for a robot that may
-        hold a newer checkpoint. What it would lose is told before, and what may go wrong: a silent robot may be alive, cut off,
-        and run it too. Then it asks; without a terminal it does nothing unless --yes. It runs under a new epoch, above any that
-        a silent robot can have opened. Refused while a robot that is heard has it, and without a majority where majority is the
-        rule. May be given at any robot.
+        Have a robot run the component now, from the checkpoint that the robot holds, or from where the frozen program is: after
+        the loss of a robot under on_loss = "hold", or where when_alone = "freeze" freezes it, or where a majority waits for a
+        robot that may hold a newer checkpoint. First this command tells what would be lost, and what may go wrong: a silent robot
+        may be alive, cut off, and run the component too. Then it asks for confirmation; without a terminal it does nothing unless
+        you give --yes. The component runs under a new epoch, above any that a silent robot can have opened. The team refuses
+        while a robot that it hears has the component, and under rule = "majority" without a majority. Give this order at any
+        robot.
 
           failover promote /lab/robot1/mapper
           failover promote /lab/robot1/mapper --robot robot2 --yes
@@ -253,10 +258,10 @@ VERBS: Final = (
     ),
     Verb(
         "prefer",
-        "which robot should run a component",
+        "choose the robot that should run a component",
         """
-        The component goes there as soon as that robot holds its checkpoints, and again after each takeover, once it keeps up.
-        An empty ROBOT ('') leaves it where it runs. May be given at any robot.
+        The component moves there as soon as that robot holds its checkpoints, and again after each takeover, once that robot
+        keeps up. An empty ROBOT ('') leaves it where it runs. Give this order at any robot.
 
           failover prefer /lab/robot1/mapper robot1
         """,
@@ -265,7 +270,7 @@ VERBS: Final = (
     ),
     Verb(
         "team",
-        "who belongs to the team, and by which key",
+        "the robots of the team, and their keys",
         """
         Begin a team, enrol robots, list them. The team file is the same on every robot and holds nothing secret; a robot's secret
         key stays on that robot alone. failover team ACT --help explains an act.
@@ -280,11 +285,11 @@ VERBS: Final = (
     ),
     Verb(
         "check",
-        "can this machine, or this process, be protected; and what to change",
+        "can failover protect programs here, or this process; and what to change",
         """
-        Without PID: what this machine offers, and what is missing. With PID: whether that process can be captured now,
-        what would come back otherwise than it was, and every reason why not. The process is not touched. With --table: each
-        kind of thing that a program may hold, and whether it is preserved, preserved by a rule of the operator's, or refused.
+        Without PID: what this machine offers, and what it lacks. With PID: whether failover can capture that process now, what a
+        restore would change, and every reason why not; the process is not touched. With --table: each kind of thing that a
+        program may hold, and whether failover preserves it, preserves it by a rule of the operator's, or refuses it.
 
           failover check
           failover check 4711
@@ -297,8 +302,8 @@ VERBS: Final = (
         "capture",
         "one snapshot of a process into a file; no agent needed",
         """
-        Write the whole state of a running process to FILE: memory, registers, open files, timers, signals. The process is
-        ended afterwards, so that it cannot run twice; --leave-running lets it go on.
+        Write the whole state of a running process to FILE: memory, registers, open files, timers, signals. Then end the process,
+        so that it cannot run twice; --leave-running leaves it running.
 
           failover capture 4711 -o mapper.snapshot
           failover capture 4711 -o before.snapshot --leave-running
@@ -308,14 +313,14 @@ VERBS: Final = (
     ),
     Verb(
         "restore",
-        "a process goes on from a snapshot in a file; no agent needed",
+        "resume a process from a snapshot in a file; no agent needed",
         """
-        Start the program of FILE where it stood. Prints its PID on a line of its own and returns while it runs on.
-        The old PID is kept where this user may choose it and it is free.
+        Resume the program of FILE from its snapshot. Print its PID on a line of its own and return while it runs on.
+        The program keeps its old PID if that is free and this user may choose it.
 
-        FILE says as which user it ran, and it is FILE's owner who wrote that. So root's restore gives the program the
-        rights of FILE's owner at most, and says what FILE asks for beyond those. --trust gives it all that it asks for:
-        for a file whose content you would run as root. failover inspect shows beforehand what comes back.
+        FILE says as which user the program ran, and FILE's owner wrote that. So root's restore gives the program the rights of
+        FILE's owner at most, and says what FILE asks for beyond those. --trust gives it all that FILE asks for: use it for a
+        file whose content you would run as root. failover inspect shows beforehand what a restore brings back.
 
           failover restore mapper.snapshot
           failover restore --wait mapper.snapshot && echo it ended well
@@ -325,7 +330,7 @@ VERBS: Final = (
     ),
     Verb(
         "inspect",
-        "what a snapshot's file holds",
+        "show the content of a snapshot's file",
         """
         Show the process, its memory, files and settings as a snapshot holds them, after verifying every byte of it.
 

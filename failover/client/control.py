@@ -51,14 +51,14 @@ from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, Req
 STATUS: Final = """
 robot, team, role, pid, lanes_pid, version: of this agent; life: count of its starts
 insecure: links are neither authenticated nor encrypted
-realtime: the heart runs at real-time priority with its memory locked
+realtime: the main loop runs at real-time priority with its memory locked
 rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
-memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of heart and lanes, and of the keepers of components
-    that run here; remembered: of these, what pages are remembered in, of all components together, and its bound (xor_cache of
-    agent.toml); None of a witness
-healthy: nothing is degraded, nothing has failed, nobody is silent, as far as this robot knows; with ``team`` as far as any robot
-    that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
+memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of main loop and worker, and of the keepers of
+    components that run here; remembered: of these, what pages are remembered in, of all components together, and its bound
+    (xor_cache of agent.toml); None of a witness
+healthy: nothing is degraded, nothing has failed, no robot is silent, as far as this robot knows; with ``team`` as far as any
+    robot that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
 notes: [sentence, …]: what is missing or degraded on this robot
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
@@ -87,9 +87,9 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     owner: uid of the user who may give orders about it and read its output, besides root
     promise: what holds for it; promise_differs: from the team's, by what was chosen for it, or because a server stands by
     kept: {checkpoints, older, size, newest_age_s, oldest_age_s} of this robot's store: positions to which the team may go back,
-        whole ones besides that are kept for people, bytes of all; None where it has nothing
-    lacks: what this robot, a standby, would need to go on with it and has not: a device, a file, a feature; by
-        sentence, None where nobody has looked; prepared_first: a hook gets it ready before, and may bring that
+        further whole ones that are kept for people, bytes of all; None where it has nothing
+    lacks: what this robot, a standby, would need to resume it and has not: a device, a file, a feature; by
+        sentence, None before the first look; prepared_first: a hook gets it ready before, and may bring that
     contested: at its primary: which of its files others hold open for writing, so that a restore is refused; by sentence
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
@@ -103,7 +103,7 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
 
 WHY: Final = """
 robots: [{robot, answered, reason, lines, damaged, clock_offset_ms, clock_doubt_ms}]: who was asked
-    reason: why it did not answer; damaged: lines of its story that cannot be read any more
+    reason: why it did not answer; damaged: lines of its event log that cannot be read any more
     clock_offset_ms: by how much its calendar is ahead of the asked robot's, known within clock_doubt_ms
 story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_before, epoch, state, late_ms, lease_left_ms,
     checkpoint, checkpoint_age_ms, output_pending, seen}]: in the order in which it happened
@@ -112,7 +112,7 @@ story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_befor
     life, number: of that robot's agent, and of the line in it; repeats: how often the line before was said again
     epoch_before, epoch, state: of the component at that robot; late_ms: the most that its own loop had been late lately
     lease_left_ms: until it had to stand still; None without a lease
-    checkpoint, checkpoint_age_ms: the newest from which somebody could go on: what is younger would have been lost
+    checkpoint, checkpoint_age_ms: the newest from which a robot could resume it: younger work would have been lost
     output_pending: bytes the program had written that are in no checkpoint
     seen: [{robot, state, silent_ms, limit_ms, links, hears_us, says, life, beat}]: every peer as that robot heard it
         links: {link: silent_ms}; says: what that peer last said about the component
@@ -284,7 +284,7 @@ class Control:
         try:
             return _reply_decoder.decode(self._exactly(size, verb))
         except UNDECODABLE as error:
-            raise LostAgentError(f"{self._path} answered {verb} in a way not understood: {error}; same version?") from error
+            raise LostAgentError(f"cannot understand the answer of {self._path} to {verb}: {error}; same version?") from error
 
     def _exactly(self, size: int, verb: str) -> bytes:
         parts = bytearray()
@@ -294,7 +294,7 @@ class Control:
             except OSError as error:
                 raise LostAgentError(f"lost the agent at {self._path} during {verb}: {error.strerror}") from error
             if not part:
-                raise LostAgentError(f"the agent at {self._path} went away during {verb}; components run on, see failover status")
+                raise LostAgentError(f"the agent at {self._path} ended during {verb}; components run on, see failover status")
             parts += part
         return bytes(parts)
 
@@ -317,7 +317,7 @@ ODD_SHOWN: Final = 60
 def _why_not(path: Path, error: OSError) -> str:
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
-        ConnectionRefusedError: "the socket is a left-over of an agent that ended; start failover-agent again",
+        ConnectionRefusedError: "the agent of this socket has ended; start failover-agent again",
         BlockingIOError: f"it has taken no connection for {CONNECT_TIMEOUT_S} s; too many others wait, or it hangs: see its log",
         PermissionError: "this user may not; use sudo, or join the group that owns the socket",
     }.get(type(error), error.strerror or str(error))

@@ -71,7 +71,7 @@ def read(directory: Path) -> Team:
     """
     path = directory / TEAM_FILE
     if not path.exists():
-        raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or carry it here from another robot")
+        raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or copy it here from another robot")
     team = strict_toml.read(path, Team)
     if len(team.robots) > ROBOT_LIMIT:
         raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")

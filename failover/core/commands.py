@@ -70,7 +70,7 @@ def _why_not_run(component: Component, turn: Turn) -> str:
     heard, voters = 1 + len(turn.team.living(turn.now_ns)), len(turn.config.peers) + 1
     if turn.config.by_majority and (heard < turn.config.quorum or not majority.is_free(component, turn)):
         if heard >= turn.config.quorum and not turn.team.rested(turn.now_ns):
-            return f"cannot run {name}: {turn.me} has just started and may be bound by what it said before; ask again in a moment"
+            return f"cannot run {name}: {turn.me} has just started and may be bound by its earlier votes; ask again in a moment"
         return (
             f"cannot run {name}: of {voters} that vote {turn.me} hears {heard} and needs {turn.config.quorum}; start the others"
         )
@@ -131,9 +131,12 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
 def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
     home = component.rules.prefer or (component.spec.home if component.spec else "")
     if home == turn.me and component.state in _RUNNING:
-        turn.order(acts.Answer(command.request, True, f"{component.name} runs at {home}, where it belongs"))
+        turn.order(acts.Answer(command.request, True, f"{component.name} runs at {home} already, its preferred robot"))
     elif not home:
-        refusal = f"nobody knows where {component.name} belongs; failover handover {component.name} --to ROBOT moves it"
+        refusal = (
+            f"{component.name} prefers no robot, and {turn.me} does not know where it was started; "
+            f"failover handover {component.name} --to ROBOT moves it"
+        )
         turn.order(acts.Answer(command.request, False, refusal))
     else:
         handover.begin(component, turn, home, command.request)

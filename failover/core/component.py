@@ -43,7 +43,7 @@ class Cause(enum.StrEnum):
     START = "may start it"
     RESTORE = "may restore it"
     RUNS = "runs it"
-    LEASE_OVER = "holds it still: nobody hears this robot"
+    LEASE_OVER = "freezes it: its lease is over"
     LEASE_BACK = "is heard again"
     CRASH = "saw it crash"
     HAND_OVER = "hands it over"
@@ -55,7 +55,7 @@ class Cause(enum.StrEnum):
     CANNOT = "cannot run it"
     FINISH = "records its end"
     FAIL = "records its failure"
-    RELEASE = "lets it go"
+    RELEASE = "releases it"
 
 
 _RUNNING = (State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING)

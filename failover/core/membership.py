@@ -333,7 +333,7 @@ class Membership:
 
     def _sighting(self, peer: Peer, component: str, now_ns: int) -> Sighting:
         entry = peer.entry(component)
-        says = f"{_state_name(entry.state)}, epoch {entry.epoch}, primary {entry.primary or 'nobody'}" if entry else ""
+        says = f"{_state_name(entry.state)}, epoch {entry.epoch}, primary {entry.primary or 'none'}" if entry else ""
         return Sighting(
             peer.robot,
             self._state(peer, now_ns),

@@ -226,7 +226,9 @@ class Node:
         component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
         if component is None:
             if isinstance(event, Command):
-                turn.order(acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists what is"))
+                turn.order(
+                    acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists the components")
+                )
             return []
         _tell(component, turn, event)
         return [component]
@@ -332,7 +334,7 @@ def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
         exits.exited(component, turn, Exited(component.name, component.epoch, found.status))
     elif lease.on_lease(component, turn):
         turn.order(acts.Freeze(component.name, component.epoch))
-        turn.say(component, f"{turn.me} is back and holds it still until it is heard, or knows that nobody else runs it")
+        turn.say(component, f"{turn.me} is back, and freezes it until a robot hears {turn.me}, or no other one runs it")
     else:
         component.move(Cause.LEASE_BACK)
 
@@ -377,7 +379,7 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     expected = component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING)
     if not expected or event.epoch != component.epoch:
         return
-    how = "it runs" if isinstance(event, Started) else f"it goes on from checkpoint {event.position.sequence}"
+    how = "it runs" if isinstance(event, Started) else f"it resumes from checkpoint {event.position.sequence}"
     if isinstance(event, Restored) and event.age_ns >= 0:
         component.resumed_ns, component.resumed_age_ns = turn.now_ns - event.age_ns, event.age_ns
         how += f", {event.age_ns / NS_PER_S:.1f} s old,"

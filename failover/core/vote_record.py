@@ -28,5 +28,5 @@ def decode(body: bytes) -> Ballot:
         return _decoder.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise RulesError(
-            f"cannot read the ballot: {error}; restore it, or start this robot as new with an empty state"
+            f"cannot read the vote record: {error}; restore it, or start this robot as new with an empty state"
         ) from error

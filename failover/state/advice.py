@@ -6,17 +6,17 @@ import collections.abc
 import types
 from typing import Any, Final
 
-NOT_DATA: Final = "it is no data that a state can hold; keep what it was made from and make it anew in on_resume"
+NOT_DATA: Final = "a state cannot hold it; keep the values that it was made from, and make it anew in on_resume"
 
 NO_FIELDS: Final = (
-    "nothing says what its fields are; make it a dataclass, or keep what it was made from and make it anew in on_resume"
+    "its fields are not declared; make it a dataclass, or keep the values it was made from and make it anew in on_resume"
 )
 
-_LOCK: Final = "a lock belongs to the threads of one process; make it anew at each start, outside what is kept"
-_RUNNING: Final = "what runs does not go on in another process; keep what it works on, and start it anew in on_resume"
+_LOCK: Final = "a lock belongs to the threads of one process; make it anew at each start, outside the state"
+_RUNNING: Final = "a running one cannot move to another process; keep the values that it works on, and start it anew in on_resume"
 _FILE: Final = "an open file belongs to one process; keep its path and position, and open it anew in on_resume"
 _SOCKET: Final = "a connection belongs to one process; keep the address, and connect anew in on_resume"
-_SUSPENDED: Final = "nobody can tell where it stands; keep the numbers that say it in a dataclass, and make it anew in on_resume"
+_SUSPENDED: Final = "its position cannot be read; keep the numbers that say it in a dataclass, and make it anew in on_resume"
 _FUNCTION: Final = "code is no data; keep a name or a member of an Enum, and look the function up by it"
 _QUEUE: Final = "it has locks inside; keep a collections.deque, and fill the queue from it in on_resume"
 _DICE: Final = "keep the numpy.random.Generator over it: numpy.random.default_rng(seed)"

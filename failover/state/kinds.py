@@ -87,7 +87,7 @@ class Kind(ABC):
     def stranger(self, value: object, place: Place, cure: str = "") -> KeepError:
         """The refusal of a value that is not of the declared type."""
         where = text_of(place)
-        cure = cure or "assign what is declared, or change the declaration"
+        cure = cure or "assign a value of the declared type, or change the declaration"
         return KeepError(
             f"cannot keep {where}: it holds {with_article(type(value).__name__)}, declared {self.name}; {cure}", where
         )

@@ -248,7 +248,7 @@ class Schema(Struct, frozen=True):
         try:
             wire = self._open.lower(value, walk, self._place)
         except KeepError as error:
-            raise FitError(f"{self.name}: what its migration made cannot be stored: {error}", error.place) from error
+            raise FitError(f"{self.name}: cannot store the result of its migration: {error}", error.place) from error
         notes = [f"{self.name}: migrated from version {stored.version} to {self.version}"]
         return wire, {region.name: region.memory for region in walk.regions}, True, notes
 

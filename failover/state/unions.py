@@ -187,7 +187,7 @@ def _nameless(value: object, where: str) -> KeepError:
     if cure:
         return KeepError(f"cannot keep {where}: it holds {with_article(type(value).__name__)}: {cure}", where)
     message = f"cannot keep {where}: nothing but its own type ({type(value).__name__}) would say what it is"
-    return KeepError(f"{message}; declare the type at its place, or take it out of what is kept", where)
+    return KeepError(f"{message}; declare the type at its place, or take it out of the state", where)
 
 
 def shape_of(wire: Wire) -> str:

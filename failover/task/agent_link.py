@@ -170,7 +170,7 @@ class Guarded:
         while self.durable < number:
             left = None if deadline is None else deadline - time.monotonic()
             if left is not None and left <= 0:
-                why = self.trouble or f"the standby holds commit {self.durable}; failover status says how it stands"
+                why = self.trouble or f"the standby holds commit {self.durable}; see failover status"
                 raise NotCommittedError(f"commit {number} is not safe after {timeout} s: {why}")
             if self._hearing.acquire(timeout=LOOK_S if left is None else min(left, LOOK_S)):
                 try:
@@ -214,11 +214,13 @@ def guarded() -> Guarded | None:
         _, uid, _ = _CREDENTIALS.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     except OSError as error:
         end.close()
-        log.warning("no agent keeps this state, a file does: nobody listens at %s=%s: %s", VARIABLE, told, error.strerror)
+        log.warning("no agent keeps this state, a file does: no guard listens at %s=%s: %s", VARIABLE, told, error.strerror)
         return None
     if uid not in (0, os.geteuid()):
         end.close()
-        log.warning("no agent keeps this state, a file does: who listens at %s=%s is uid %d, not we or root", VARIABLE, told, uid)
+        log.warning(
+            "no agent keeps this state, a file does: the listener at %s=%s is uid %d, not this user or root", VARIABLE, told, uid
+        )
         return None
     return Guarded(end)
 

@@ -271,8 +271,8 @@ class _Process:
     def refuse_second(self, name: str) -> None:
         if self.task is not None and self._pid == os.getpid():
             raise TaskError(
-                f"cannot keep {name}: this process keeps {self.task.name} already, and only what is in one state is "
-                "committed as one; put both into one dataclass"
+                f"cannot keep {name}: this process keeps {self.task.name} already, and a commit covers one "
+                "state; put both into one dataclass"
             )
 
 

@@ -250,6 +250,6 @@ class Recorder:
 
     def _failed(self, error: Exception) -> bool:
         if str(error) != self.trouble:
-            log.warning("a commit was not written, the program goes on: %s", error)
+            log.warning("a commit was not written; the program continues: %s", error)
         self.trouble = str(error)
         return False

@@ -14,7 +14,7 @@ from failover.errors import FailoverError
 STORY = [
     {"at": 99.0, "did": "robot1 was silent for 60 ms on every link (wire): it counts as dead"},
     {"at": 100.055, "did": "robot1 was silent for 60 ms on every link (wire): it counts as dead"},
-    {"at": 100.055, "did": "robot2 claims epoch 2, to run it from its newest checkpoint: nobody runs it"},
+    {"at": 100.055, "did": "robot2 claims epoch 2, to run it from its newest checkpoint: no robot runs it"},
     {
         "at": 100.085,
         "did": "it acts again 85.0 ms after the last word of the robot that ran it: silence 60.5 ms, asking and clearing away "

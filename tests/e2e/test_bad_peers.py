@@ -158,7 +158,7 @@ def test_beats_recorded_in_an_earlier_life_are_not_believed_in_the_next(pair: Pa
 
 def test_a_stranger_at_the_bulk_lane_is_refused_and_disturbs_nobody(pair: Pair) -> None:
     assert "REFUSED" in stranger.knock(pair[0], "robot2").upper()
-    until_said(pair[0], "a key that is not in this robot's team.toml was refused on the bulk lane", "1 of 1 connected")
+    until_said(pair[0], "this robot refused a key that is not in its team.toml on the replication link", "1 of 1 connected")
 
 
 @contextlib.contextmanager
@@ -179,7 +179,7 @@ def test_a_peer_with_another_key_is_refused_in_words_at_both_robots(pair: Pair) 
         robots.stop_agent(second)
         robots.start_agent(second)
         until_said(second, "robot1 does not know this robot's key", "this robot's secret key does not belong to its public key")
-        until_said(first, "a key that is not in this robot's team.toml was refused", "running, unprotected", "dead")
+        until_said(first, "this robot refused a key that is not in its team.toml", "running, unprotected", "dead")
     robots.stop_agent(second)
     robots.start_agent(second)
 

@@ -146,6 +146,6 @@ def test_a_program_that_stops_committing_is_seen_in_status_and_sends_nothing(
     assert (told["snapshots"], told["protection"]) == (sent, "protected")
     assert robots.checkpoints(second, "count") <= sent
     drawn = robots.failover(first, "status").stdout
-    assert "running, last commit" in drawn and "it does not commit any more" in drawn
+    assert "running, last commit" in drawn and "it commits no more" in drawn
     first.cut_power()
     robots.until(lambda: b"resumed True" in robots.output(second, "count"), "it to learn how old its state is")

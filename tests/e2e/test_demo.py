@@ -130,11 +130,11 @@ def test_programs_that_end_before_they_are_protected_are_shown_once_more_with_mo
     ran = subprocess.run(command, env=environment(place), capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     lines = ran.stdout.splitlines()
-    early = [index for index, line in enumerate(lines) if "came to its end at robot1, before the power was cut" in line]
+    early = [index for index, line in enumerate(lines) if "ended at robot1, before the power was cut" in line]
     assert len(early) == 1
-    assert lines[early[0]].endswith("; once more, with programs that take longer")
+    assert lines[early[0]].endswith("; trying again, with programs that take longer")
     assert any("power cut" in line for line in lines[early[0] :])
-    assert lines[-1] == "the programs outlived their robot"
+    assert lines[-1] == "every program resumed, and its output is complete"
     assert_nothing_left(place)
 
 

@@ -78,8 +78,8 @@ def test_a_driver_goes_on_with_the_device_of_the_other_robot(tmp_path: Path) -> 
             for order in (("handover", "driver"), ("prefer", "driver", "robot2")):
                 refused = robots.failover(first, *order)
                 assert refused.returncode == 1 and lack in refused.stderr, refused
-            assert "robot2 could not go on with it" in robots.failover(first, "status").stdout
-            assert f"could not go on here: {lack}" in robots.failover(second, "check").stdout
+            assert "robot2 could not resume it" in robots.failover(first, "status").stdout
+            assert f"could not resume here: {lack}" in robots.failover(second, "check").stdout
             assert told(first_line, b"two\n") == b"got two\n", "it was never stopped"
             there.symlink_to(os.ttyname(second_end))
             robots.until_protected(first, "driver")

@@ -228,4 +228,4 @@ def test_a_program_is_told_by_a_signal_where_it_is_now(tmp_path: Path) -> None:
         notes = robots.component(second, "deaf")["notes"]
         assert any("neither handles nor blocks SIGUSR2" in note for note in notes), notes
         refused = robots.failover(first, "run", "--before-capture", "signal:SIGUSR2", "--", "/bin/true")
-        assert refused.returncode == 1 and "only after_resume takes one" in refused.stderr, refused
+        assert refused.returncode == 1 and "only after_resume takes a signal" in refused.stderr, refused

@@ -58,7 +58,7 @@ def test_the_server_returns_a_component_to_an_empty_robot_as_the_page_tells_it(t
         typed.type(kill)  # people type slowly: what it ends may still write to the directory that goes next
         robots.until(lambda: not any(map(lives, there)), "the end of both robots")
         typed.type("\n".join(later))
-        robots.until(lambda: "it goes on from checkpoint" in typed.type(why), "the counter to go on")
+        robots.until(lambda: "it resumes from checkpoint" in typed.type(why), "the counter to go on")
         before = len(typed.type(logs).split())
         robots.until(lambda: len(typed.type(logs).split()) > before + SEEN, "the counter to count on")
         numbers = typed.type(logs).split()

@@ -66,7 +66,7 @@ def forgotten(pair: Pair) -> Iterator[None]:
         (("handover", "sleeper", "--to", "mars"), FAILED, "the team knows robot1, robot2"),
         (("prefer", "sleeper", "mars"), FAILED, "the team knows robot1, robot2"),
         (("prefer", "sleeper"), USAGE, "the following arguments are required: ROBOT"),
-        (("failback", "sleeper"), HEALTHY, "runs at robot1, where it belongs"),
+        (("failback", "sleeper"), HEALTHY, "runs at robot1 already, its preferred robot"),
         (("protect", "1073741823"), FAILED, "No such process"),
         (("protect", "me"), USAGE, "is not a whole number above zero"),
         (("logs", "nobody"), FAILED, "no component is called 'nobody'"),
@@ -106,7 +106,7 @@ def test_a_process_that_is_protected_already_is_refused_by_its_name(pair: Pair) 
     pid = robots.component(pair[0], "sleeper")["pid"]
     ran = robots.failover(pair[0], "protect", str(pid))
     assert ran.returncode == FAILED
-    assert "is protected already, as /demo/robot1/sleeper; failover release lets it go" in ran.stderr
+    assert "is protected already, as /demo/robot1/sleeper; failover release ends that" in ran.stderr
 
 
 def test_ctrl_c_reaches_the_program_and_its_exit_status_comes_back(pair: Pair) -> None:

@@ -90,7 +90,7 @@ def test_a_takeover_from_an_old_checkpoint_says_how_old_it_is(pair: Pair, flag: 
 def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pair, flag: Path) -> None:
     first, second = pair
     flag.touch()
-    robots.until_status(first, 1, "protected no longer", "a pidfd", "failover release, then protect, begins anew")
+    robots.until_status(first, 1, "not protected any more", "a pidfd", "to protect it again: failover release, then protect")
     robots.until(lambda: robots.component(second, "count").get("standby") == "", "robot2 to forget its checkpoints")
     flag.unlink()
     shown = robots.component(first, "count")
@@ -140,7 +140,7 @@ def test_a_standby_that_falls_silent_leaves_its_primary_unprotected_and_said_so(
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGSTOP)
     shown = robots.until_status(first, 1, "dead", "running, unprotected")
-    assert "hears nobody" in shown
+    assert "hears no other robot" in shown
     before = len(robots.output(first, "count"))
     robots.until(lambda: len(robots.output(first, "count")) > before, "the program to run on")
 

@@ -80,7 +80,7 @@ def test_a_program_stands_still_while_its_robot_is_alone(pair: Pair) -> None:
             os.kill(pid, signal.SIGSTOP)
     robots.until(lambda: robots.component(first, "count").get("state") == "frozen", "it to stand still")
     shown = robots.failover(first, "status")
-    assert (shown.returncode, "held still: nobody entrusted with it hears this robot" in shown.stdout) == (1, True), shown
+    assert (shown.returncode, "held still: no robot entrusted with it hears this robot" in shown.stdout) == (1, True), shown
 
 
 @settings("snapshot_period_ms = 1000\n")

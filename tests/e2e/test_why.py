@@ -44,7 +44,7 @@ def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the
     first, second = pair
     first.cut_power()
     robots.until_taken_over(second)
-    robots.until(lambda: bool(lines(second, "goes on from checkpoint")), "the story to be told")
+    robots.until(lambda: bool(lines(second, "resumes from checkpoint")), "the story to be told")
     (claim,) = lines(second, "claims epoch", "--robot", "robot2")
     (seen,) = claim["seen"]
     assert (seen["robot"], seen["state"]) == ("robot1", "dead")
@@ -56,7 +56,7 @@ def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the
     by_robot = {one["robot"]: one for one in why(second)["robots"]}
     assert not by_robot["robot1"]["answered"] and by_robot["robot1"]["reason"]
     shown = robots.failover(second, "why", "count").stdout
-    assert "robot1: counted as dead, silent for" in shown and "robot1 did not tell its part:" in shown, shown
+    assert "robot1: counted as dead, silent for" in shown and "robot1 did not send its event log:" in shown, shown
 
     before = why(second, "count", "--robot", "robot2")["story"]
     robots.keep_on(second)
@@ -115,7 +115,7 @@ def test_both_robots_tell_one_story_in_order_though_a_clock_is_wrong_by_five_sec
     robots.until_taken_over(second)
     os.kill(agent, signal.SIGCONT)
     robots.until(lambda: robots.component(first, "count").get("role") == "standby", "robot1 to follow")
-    robots.until(lambda: bool(lines(first, "is told stale")), "the story to be told")
+    robots.until(lambda: bool(lines(first, "hears that its copy is stale")), "the story to be told")
     for robot, other, ahead_ms in ((first, "robot2", SKEW_S * 1_000), (second, "robot1", -SKEW_S * 1_000)):
         told = robots.until(lambda at=robot: told_by_both(at), "both robots to tell their part")  # type: ignore[misc]
         clocks = {one["robot"]: one["clock_offset_ms"] for one in told["robots"]}
@@ -144,7 +144,7 @@ def expect_the_order(story: list[dict[str, Any]]) -> None:
     noticed = [at for at in places("robot2", "robot1 was silent for") if at < claim]
     woke = places("robot1", "itself stood still", after=claim)  # on a busy machine also later, once more
     assert noticed and woke, did
-    stale = places("robot1", "is told stale", after=woke[0])
+    stale = places("robot1", "hears that its copy is stale", after=woke[0])
     assert stale, did
     instants = [story[place]["at"] for place in (noticed[-1], claim, woke[0], stale[0])]
     assert instants == sorted(instants), "by the one clock that they are shown on"

@@ -305,7 +305,7 @@ def test_a_segment_of_another_version_is_refused_and_left_alone(tmp_path: Path) 
     content = bytearray(path.read_bytes())
     content[8] = 2
     path.write_bytes(content)
-    assert "it is of version 2 with pages of 4096 bytes, we read version 1" in asks(tmp_path)[0]
+    assert "it is of version 2 with pages of 4096 bytes, this header reads version 1" in asks(tmp_path)[0]
     assert path.read_bytes() == content
 
 

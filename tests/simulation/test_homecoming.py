@@ -42,7 +42,7 @@ def test_it_goes_to_a_robot_that_lacks_nothing() -> None:
 def test_it_waits_while_the_robot_lacks_something_and_status_says_what() -> None:
     world = at_robot1(LACK)
     assert later(world, LONG_MS) == ["robot1"]
-    assert f"its return to robot2 waits, which could not go on with it: {LACK[0]}" in notes(world)
+    assert f"its return waits: robot2 could not resume it: {LACK[0]}" in notes(world)
     told = [one.sentence for one in world.robots["robot1"].told]
     assert sum("it does not return to robot2" in sentence for sentence in told) == 1
     assert not any("handover" in sentence or "hand it over" in sentence for sentence in told), "it was never held still for that"
@@ -53,7 +53,7 @@ def test_it_waits_while_the_robot_lacks_something_and_status_says_what() -> None
 
 def test_what_its_operator_says_meanwhile_counts() -> None:
     world = at_robot1(LACK)
-    assert later(world, 1_000) == ["robot1"] and "its return to robot2 waits" in notes(world)
+    assert later(world, 1_000) == ["robot1"] and "its return waits: robot2" in notes(world)
     world.command("robot1", Prefer(world.request(), PART, ""))
     world.robots["robot2"].lacks = ()
     assert later(world, LONG_MS) == ["robot1"] and "waits" not in notes(world)
@@ -61,6 +61,6 @@ def test_what_its_operator_says_meanwhile_counts() -> None:
 
 def test_what_one_robot_lacked_is_not_said_of_the_one_that_is_preferred_then() -> None:
     world = at_robot1(LACK)
-    assert later(world, 1_000) == ["robot1"] and "its return to robot2 waits" in notes(world)
+    assert later(world, 1_000) == ["robot1"] and "its return waits: robot2" in notes(world)
     world.command("robot1", Prefer(world.request(), PART, "robot2"))
     assert "waits" not in notes(world), "it is asked anew"

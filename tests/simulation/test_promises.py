@@ -87,7 +87,7 @@ def kept_aside_at(robots: list[str]) -> Watcher:
 
 def test_whoever_is_silent_is_replaced() -> None:
     two = team()
-    assert "whoever is silent for 170 ms (up to 300 where beats come late) is replaced" in two.says("robot1")
+    assert "a robot that is silent for 170 ms (up to 300 where beats come late) is replaced" in two.says("robot1")
     two.world.power_off("robot1")
     assert two.after(160) == []
     assert two.after(200) == ["robot2"]
@@ -96,8 +96,8 @@ def test_whoever_is_silent_is_replaced() -> None:
 def test_a_total_cut_between_two_that_live_can_run_a_component_twice() -> None:
     two = team()
     says = two.says("robot1")
-    assert "a total cut between two that live can run a component twice until they meet again" in says
-    assert "then the copy that never stopped goes on" in says
+    assert "after a total cut two live robots can both run a component until they hear each other" in says
+    assert "then the copy that never stopped continues" in says
     two.cut("robot1", "robot2")
     assert two.after(500) == ["robot1", "robot2"]
 
@@ -137,13 +137,13 @@ def test_the_team_of_two_says_its_rule_and_its_promise_in_one_sentence_each() ->
     promises = [one.promise for one in status.components]
     assert promises == [
         "If robot1 is silent for 170 ms (up to 300 where beats come late), robot2 runs it; "
-        "it may run twice if both live on and cannot hear each other; then the copy that never stopped goes on."
+        "it may run twice if both live on and cannot hear each other; then the copy that never stopped continues."
     ]
 
 
 def test_except_where_when_alone_is_freeze_there_it_stands_still_here_first() -> None:
     two = team(alone=WhenAlone.FREEZE)
-    assert "except where when_alone is freeze" in two.says("robot1")
+    assert "when_alone = freeze prevents that" in two.says("robot1")
     assert two.says_of_it("robot1") == (
         "If robot1 is silent for 170 ms (up to 300 where beats come late), robot2 runs it; it stands still here first."
     )
@@ -165,7 +165,7 @@ def test_who_hears_nobody_says_that_nothing_is_protected() -> None:
     two = team()
     two.world.power_off("robot2")
     two.after(500)
-    assert two.says("robot1") == "robot1 hears nobody: what runs here is not protected."
+    assert two.says("robot1") == "robot1 hears no other robot: its programs are not protected."
 
 
 # rule = "majority"
@@ -187,7 +187,7 @@ def test_without_a_majority_what_runs_here_stands_still_and_nothing_is_taken_ove
     assert three.after(500) == ["robot1"]
     three.cut("robot1", "robot2")
     assert three.after(500) == [] and three.after(1_000) == []
-    sentence = "1 of 3 that vote, itself among them, and 2 are a majority: what runs here stands still, and nothing is taken over"
+    sentence = "1 of 3 that vote, itself among them, and 2 are a majority: its programs stand still, and it takes nothing over"
     assert sentence in three.says("robot1") and sentence in three.says("robot2")
     three.world.power_on("witness1")
     assert three.after(500) == ["robot1"]
@@ -231,7 +231,7 @@ def test_where_a_server_stands_by_it_gives_the_checkpoint_to_the_first_robot_tha
 
 def test_a_witness_votes_and_holds_nothing() -> None:
     three = team(robots=2, witnesses=1)
-    assert three.says_of_it("witness1") == "witness1 votes for who runs it; now that is robot1."
+    assert three.says_of_it("witness1") == "witness1 votes for the robot that runs it, now robot1."
     assert not three.world.robots["witness1"].store
 
 
@@ -273,7 +273,7 @@ def test_two_that_decide_by_different_rules_start_and_take_over_nothing_between_
     assert two.after(1_000) == ["robot1"]
     world.power_on("robot2")
     assert two.after(2_000) == ["robot1"] and state_at(world, "robot2", PART) is State.ABSENT
-    sentence = "robot1 decides by rule = pair, robot2 by another: nothing is started, taken over, moved or protected between them"
+    sentence = "robot1 decides by rule = pair, robot2 by another: between them they start, take over, move and protect nothing"
     assert sentence in two.says("robot1") and "robot2 decides by rule = majority, robot1 by another" in two.says("robot2")
     assert any(sentence in one.sentence for one in world.robots["robot1"].told)
     world.power_off("robot1")

@@ -88,7 +88,7 @@ def test_an_operator_is_told_of_a_copy_that_may_act_and_nothing_is_done() -> Non
     world.power_off("robot1")
     later(world, 2_000)
     sentence = told(world, "robot2", is_trial=True)
-    assert "would go on at robot2 from checkpoint" in sentence and "what was done since is lost" in sentence
+    assert "would resume at robot2 from checkpoint" in sentence and "the work since then is lost" in sentence
     assert "robot1 has not been heard for 2 s; if it lives it may run it too" in sentence
     assert later(world) == []
 

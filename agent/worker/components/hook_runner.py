@@ -92,7 +92,7 @@ class Occasions(Struct):
         name = signal.Signals(number).name
         if failure:
             self.figures.hooks["after_resume"] = f"after_resume (signal:{name}) failed on {self.around.places.robot}: {failure}"
-        said = self.figures.hooks.get("after_resume") or f"after_resume: it was told by {name}, before its next instruction"
+        said = self.figures.hooks.get("after_resume") or f"after_resume: it got {name} before its next instruction"
         self.around.tell(events.Noticed(self.name, said))
 
     async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion, pid: int) -> None:

@@ -152,7 +152,7 @@ class Hooks(Struct, frozen=True):
 
     def _failure(self, name: str, status: int) -> str:
         if self.starter:
-            return f"journalctl --unit failover-hook-{name} tells how"
+            return f"see journalctl --unit failover-hook-{name}"
         return f"exit status {status}" if status > 0 else f"signal {-status}"
 
     async def _begun(self, name: str, hook: Hook, environment: Mapping[str, str]) -> _Running:
@@ -218,7 +218,10 @@ class _Running(Struct):
         finally:
             reading.cancel()
         if not done:
-            log.info("a process that hook %d has left behind has its output open; what it says is not heard", self.process.pid)
+            log.info(
+                "a process that hook %d left behind still has its output open; the agent does not read that output",
+                self.process.pid,
+            )
         return self.said
 
     async def _read(self) -> None:

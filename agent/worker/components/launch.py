@@ -252,7 +252,7 @@ async def lay(
 
 def stale(name: str) -> ChainError:
     """A ready copy does not lead to what the store holds now: a base has come."""
-    return ChainError(f"the ready copy of {name} must be laid again: a new chain has begun")
+    return ChainError(f"the ready copy of {name} must be built again: a new chain has begun")
 
 
 async def finish(

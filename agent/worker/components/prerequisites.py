@@ -41,7 +41,7 @@ async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
     try:
         found = await errands.send(robot, "lacks", {"name": name}, patience_s=PATIENCE_S)
     except RefusedError as untold:
-        log.warning("%s: whether it could go on at %s is not known: %s", name, robot, untold)
+        log.warning("%s: cannot tell whether it could resume at %s: %s", name, robot, untold)
         return ()
     reasons = found.get("lacks")
     return tuple(map(str, reasons)) if isinstance(reasons, list) else ()
@@ -107,9 +107,9 @@ async def _told_by_one_keeper(
             except StoreError:
                 continue  # there is no checkpoint of it here yet, or no more
             except (CheckpointError, OSError) as trouble:
-                log.warning("%s: cannot look whether it could go on here: %s", charge.name, trouble)
+                log.warning("%s: cannot check whether it could resume here: %s", charge.name, trouble)
     except TROUBLE as trouble:
-        log.warning("cannot look which components could go on here: %s", trouble)
+        log.warning("cannot check which components could resume here: %s", trouble)
     finally:
         if keeper is not None:
             keeper.end()

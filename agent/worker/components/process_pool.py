@@ -174,7 +174,7 @@ class Nursery:
         try:
             self.prepare()
         except (GuardError, KeeperLostError) as error:
-            log.warning("no guard and keeper wait in advance, a takeover will take longer: %s", error)
+            log.warning("the agent has no spare guard and keeper, so a takeover will take longer: %s", error)
 
     async def _guard_born(self) -> Dialogue:
         name = _new_name()
@@ -227,7 +227,7 @@ class Nursery:
                 return _call(path)
             status = child.poll()
             if status is not None and (status or not self._starter):  # systemd-run ends well as soon as it has been started
-                raise GuardError(f"{what} ended at once, status {status}; what it said stands in the agent's log")
+                raise GuardError(f"{what} ended at once, status {status}; its last words stand in the agent's log")
             await asyncio.sleep(POLL_S)
             waited += POLL_S
         child.kill()

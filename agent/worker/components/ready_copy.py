@@ -144,7 +144,7 @@ class ReadyCopy:
             except TROUBLE as trouble:
                 failures = 0 if time.monotonic() - laid_s >= STEADY_S else failures
                 pause_s, failures, laid_s = PAUSES_S[min(failures, len(PAUSES_S) - 1)], failures + 1, math.inf
-                log.info("%s: its ready copy is laid again: %s", self._name, trouble)
+                log.info("%s: its ready copy must be built again: %s", self._name, trouble)
                 await self._end(str(trouble))
             if told != (self._ready is not None):
                 told = not told

@@ -68,7 +68,7 @@ async def brought_back(
             stood_still=act.why is Resumption.HANDED_OVER,
         )
     if spec is None:
-        raise RestoreError(f"cannot start {name} again: this robot was never told its command; start it by failover run")
+        raise RestoreError(f"cannot start {name} again: this robot does not know its command; start it by failover run")
     program = again(around, spec, newest)
     return await launch.begin_again(
         name,

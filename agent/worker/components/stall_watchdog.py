@@ -81,7 +81,7 @@ class Watchman:
 
     def end(self, why: str) -> None:
         """End the process."""
-        log.error("%s, pid %d, is ended: %s", self._whom, self._pid, why)
+        log.error("ending %s, pid %d: %s", self._whom, self._pid, why)
         with contextlib.suppress(ProcessLookupError):
             os.kill(self._pid, signal.SIGKILL)
 

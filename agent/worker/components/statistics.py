@@ -60,8 +60,8 @@ class Commits(Struct):
         """What to say of a program that is overdue, for somebody who looks at ``failover status`` for the first time."""
         used = "its only one" if self.usual_ns is None else f"before that there was one every {seconds(self.usual_ns)}"
         return (
-            f"last commit {seconds(now_ns - self.newest_ns)} ago, {used}: it does not commit any more, or it hangs; "
-            "if its robot is lost now, it goes on from that commit"
+            f"last commit {seconds(now_ns - self.newest_ns)} ago, {used}: it commits no more, or it hangs; "
+            "if its robot is lost now, it resumes from that commit"
         )
 
 

@@ -393,14 +393,14 @@ class Charge:
                 laps.lap("its descriptors, timers and registers")
                 return await self._let_it_run(copied.component, act, outage_ns, laps)
             except TROUBLE as trouble:
-                log.warning("%s: its ready copy cannot go on, it is restored from its chain: %s", self.name, trouble)
+                log.warning("%s: its ready copy cannot resume; the agent restores it from its chain: %s", self.name, trouble)
         waiting = self.standby.take()
         if waiting is not None:
             try:
                 component = await resume.brought_back(self.around, act, chain, outage_ns, laps, waiting)
                 return await self._let_it_run(component, act, outage_ns, laps)
             except TROUBLE as trouble:
-                log.warning("%s: what waited here cannot go on with it, it is started anew: %s", self.name, trouble)
+                log.warning("%s: the program that waited here cannot resume it; the agent starts it anew: %s", self.name, trouble)
         component = await resume.brought_back(self.around, act, chain, outage_ns, laps)
         return await self._let_it_run(component, act, outage_ns, laps)
 
@@ -474,7 +474,9 @@ class Charge:
     async def _keep_aside(self, act: acts.KeepAside) -> None:
         component = self._present()
         path = await self._snapshots.keep_aside(component, act)
-        self._notice(f"the copy that lost is kept for inspection in {path}; its output since is shown to nobody", component)
+        self._notice(
+            f"the copy that lost is kept for inspection in {path}; failover logs does not show its output since then", component
+        )
 
     async def _report(self, act: acts.ReportExit) -> None:
         """The end is a record now: tell who waits, and let the guard go."""

@@ -134,7 +134,7 @@ async def _hindrance(component: Component) -> str:
     if component.ended.done():
         return f"it {_how(component)} before it asked for its state" + _said(component)
     if not component.connected.is_set():
-        return f"it has not asked for its state within {READY_S:.0f} s; what takes so long belongs after failover.resume()"
+        return f"it has not asked for its state within {READY_S:.0f} s; put such long work after failover.resume()"
     return ""
 
 

@@ -18,7 +18,7 @@ from msgspec import Struct
 WATCHDOGS: Final = Path("/sys/class/watchdog")
 ACTIVE: Final = "active"
 
-GUARDED: Final = "a program whose lease is over is frozen by its guard, whatever becomes of the agent"
+GUARDED: Final = "a guard freezes its program when the lease is over, even if the agent has ended"
 
 
 class Watchdog(Struct, frozen=True):
@@ -51,13 +51,14 @@ def sentence(found: Watchdog | None) -> str:
     """For ``failover status``."""
     if found is None:
         return (
-            f"{GUARDED}; if all of this robot stood still at once and went on later, nothing here would help: no hardware "
-            "watchdog is active; switch such a robot off from outside, or let actuators check the epoch (failover.Gateway)"
+            f"{GUARDED}; if all of this robot stood still at once and continued later, nothing here would stop its "
+            "programs: no hardware watchdog is active; switch such a robot off from outside, or let actuators check the epoch "
+            "(failover.Gateway)"
         )
     if not found.is_told:
         return (
             f"{GUARDED}; if all of this robot stood still at once, only its watchdog ({found.identity}) would help, and this "
-            "kernel does not tell whether anybody feeds it; systemctl show --property=RuntimeWatchdogUSec does"
+            "kernel does not tell whether a program feeds it; systemctl show --property=RuntimeWatchdogUSec does"
         )
     after = f"after {found.timeout_s} s" if found.timeout_s else "after its timeout"
     return f"{GUARDED}; if all of this robot stood still at once, its watchdog ({found.identity}) would reset it {after}"

@@ -146,8 +146,8 @@ def told_lacks(view: ComponentView, charge: Charge | None, robot: str) -> list[s
         return []
     lacks = _lacks(view, charge.figures) or ()
     if charge.is_prepared_first:
-        return [f"{robot} lacks now, and its hook before_resume is to bring: {lack}" for lack in lacks]
-    return [f"{robot} could not go on with it: {lack}" for lack in lacks]
+        return [f"{robot} lacks this now, and the hook before_resume must bring it: {lack}" for lack in lacks]
+    return [f"{robot} could not resume it: {lack}" for lack in lacks]
 
 
 def _contested(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:

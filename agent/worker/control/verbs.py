@@ -176,7 +176,7 @@ class Verbs(Questions):
         assert guest.rights is not None, "it was asked whose it is"
         for known in self._lanes.charges.values():
             if known.component is not None and known.component.pid == wanted.pid:
-                raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release lets it go")
+                raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release ends that")
         name = await self._fresh_name(wanted.name, "", caller.uid)
         carried, devices = self._carried(name, wanted.carry), self._device_rules(name, wanted.devices)
         connections = self._connections(name, wanted.connections)
@@ -240,7 +240,7 @@ class Verbs(Questions):
         if robot not in await self._reachable():
             return
         if reasons := await prerequisites.asked_of(self._lanes.errands, robot, name):
-            sentence = f"cannot {verb} {name} to {robot}, where it could not go on: {'; '.join(reasons)}"
+            sentence = f"cannot {verb} {name} to {robot}, which could not resume it: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 
     async def _moved(self, by: int, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
@@ -265,7 +265,7 @@ class Verbs(Questions):
             if view.get("role") == "primary" and view["state"] in ("running", "degraded"):
                 return view
             if view.get("state") in ("ended", "failed") or view.get("primary") not in (robot, None):
-                sentence = "; ".join((*view.get("reasons", ()), *view.get("notes", ()))) or "failover why tells the story"
+                sentence = "; ".join((*view.get("reasons", ()), *view.get("notes", ()))) or "see failover why"
                 raise RefusedError(f"{robot} took {name} and does not run it: {sentence}")
             if clock.now_ns() > deadline_ns:
                 raise RefusedError(
@@ -396,7 +396,7 @@ class Verbs(Questions):
         if end.done() and end.result().failed:
             raise RefusedError(f"cannot start {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
         if not charge.started.is_set():
-            raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; failover why {name} tells what it waits for")
+            raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; see failover why {name}")
         return charge
 
     async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:

@@ -114,7 +114,7 @@ class Telling:
         try:
             kept = await asyncio.to_thread(event_log.read, Path(self._lanes.settings.config.state_directory))
         except OSError as error:
-            raise RefusedError(f"the story that is kept here cannot be read: {error.strerror}") from error
+            raise RefusedError(f"this robot cannot read its event log: {error.strerror}") from error
         found = {_place(line): line for line in (*kept.lines, *told.story)}
         now = _reading()
         chosen = [
@@ -136,7 +136,9 @@ class Telling:
         except RefusedError as refusal:
             heard.reason = str(refusal)
         except (*UNDECODABLE, LookupError, TypeError, ValueError) as error:
-            heard.reason = f"{robot} told its story in a way not understood: {error}; install the same release on both"
+            heard.reason = (
+                f"{robot} sent an event log that this robot does not understand: {error}; install the same release on both"
+            )
         return heard
 
     async def _fetch(self, heard: Heard, component: str, age_ms_max: int) -> None:

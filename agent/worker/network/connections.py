@@ -71,7 +71,7 @@ class Ways:
             except LaneError as error:
                 if way == BULK:
                     raise
-                self.troubles.append(f"orders do not travel over a further link: {error}")
+                self.troubles.append(f"orders cannot use a further link: {error}")
                 log.warning("%s", self.troubles[-1])
 
     async def close(self) -> None:
@@ -109,7 +109,7 @@ class Ways:
             return "it is no robot of this team"
         if any(_is_connected(lane, peer) for lane in self._lanes):
             return ""
-        return f"the bulk lane is {link.state}" + (f", {link.reason}" if link.reason else "")
+        return f"the replication link is {link.state}" + (f", {link.reason}" if link.reason else "")
 
     def beat_key(self, peer: str) -> bytes:
         """The key for our beats to a peer on a new connection: a fresh one with the first, told again on any further."""

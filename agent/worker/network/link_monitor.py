@@ -38,7 +38,7 @@ class Wires:
         try:
             self._listener = rtnetlink.changes()
         except OSError as error:
-            log.warning("the kernel does not tell when a cable is pulled (%s); it is asked every %.0f s", error.strerror, POLL_S)
+            log.warning("the kernel does not report a pulled cable (%s); the agent asks it every %.0f s", error.strerror, POLL_S)
         if self._listener is not None:
             asyncio.get_running_loop().add_reader(self._listener.fileno(), self._stir)
         self._stirred.set()

@@ -117,11 +117,11 @@ class Facts:
         if one.hardware in RADIO_HARDWARE:
             return f"its hardware type is {one.hardware}"
         if one.name in self._listed():
-            return "it stands in /proc/net/wireless"
+            return "/proc/net/wireless lists it"
         if because := self._sysfs_radio(one):
             return because
         if one.kind in TUNNELS or one.hardware in NONE_HARDWARE:
-            return f"it is a tunnel or a modem ({one.kind or one.hardware}): nobody can tell what carries its bytes"
+            return f"it is a tunnel or a modem ({one.kind or one.hardware}): the medium of its bytes cannot be known"
         for other in scene.links.values():
             stands_on = other.index == one.lower and one.kind != "veth"  # a veth's other end is no lower one
             if depth and (stands_on or other.master == one.index) and (because := self._radio(other, scene, depth - 1)):

@@ -70,9 +70,7 @@ class Errands:
             self._say(peer, Errand(number, verb, msgspec.msgpack.encode(arguments), by))
             done = await asyncio.wait_for(answer, patience_s)
         except TimeoutError:
-            raise RefusedError(
-                f"{peer} did not answer to {verb} in {patience_s:g} s; failover status tells how it stands"
-            ) from None
+            raise RefusedError(f"{peer} did not answer to {verb} in {patience_s:g} s; see failover status") from None
         finally:
             self._waiting.pop((peer, number), None)
         if done.refusal:
@@ -80,7 +78,9 @@ class Errands:
         try:
             return msgspec.msgpack.decode(done.content, type=dict[str, Any])
         except UNDECODABLE as error:
-            raise RefusedError(f"{peer} answered {verb} in a way not understood: {error}; same release there?") from error
+            raise RefusedError(
+                f"this robot does not understand the answer of {peer} to {verb}: {error}; same release there?"
+            ) from error
 
     def done(self, peer: str, message: ErrandDone) -> None:
         """A peer has answered."""

@@ -214,7 +214,7 @@ class Link:
             with contextlib.suppress(LaneError):
                 await asyncio.shield(self._chunk[1])
         if self.state is not LinkState.CONNECTED:
-            raise LaneError(f"the bulk lane to {self.peer} is down: {self.reason or self.state}")
+            raise LaneError(f"the replication link to {self.peer} is down: {self.reason or self.state}")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._chunk = (encode_bulk(chunk), done)
         self._wake.set()
@@ -265,7 +265,7 @@ class Link:
             elif kind == zmq.EVENT_DISCONNECTED and self.state is not LinkState.REFUSED:
                 self._enter(LinkState.CONNECTING, "the connection was lost")
             elif kind == zmq.EVENT_CLOSED and self.state is LinkState.CONNECTING:
-                self._enter(LinkState.CONNECTING, "nobody listens there")
+                self._enter(LinkState.CONNECTING, "no agent listens there")
 
     def _knock_again(self) -> None:
         """ZeroMQ does not by itself where a key was refused; and both robots are to know that the other one lives."""
@@ -286,7 +286,7 @@ class Link:
     def _fail_chunk(self, reason: str) -> None:
         waiting, self._chunk = self._chunk, None
         if waiting is not None and not waiting[1].done():
-            waiting[1].set_exception(LaneError(f"the bulk lane to {self.peer} went down: {reason}"))
+            waiting[1].set_exception(LaneError(f"the replication link to {self.peer} went down: {reason}"))
 
 
 class BulkLane:
@@ -427,7 +427,8 @@ class BulkLane:
     def troubles(self) -> list[str]:
         """What was refused in this life, for the status: a sentence each."""
         told = [
-            f"{peer} sent {count} messages on the bulk lane that this robot does not understand; install the same release on both"
+            f"{peer} sent {count} messages on the replication link that this robot does not understand; "
+            "install the same release on both"
             for peer, count in self._misunderstood.items()
         ]
         if trouble := self._arrivals.trouble():
@@ -435,8 +436,8 @@ class BulkLane:
         told.extend(self._mismatch.values())
         if self.strangers:
             told.append(
-                f"a key that is not in this robot's team.toml was refused on the bulk lane, {self.strangers} times, last from "
-                f"{self._stranger}; bring the same team.toml to every robot if it is one of yours"
+                f"this robot refused a key that is not in its team.toml on the replication link, {self.strangers} times, "
+                f"last from {self._stranger}; bring the same team.toml to every robot if it is one of yours"
             )
         return told
 
@@ -460,7 +461,7 @@ class BulkLane:
                 elif peer:
                     self._misunderstood[peer] += 1
                 else:
-                    self._refused("somebody under another's name")
+                    self._refused("a sender under another robot's name")
         finally:
             router.close(0)
 
@@ -513,13 +514,13 @@ class BulkLane:
             self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
             self._unread(peer, self._mismatch[peer])
         if not peers:
-            self._unread("", f"one at {address} presents the key {key}")
+            self._unread("", f"a sender at {address} presents the key {key}")
 
     def _refused(self, stranger: str) -> None:
         """Count one that is not in the team; the log hears of it once, for it may knock for ever."""
         self.strangers += 1
         if stranger != self._stranger:
-            log.warning("refused a key that is not in team.toml on the bulk lane: %s", stranger)
+            log.warning("refused a key that is not in team.toml on the replication link: %s", stranger)
         self._stranger = stranger
 
 

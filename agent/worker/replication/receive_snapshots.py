@@ -238,5 +238,5 @@ class Deposit:
         if (header.component, header.position, header.parent, header.epoch) != told:
             raise FormatError(f"a snapshot of {offer.component} is not the one that was offered: it names {header.component}")
         if self._runs and offer.spec.launch.carry and (lack := self._lack_of_room(offer.component, descriptor)):
-            raise StoreError(f"a checkpoint of {offer.component} is of no use here: {lack}")
+            raise StoreError(f"this robot cannot use a checkpoint of {offer.component}: {lack}")
         return self._store.put(descriptor)

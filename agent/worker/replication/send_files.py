@@ -125,7 +125,7 @@ class Bringing:
         self._peers.setdefault(peer, _Peer()).sure.clear()
         for name, answer in self._asked.values():
             if name == peer and not answer.done():
-                answer.set_exception(LaneError(f"the bulk lane to {peer} went down"))
+                answer.set_exception(LaneError(f"the replication link to {peer} went down"))
 
     async def _lacking(self, peer: str, component: str, files: tuple[Need, ...]) -> dict[bytes, Need]:
         """Which of the files a peer will take, by digest."""
@@ -146,7 +146,7 @@ class Bringing:
         try:
             for _ in range(ASKED_TIMES):
                 if not self._say(peer, Belongings(number, component, files)):
-                    raise LaneError(f"the bulk lane to {peer} is not connected")
+                    raise LaneError(f"the replication link to {peer} is not connected")
                 with contextlib.suppress(TimeoutError):
                     return await asyncio.wait_for(asyncio.shield(answer), ANSWER_S / ASKED_TIMES)
             raise LaneError(f"{peer} did not say within {ANSWER_S:.0f} s which files of {component} it lacks")

@@ -106,7 +106,7 @@ class Shipper:
         transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
         try:
             if not self._lane.say(peer, msgspec.structs.replace(offer, transfer=number)):
-                raise LaneError(f"the bulk lane to {peer} is not connected")
+                raise LaneError(f"the replication link to {peer} is not connected")
             for offset in range(0, offer.size, CHUNK_SIZE_MAX):
                 size = min(CHUNK_SIZE_MAX, offer.size - offset)
                 await self._until(transfer, lambda end=offset + size: transfer.until >= end)  # type: ignore[misc]

@@ -183,7 +183,7 @@ class CooperativeEngine:
         """See `checkpoint.engine.Engine.probe`: nothing stands in the way of a program that keeps its state itself."""
         arguments = told_by_spokesman(pid, lambda tid: procfs.read_bytes(tid, "cmdline")).rstrip(b"\0").split(b"\0")
         command = " ".join(word.decode(errors="replace") for word in arguments)
-        text = "only what it commits comes back; the program is started again and resumes from that"
+        text = "a restore starts the program again from its newest commit; nothing else comes back"
         return Report(pid, command, 0, "versions", (Finding("process", f"pid {pid}", NOTED, text),))
 
     def protect(self, pid: int, order: ProtectOrder) -> Session:

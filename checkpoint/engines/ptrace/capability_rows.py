@@ -49,7 +49,7 @@ CAPABILITIES: Final = (
         Area.PROCESS,
         "user, groups, capabilities",
         "as far as the agent has them; the program of an ordinary user comes back with that user's rights and no more",
-        "of the program are not kept: we do not have them",
+        "of the program are not kept: failover does not have them",
     ),
     preserved(
         Area.THREADS,
@@ -60,7 +60,7 @@ CAPABILITIES: Final = (
         Area.THERE,
         "a PID or thread id that is taken, if the program has several threads or one of its locks names the id",
         "free the id, or start the program with `failover run`, which gives it PIDs of its own",
-        "by which they know it, cannot be had",
+        "by which they know it, is not available",
         "it holds a lock that names its own pid",
         "and a lock that the program holds names it",
         "that id is in use",
@@ -84,17 +84,17 @@ CAPABILITIES: Final = (
     preserved(
         Area.TIME,
         "interval timers, POSIX timers and sleeps, relative or absolute, of the realtime, monotonic, boot and TAI clocks",
-        "go on with the time that was left, and count the outage; if the clock is set later, a POSIX timer does not follow",
+        "continue with the time that was left, and count the outage; if the clock is set later, a POSIX timer does not follow",
     ),
     preserved(
         Area.TIME,
         "timers of processor time (setitimer, CLOCK_PROCESS_CPUTIME_ID, CLOCK_THREAD_CPUTIME_ID)",
-        "go on with the time that was left; the clocks themselves, and the figures of getrusage, begin anew",
+        "continue with the time that was left; the clocks themselves, and the figures of getrusage, begin anew",
     ),
     by_rule(
         Area.TIME,
         "monotonic and boot clocks",
-        "never go back; they go on from their reading where `failover run` gave the program a time namespace. The time of "
+        "never go back; they continue from their reading where `failover run` gave the program a time namespace. The time of "
         "day is the machine's",
     ),
 )

@@ -29,7 +29,7 @@ class SoftDirtyTracker:
     """The soft-dirty bit: cleared for the whole process, set by the kernel with the first write and in every new mapping."""
 
     name = "soft-dirty"
-    cost = "it stands still while the entries of all its pages are read"
+    cost = "it stands still while failover reads the entries of all its pages"
     sees_every_write = True
     scans_running = False
 

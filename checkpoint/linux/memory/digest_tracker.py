@@ -33,7 +33,7 @@ class DigestTracker:
     """Reads everything that exists and compares digests. Needs nothing of the kernel."""
 
     name = "digest"
-    cost = "it stands still while all of its memory is read, a tenth of its time at most, by longer periods"
+    cost = "it stands still while failover reads all of its memory; longer periods keep that to a tenth of its time"
     sees_every_write = False
     scans_running = False
 

@@ -247,8 +247,8 @@ def connect(made: socket.socket, kept: Kept, ours: Address, peer: Address) -> No
             made.connect(peer)
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
-                raise InUseError("somebody on this machine has the same connection") from error
-            raise CannotCarryError(f"no way leads to {peer[0]} from here: {error.strerror}") from error
+                raise InUseError("a process on this machine has the same connection") from error
+            raise CannotCarryError(f"no route leads to {peer[0]} from here: {error.strerror}") from error
 
 
 @contextlib.contextmanager

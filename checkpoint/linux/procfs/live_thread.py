@@ -61,7 +61,7 @@ def told_by_spokesman(pid: int, question: Callable[[int], Answer]) -> Answer:
         else:
             if spokesman_of(pid) == spokesman:
                 return answer
-    raise ProbeError(f"cannot look at pid {pid}: its threads end while it is looked at; try again")
+    raise ProbeError(f"cannot examine pid {pid}: its threads end while failover examines it; try again")
 
 
 def _ends(stat: procfs.Stat) -> bool:

@@ -60,7 +60,7 @@ def show(files: Sequence[BroughtFile], user: User, *, own_mounts: bool) -> None:
     if not files or os.path.lexists(files[0].path):
         return
     if not own_mounts:
-        reason = "is not here, and what was brought of it can be shown only to a program with mounts of its own (isolate = true)"
+        reason = "is not here, and its brought copy can be shown only to a program with mounts of its own (isolate = true)"
         raise OSError(errno.ENOENT, reason, files[0].path)
     contents = [os.open(file.content, os.O_RDONLY | os.O_CLOEXEC) for file in files]
     with _as_user(user):
@@ -107,7 +107,7 @@ def _place_for(files: Sequence[BroughtFile], user: User) -> int:
     place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     if os.fstat(place).st_uid != user.uid or os.listdir(place):
         os.close(place)
-        raise OSError(errno.EEXIST, "holds other files, or is somebody else's: install the program there", str(folder))
+        raise OSError(errno.EEXIST, "holds other files, or belongs to another user: install the program there", str(folder))
     return place
 
 

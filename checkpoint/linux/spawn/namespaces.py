@@ -123,7 +123,7 @@ _CURE: Final = "give it CAP_SYS_ADMIN, or allow user namespaces (sysctl user.max
 
 
 _IN_A_CHROOT: Final = (
-    "its mounts would be seen by everybody, for the root directory is that of a chroot and no mount point; bind that directory "
+    "every process would see its mounts, for the root directory is that of a chroot and no mount point; bind that directory "
     "to itself first (mount --bind DIRECTORY DIRECTORY)"
 )
 

@@ -251,7 +251,7 @@ def _sibling_with_pid(wanted: int) -> tuple[int, list[str]]:
         if not wanted or error.errno not in (errno.EEXIST, errno.EPERM, errno.EINVAL):
             raise
         reason = _why_taken(wanted) if error.errno == errno.EEXIST else "that needs CAP_CHECKPOINT_RESTORE"
-        return namespaces.sibling(), [f"new PID: {wanted} cannot be had, {reason}"]
+        return namespaces.sibling(), [f"new PID: {wanted} is not available, {reason}"]
 
 
 def _why_taken(pid: int) -> str:

@@ -160,8 +160,8 @@ def _wait_in_call(pid: int, name: str) -> None:
         waited = time.perf_counter() - began
         if waited > BATCH_TIMEOUT_S:
             raise CaptureError(
-                f"pid {pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its cgroup, or higher "
-                "priorities leave it no processor; protect it again when it runs"
+                f"pid {pid} did not run for {BATCH_TIMEOUT_S:g} s while failover examined it: it is frozen by its cgroup, or "
+                "higher priorities leave it no processor; protect it again when it runs"
             )
         rest(waited)
 

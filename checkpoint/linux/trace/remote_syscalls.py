@@ -425,7 +425,7 @@ class BorrowedPages:
         errand = Errand(self._memory, sent, places)
         try:
             if not sent.start(tracees, [desk.code for desk, _, _ in places], registers, masks):
-                raise ProcessGoneError(f"pid {self._memory.pid} ended while it was being looked at")
+                raise ProcessGoneError(f"pid {self._memory.pid} ended while failover examined it")
             yield errand
             errand.call_back()
         finally:
@@ -439,7 +439,7 @@ class BorrowedPages:
         for place in range(len(desks)):
             if raw[place * size + _STATE_OFFSET] == ARMED:
                 raise CaptureError(
-                    f"pid {self._memory.pid} still has to return to code of an earlier look; capture it again in a moment"
+                    f"pid {self._memory.pid} still has to return to code of an earlier capture; capture it again in a moment"
                 )
 
     def _take_back(self, errand: Errand, places: Sequence[tuple[Desk, Guest]]) -> None:
@@ -556,7 +556,7 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
         waited = time.perf_counter() - began
         if waited > BATCH_TIMEOUT_S:
             raise CaptureError(
-                f"pid {memory.pid} did not run for {BATCH_TIMEOUT_S:g} s while it was looked at: it is frozen by its "
+                f"pid {memory.pid} did not run for {BATCH_TIMEOUT_S:g} s while failover examined it: it is frozen by its "
                 "cgroup, or higher priorities leave it no processor; capture it again when it runs"
             )
         if is_here is None:
@@ -592,7 +592,7 @@ def set_back(guest: Guest, is_ours: Callable[[int], bool]) -> Registers:
     if not is_ours(found[arch.INSTRUCTION_POINTER]):
         tracee.is_as_found = True  # whatever it stands in now it has come to by itself
         raise CaptureError(
-            f"pid {tracee.pid} has run on while it was looked at: the machine left us no processor for "
+            f"pid {tracee.pid} has run on while failover examined it: failover got no processor for "
             f"{arch.ENTRY_TIMEOUT_NS // 1_000_000} ms; capture it again"
         )
     tracee.set_signal_mask(mask)

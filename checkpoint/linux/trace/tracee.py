@@ -181,7 +181,9 @@ class Tracee:
         except ProbeError as error:
             if procfs.status(self.pid).tracer != os.getpid():
                 raise
-            raise CaptureError(f"{error}: it is ours since an earlier look, until it stops; capture it again") from error
+            raise CaptureError(
+                f"{error}: failover traces it since an earlier capture, until it stops; capture it again"
+            ) from error
         self.is_as_found = True
         self._options = options & abi.PTRACE_O_SUSPEND_SECCOMP
 
@@ -255,7 +257,7 @@ class Tracee:
             try:
                 pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
             except ChildProcessError as error:
-                raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
+                raise ProcessGoneError(f"pid {self.pid} ended while failover examined it") from error
             if pid:
                 return self.stop_of(status)
             waited = time.perf_counter() - began
@@ -284,9 +286,9 @@ class Tracee:
         try:
             found = os.waitid(os.P_PID, self.pid, options)
         except ChildProcessError as error:
-            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
+            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it") from error
         if found is not None and found.si_code in abi.ENDS:
-            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
+            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it")
         return self.reported() if found is not None else None
 
     def is_dead(self) -> bool:
@@ -302,7 +304,7 @@ class Tracee:
         try:
             pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
         except ChildProcessError as error:
-            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at") from error
+            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it") from error
         return self.stop_of(status) if pid else None
 
     def stop_of(self, status: int) -> Stop:
@@ -312,7 +314,7 @@ class Tracee:
             ProcessGoneError: it tells of its end.
         """
         if not os.WIFSTOPPED(status):
-            raise ProcessGoneError(f"pid {self.pid} ended while it was being looked at")
+            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it")
         stop = Stop(event=status >> 16, signal=os.WSTOPSIG(status))
         if stop.event == abi.PTRACE_EVENT_STOP:
             self.stopped_by = stop.signal if stop.signal != signal.SIGTRAP else 0

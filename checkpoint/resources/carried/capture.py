@@ -76,7 +76,7 @@ CAPABILITIES: Final = (
         Area.FILES,
         "in a carried folder: sockets, devices, network mounts, other file systems; more than the limits of carrying allow",
         "carry less, or name a folder without them",
-        "which is not carried: let it lie outside that folder",
+        "which is not carried: keep it outside that folder",
         "is to be carried and is neither a file nor a folder",
         "another file system is mounted at or above",
         "no file of that size is carried",
@@ -235,8 +235,8 @@ class CarriedTrees(Struct):
                 return Seen(unreadable=(self._unreadable(error),))
             except OSError as error:
                 raise CaptureError(
-                    f"cannot capture pid {self.pid}: its carried files change while they are looked at ({self._path_of(error)}: "
-                    f"{error.strerror}); try again, and let nobody else write there"
+                    f"cannot capture pid {self.pid}: its carried files change while failover reads them ({self._path_of(error)}: "
+                    f"{error.strerror}); try again, and let no other program write there"
                 ) from error
         return Seen(tuple(names), links)
 
@@ -373,7 +373,7 @@ class CarriedTrees(Struct):
 
     def _refuse_name(self, name: Name, device: int) -> str:
         if name.kind in KINDS_LEFT_OUT:
-            return f"{self._called(name)} is a {KINDS_LEFT_OUT[name.kind]}, which is not carried: let it lie outside that folder"
+            return f"{self._called(name)} is a {KINDS_LEFT_OUT[name.kind]}, which is not carried: keep it outside that folder"
         if not name.name and name.kind not in (stat.S_IFREG, stat.S_IFDIR):
             return f"{self._called(name)} is to be carried and is neither a file nor a folder: name another path"
         if name.about.st_dev != device:

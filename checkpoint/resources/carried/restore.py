@@ -93,7 +93,7 @@ def lay_down(state: Snapshot, eyes: Eyes | None, spared: frozenset[int]) -> Laid
         except BaseException as error:
             if stuck := [where for laying in reversed(layings) for where in laying.take_back()]:
                 raise RestoreError(
-                    f"cannot lay down what {state.component} carries ({error}), nor undo it: {'; '.join(stuck)}"
+                    f"cannot write the carried files of {state.component} ({error}), nor undo it: {'; '.join(stuck)}"
                 ) from error
             raise
         finally:
@@ -108,7 +108,7 @@ def _laid(state: Snapshot, layings: Sequence[_Laying]) -> Laid:
             laying.compare()
     wanted = [(laying.tree.path, laying.held_size) for laying in layings if not laying.stands]
     if reason := carried_files.lack_of_room(wanted):
-        raise RestoreError(f"cannot lay down what {state.component} carries: {reason}")
+        raise RestoreError(f"cannot write the carried files of {state.component}: {reason}")
     for step in (_Laying.build, _Laying.swap, _Laying.settle):
         for laying in layings:
             with _told(state, laying):
@@ -130,7 +130,7 @@ def _told(state: Snapshot, laying: _Laying) -> Iterator[None]:
     except OSError as error:
         where = laying.called(os.fsdecode(error.filename or "there"))
         raise RestoreError(
-            f"cannot lay down {laying.tree.path}, which {state.component} carries ({where}: {error.strerror}); "
+            f"cannot write {laying.tree.path}, which {state.component} carries ({where}: {error.strerror}); "
             "see to room and rights there"
         ) from error
 
@@ -147,7 +147,7 @@ def _outermost(trees: Sequence[Tree]) -> list[Tree]:
         if above is None:
             found.append(tree)
         elif _names_at(above, tree.path) != {os.fsencode(_at(tree.path, entry)) for entry in tree.entries}:
-            raise RestoreError(f"cannot lay down {tree.path} in {above.path}: they are carried apart; see to carry_at")
+            raise RestoreError(f"cannot write {tree.path} in {above.path}: each is carried by itself; correct carry_at")
     return found
 
 
@@ -252,7 +252,7 @@ class _Laying(Struct):
         else:
             self._swap_whole()
         if self._kept:
-            self.notes.append(f"{self.tree.path} was not as the checkpoint has it; what stood there is kept in {self._kept}")
+            self.notes.append(f"{self.tree.path} differed from the checkpoint; its former content is kept in {self._kept}")
 
     def settle(self) -> None:
         """Give what did not move itself its attributes."""
@@ -400,7 +400,10 @@ class _Laying(Struct):
         if os.geteuid() == ROOT:
             raise PermissionError(errno.EPERM, f"it would belong to uid {own_uid()}, not to its owner", strangers[0])
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
-        return [f"{strangers[0]}{more} belongs to whom the program runs as, not to its former owner: only root gives files away"]
+        return [
+            f"{strangers[0]}{more} belongs to the user that the program runs as, not to its former owner: "
+            "only root gives files away"
+        ]
 
     def _called(self, entry: Entry) -> str:
         return _at(self.tree.path, entry)

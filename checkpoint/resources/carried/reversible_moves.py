@@ -65,8 +65,8 @@ class Moves(Struct):
 
 def _held_by(move: _Move) -> str:
     if move.flag == RENAME_EXCHANGE:
-        return f"what stood at {move.new} is at {move.old}"
-    return f"what stood at {move.old} is at {move.new}"
+        return f"the former {move.new} is at {move.old}"
+    return f"the former {move.old} is at {move.new}"
 
 
 def _rename(old: str, new: str) -> None:

@@ -56,7 +56,7 @@ CAPABILITIES: Final = (
         Area.DEVICES,
         "a GPU, or a device that is mapped, also with the rule `reopen`",
         "use the rule `hook`, with nothing of the device mapped; or a driver process of its own",
-        "whose state in the device nobody can read",
+        "whose state in the device failover cannot read",
     ),
     refused(
         Area.THERE,
@@ -125,7 +125,9 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if rule is None or not is_ruled(held.first, (rule,)) or rule.action == "hook":
         return None
     if held.first.target.startswith(GPUS):
-        return f'{held.name} is {held.first.target}, a GPU, whose state in the device nobody can read: give it the rule "hook"'
+        return (
+            f'{held.name} is {held.first.target}, a GPU, whose state in the device failover cannot read: give it the rule "hook"'
+        )
     return None
 
 

@@ -56,6 +56,6 @@ def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     node = unlinked.make_node(table, str(facts["path"]), number_of(facts["mode"]), number_of(facts["device_number"]))
     made = table.open(f"/proc/self/fd/{node}", flags)
     owner = number_of(facts["uid"]), number_of(facts["gid"])
-    table.attempt(f"the deleted device {facts['path']!s} belongs to whom the program runs as", "fchown", made, *owner)
+    table.attempt(f"the deleted device {facts['path']!s} belongs to the user that the program runs as", "fchown", made, *owner)
     table.close(node)
     return made

@@ -56,8 +56,8 @@ CAPABILITIES: Final = (
 
 NAME: Final = "/[aio] (deleted)"
 NOTE: Final = (
-    "it has a ring of asynchronous I/O (io_setup): a poll that is under way by it (IOCB_CMD_POLL), which nobody can see, is "
-    "lost: use epoll for that"
+    "it has a ring of asynchronous I/O (io_setup): a poll that is under way by it (IOCB_CMD_POLL) is lost, because "
+    "the kernel does not show it: use epoll for that"
 )
 HEADER: Final = struct.Struct("<8I")
 """struct aio_ring: number, count of events, head, tail, magic, features (2), length of itself."""

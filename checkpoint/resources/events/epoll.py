@@ -40,7 +40,7 @@ CAPABILITIES: Final = (
         Area.PIPES,
         "an epoll instance that watches a descriptor which the program has closed and another process holds",
         "remove it from the instance (EPOLL_CTL_DEL) before closing it",
-        "take that out (EPOLL_CTL_DEL)",
+        "remove it (EPOLL_CTL_DEL)",
     ),
 )
 
@@ -96,8 +96,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     if (closed := _closed(held)) is not None:
         return (
-            f"{held.name} is an epoll instance that watches what was descriptor {closed}, which the program has closed and "
-            "somebody else still holds: let it take that out (EPOLL_CTL_DEL) before closing"
+            f"{held.name} is an epoll instance that watches the former descriptor {closed}, which the program has closed and "
+            "another process still holds: let the program remove it (EPOLL_CTL_DEL) before closing"
         )
     return other_holders.refuse(held, "an epoll instance")
 

@@ -77,7 +77,7 @@ def refuse(held: OpenFile) -> str | None:
     if _is_of_ours(held, owner) and kind in _OWNERS:
         return None
     whom = {F_OWNER_TID: f"thread {owner} alone", F_OWNER_PGRP: f"process group {owner}"}.get(kind, str(owner))
-    return f"{held.name} sends its signals to {whom}, not to the process itself, which is not kept: let it own them itself"
+    return f"{held.name} sends its signals to {whom}, not to the process itself, which is not kept: let the program own them"
 
 
 def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -> None:

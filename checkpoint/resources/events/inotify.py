@@ -122,7 +122,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     what = f"{held.name} is an inotify instance"
     if held.observed.get("unread"):
-        return f"{what} with events that the program has not read yet: it is kept as soon as they are read"
+        return f"{what} with events that the program has not read yet: failover captures it as soon as the program has read them"
     for number, path, _ in _watches(held):
         if not path:
             return f"{what} whose watch {number} is of a file that no path leads to: let the program remove that watch"

@@ -126,7 +126,10 @@ def findings(held: Sequence[Resource]) -> Iterator[Finding]:
         thread = number_of(one.facts.get("thread", 0)) if one.kind == KIND else 0
         if thread and passed & {_list(pair)[0] for pair in _list(one.facts["descriptors"])}:
             whom = f"the single thread {thread} that is on its way in a unix socket, too"
-            text = f"{one.name} is a pidfd of {whom}, which is not kept yet: it is kept as soon as that is received"
+            text = (
+                f"{one.name} is a pidfd of {whom}, which is not kept yet: "
+                "failover captures it as soon as the program has received that"
+            )
             yield Finding(KIND, one.name, REFUSED, text)
 
 

@@ -49,7 +49,7 @@ CAPABILITIES: Final = (
         "a deleted file over 16 MiB, or one whose other name is far away; the mere path (O_PATH) of a deleted device, "
         "socket or pipe",
         "give it a name",
-        "cannot be opened again; let it close that",
+        "cannot be opened again; let the program close it",
         "still has another name",
         "deleted files are carried up to",
     ),
@@ -140,7 +140,10 @@ def is_file(one: Descriptor) -> bool:
 def _refuse_deleted(held: OpenFile) -> str | None:
     first, what = held.first, f"{held.name} is {held.first.target}"
     if stat.S_IFMT(first.mode) not in (stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK):
-        return f"{what}: a deleted device or the like, of which only the path is open, cannot be opened again; let it close that"
+        return (
+            f"{what}: a deleted device or the like, of which only the path is open, cannot be opened again; "
+            "let the program close it"
+        )
     if first.links and not other_name(held):
         return f"{what}, but it still has another name, which is not known: let the program open it under that name"
     if not first.links and first.stored > CONTENT_LIMIT:

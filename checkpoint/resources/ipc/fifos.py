@@ -224,7 +224,7 @@ def make_nameless(table: CallTable, held: Resource) -> int:
     """Make a named pipe without a name, empty, to be opened through the number that this gives."""
     made = unlinked.make_node(table, str(held.facts["path"]), number_of(held.facts["mode"]))
     owner = number_of(held.facts["uid"]), number_of(held.facts["gid"])
-    lost = f"the named pipe of {held.name} belongs to whom the program runs as"
+    lost = f"the named pipe of {held.name} belongs to the user that the program runs as"
     table.attempt(lost, "fchownat", made, table.place_path(""), *owner, AT_EMPTY_PATH)
     return made
 

@@ -46,7 +46,7 @@ CAPABILITIES: Final = (
         Area.PIPES,
         "a pipe to another process",
         "redirect it to a file, or start the programs so that one component holds both ends",
-        "to somebody else: only pipes of which",
+        "to another process: only pipes of which",
         "that another process holds too",
     ),
 )
@@ -85,7 +85,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     what = f"{held.name} is a pipe"
     if not held.both_ends:
-        return f"{what} to somebody else: only pipes of which the program holds both ends are kept; redirect it to a file"
+        return f"{what} to another process: only pipes of which the program holds both ends are kept; redirect it to a file"
     if other_holders.has_end(held):
         return f"{what} that another process holds too: protect the program when that has ended"
     return None

@@ -211,7 +211,10 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     number, waiting, discipline = (number_of(seen.get(name, N_TTY)) for name in ("terminal", "waiting", "discipline"))
     if waiting:
-        return f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: it is kept as soon as they are read"
+        return (
+            f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: "
+            "failover captures it as soon as the program has read them"
+        )
     if discipline != N_TTY:
         return f"{held.name} is a pseudo-terminal with line discipline {discipline}: only the ordinary one (N_TTY) is kept"
     if not seen["hung_up"] and (other := _other_opener(held, number)):

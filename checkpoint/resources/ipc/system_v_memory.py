@@ -108,7 +108,7 @@ def refuse(lines: Iterable[MapsLine], known: Mapping[int, Segment]) -> Iterator[
         if segment.attached > len(pieces):
             yield f"{what} attached by other processes, too, which stay behind: protect the program when they have ended"
         if not _is_whole(pieces, segment.size):
-            yield f"{what} one of which it has unmapped a part: let it keep the whole"
+            yield f"{what} one of which it has unmapped a part: let the program keep the whole"
 
 
 def _is_whole(pieces: Sequence[MapsLine], size: int) -> bool:
@@ -195,7 +195,7 @@ class Segments(Struct):
             raise RestoreError(f"cannot make {what}: {error.strerror}; see kernel.shmmax, kernel.shmmni, or ipcs") from error
         self._made.append(made)
         if made != wanted.identifier:
-            self.notes.append(f"its System V shared memory {wanted.identifier} is {made} here: that id could not be had")
+            self.notes.append(f"its System V shared memory {wanted.identifier} is {made} here: that id was not available")
         return made
 
     def attached(self) -> None:

@@ -101,7 +101,7 @@ def refuse(pid: int, status: Status) -> Iterator[str]:
     if pid != status.tgid and not can_look_through(pid):
         yield "its first thread has ended while others live, and this kernel lends no descriptors through another: Linux 6.9 does"
     if status.threads > THREAD_LIMIT:
-        yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let it start fewer"
+        yield f"it has {status.threads} threads; the limit is {THREAD_LIMIT}: let the program start fewer"
         return
     if status.state in "ZX":
         yield from refuse_ended_first(status)
@@ -114,13 +114,19 @@ def refuse(pid: int, status: Status) -> Iterator[str]:
             except (ProcessGoneError, ProbeError, FileNotFoundError):
                 continue  # this one has ended
     if any(timer.clock == CLOCK_THREAD_CPUTIME for timer in parse_timers(procfs.read_text(pid, "timers"))):
-        yield "it has a timer that counts the processor time of one of its threads, and nobody tells which: use another clock"
+        yield (
+            "it has a timer that counts the processor time of one of its threads, and the kernel does not tell which: "
+            "use another clock"
+        )
 
 
 def refuse_ended_first(status: Status) -> Iterator[str]:
     """Why a process whose first thread has ended cannot be captured; nothing stands against one that has ended as a whole."""
     if status.state in "ZX" and status.threads > 1:
-        yield f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: let it wait for them"
+        yield (
+            f"its first thread has ended while {status.threads - 1} others live, which is not kept yet: "
+            "let the first thread wait for them"
+        )
 
 
 def refuse_kin(threads: Threads) -> tuple[str, ...]:

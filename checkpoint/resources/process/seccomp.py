@@ -58,7 +58,7 @@ FLAG_SPEC_ALLOW: Final = 4
 
 def not_ours(why: str, who: str = "it") -> str:
     """Why a confined process, or thread, is refused where we may not suspend filters."""
-    return f"{who} runs under a seccomp filter, which forbids what a capture asks of it: {why}"
+    return f"{who} runs under a seccomp filter, which forbids system calls of a capture: {why}"
 
 
 def untold(why: str) -> str:
@@ -83,7 +83,7 @@ def describe(threads: Iterable[tuple[int, Confinement]]) -> tuple[Resource, ...]
 def mismatches(held: Resource) -> Iterator[str]:
     """Why it cannot be had here."""
     if why := seccomp.why_not():
-        yield f"it runs under a seccomp filter, which would forbid what a restore asks of it: {why}"
+        yield f"it runs under a seccomp filter, which would forbid system calls of a restore: {why}"
 
 
 def is_confined(resources: Iterable[Resource]) -> bool:

@@ -243,7 +243,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     name = kinds.get(number_of(seen["type"]), "a raw socket")
     if seen["unfinished"]:
         return (
-            f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): it is kept as soon as it is"
+            f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): "
+            "failover captures it as soon as it is sent"
         )
     return sockets.refuse_filter(held) or other_holders.refuse(held, name)
 
@@ -252,11 +253,14 @@ def findings(held: Iterable[Resource]) -> Iterator[Finding]:
     """Connections and datagrams that are lost."""
     for one in held:
         if one.kind == KIND and one.facts.get("failed"):
-            text = f"an error, and what else waits in {one.name}, is lost when the program comes back"
+            text = f"an error, and the data that waits in {one.name}, are lost when the program comes back"
             yield Finding(KIND, one.name, NOTED, text)
         if one.kind == KIND and one.facts.get("lost"):
             yield Finding(
-                KIND, one.name, NOTED, f"what waits in {one.name}, a raw or ICMP socket, is lost when the program comes back"
+                KIND,
+                one.name,
+                NOTED,
+                f"the data that waits in {one.name}, a raw or ICMP socket, is lost when the program comes back",
             )
         if one.kind == KIND and number_of(one.facts["waiting"]):
             count = number_of(one.facts["waiting"])
@@ -316,7 +320,7 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Di
         number, peer = made[number_of(one.facts["socket"])], one.facts["peer"]
         assert isinstance(peer, list)
         if peer:
-            what = f"{one.name} is not connected to {in_words(peer)}, where no way leads from here"
+            what = f"{one.name} is not connected to {in_words(peer)}, where no route leads from here"
             table.attempt(what, "connect", number, table.place(sockaddr(peer)), size_of(peer))
         sockets.shut_down(table, one, number)
         sockets.set_flags(table, one, number)

@@ -117,10 +117,14 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     if (family := number_of(seen["protocol"])) not in FAMILIES:
         return (
-            f"{held.name} is a netlink socket of family {family}, for which the kernel keeps more than it tells: let it be closed"
+            f"{held.name} is a netlink socket of family {family}, for which the kernel keeps more than it shows: "
+            "let the program close it"
         )
     if seen["busy"]:
-        return f"{held.name} is a netlink socket in which an answer of the kernel waits: it is kept as soon as that is read"
+        return (
+            f"{held.name} is a netlink socket in which an answer of the kernel waits: "
+            "failover captures it as soon as the program has read that"
+        )
     return sockets.refuse_filter(held) or other_holders.refuse(held, "a netlink socket")
 
 

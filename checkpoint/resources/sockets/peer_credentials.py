@@ -82,7 +82,7 @@ class Disguise(Struct, frozen=True):
                 with self.as_program(table):
                     yield
                 return
-            lost = f"{one.name} tells another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
+            lost = f"{one.name} reports another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
             with self._as(table, number_of(maker[1]), number_of(maker[2]), lost):
                 yield
         else:
@@ -114,10 +114,10 @@ class Disguise(Struct, frozen=True):
             if not (isinstance(maker, list) and maker):
                 continue
             if maker[0] != self.inner_pid:
-                found.append(f"{one.name} tells another process as its peer (SO_PEERCRED): it was pid {maker[0]!r}")
+                found.append(f"{one.name} reports another process as its peer (SO_PEERCRED): it was pid {maker[0]!r}")
             if self._is_foreign(number_of(maker[1]), number_of(maker[2])):
                 found.append(
-                    f"{one.name} tells another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
+                    f"{one.name} reports another user as its peer (SO_PEERCRED): it was uid {maker[1]!r}, gid {maker[2]!r}"
                 )
         return tuple(found)
 

@@ -94,6 +94,6 @@ def _sender(table: CallTable, one: Resource, source: list[Fact]) -> int:
     family = socket.AF_INET6 if ":" in str(source[0]) else socket.AF_INET
     form = (family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC, number_of(one.facts["protocol"]))
     made = table.obtain(f"make a sender for {one.name}", "socket", *form)
-    lost = f"what waits in {one.name} came from {in_words(source)}, and comes from nobody now"
+    lost = f"the data that waits in {one.name} came from {in_words(source)}, and has no sender now"
     table.attempt(lost, "bind", made, table.place(sockaddr(source)), size_of(source))
     return made

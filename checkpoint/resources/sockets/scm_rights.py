@@ -97,7 +97,8 @@ def refuse(held: OpenFile, kind: str, owned: Collection[str]) -> str | None:
     if held.lent is None or (kind in KINDS and not set(owned) & set(OWNED)):
         return None
     return (
-        f"{held.first.target} is on its way in a unix socket, which the program has closed: it is kept as soon as it is received"
+        f"{held.first.target} is on its way in a unix socket, which the program has closed: "
+        "failover captures it as soon as the program has received it"
     )
 
 

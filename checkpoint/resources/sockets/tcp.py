@@ -94,7 +94,7 @@ MAY_MOVE: Final = "may_move"
 LEFT: Final = "left"
 """Why one is not taken along that was to be."""
 
-ON_ITS_WAY: Final = "it was on its way in a unix socket: received, it is taken along"
+ON_ITS_WAY: Final = "it was on its way in a unix socket; once received, it is taken along"
 """Of one that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
 
 READ_ENDED: Final = 1
@@ -217,16 +217,22 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
     """Why a connection of the program with itself cannot be made again."""
     what = f"{one.name} is a TCP connection of the program with itself"
     if one.facts.get("urgent"):
-        yield f"{what}, in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
+        yield f"{what}, in which an out-of-band byte waits (MSG_OOB): failover captures it as soon as the program has read that"
     if one.facts.get("encrypted"):
         yield f"{what}, which the kernel encrypts (TCP_ULP): have the program's library do so"
     if one.facts["state"] == CLOSED:
         return
     underway = _number(one, "unsent") + _number(one, "sent") - _number(other, "received") + (other.facts["state"] in _PEER_ENDED)
     if underway > 0:
-        yield f"{what}, {underway} bytes of which have not arrived at its other end: it is kept as soon as they have"
+        yield (
+            f"{what}, {underway} bytes of which have not arrived at its other end: "
+            "failover captures it as soon as they have arrived"
+        )
     if _number(one, "unread") > sockets.QUEUE_LIMIT:
-        yield f"{what}, in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
+        yield (
+            f"{what}, in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: "
+            "failover captures it as soon as the program has read them"
+        )
 
 
 def note(held: Resource) -> str | None:

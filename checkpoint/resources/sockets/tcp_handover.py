@@ -45,7 +45,7 @@ CAPABILITIES: Final = (
         "a handover, a failback, and `failover capture` with `restore` carry established connections, with the data in "
         "them (TCP_REPAIR); their address must follow (docs/connections.md). After a crash they are reset",
         "it takes CAP_NET_ADMIN",
-        "goes on once this machine has its address",
+        "continues once this machine has its address",
     ),
 )
 
@@ -233,7 +233,7 @@ class Arriving:
                 tcp_repair.ask_peer(made, one.kept, reuse)
                 made.close()
         except OSError as error:
-            raise RestoreError(f"cannot let TCP connections go on: {error.strerror}") from error
+            raise RestoreError(f"cannot resume TCP connections: {error.strerror}") from error
         with contextlib.suppress(OSError):  # then nobody could have silenced them either
             packet_drop.lift(self._ended)
 
@@ -241,7 +241,7 @@ class Arriving:
 def _missing(one: _Arrival) -> str:
     ours = one.connection.ours[0]
     return (
-        f"the TCP connection {one.resource.name} goes on once this machine has its address: add {ours} to one of its interfaces"
+        f"the TCP connection {one.resource.name} continues once this machine has its address: add {ours} to one of its interfaces"
     )
 
 
@@ -263,7 +263,7 @@ def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
                 ended.append(_connection(held.facts))
             if held.kind == KIND and TAKEN in held.facts:
                 one = _Arrival(process, held, _connection(held.facts), _kept(held))
-                if reason := _hindrance(one) if wanted else "it goes on from an older state":
+                if reason := _hindrance(one) if wanted else "the program resumes from an older state":
                     lost[number_of(held.facts["socket"])] = reason
                 else:
                     arrivals.append(one)

@@ -59,9 +59,9 @@ CAPABILITIES: Final = (
         "a unix socket with descriptors on their way between several processes, with an out-of-band byte, or with over 4 "
         "MiB of data that waits",
         "wait: failover captures it as soon as the program has taken them",
-        "in which an out-of-band byte waits (MSG_OOB): it",
+        "in which an out-of-band byte waits (MSG_OOB): failover",
         "with descriptors on their way",
-        "MiB wait: it is kept as soon as",
+        "MiB wait: failover captures it as soon as",
     ),
     refused(
         Area.SOCKETS,
@@ -74,7 +74,7 @@ CAPABILITIES: Final = (
 
 BOTH_DIRECTIONS: Final = 3
 NOT_WAITING: Final = -1
-_ACCEPTED: Final = "it is kept as soon as the program has accepted it"
+_ACCEPTED: Final = "failover captures it as soon as the program has accepted it"
 _ALONE: Final = "protect the program while it has no such connection"
 
 
@@ -180,18 +180,25 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} connected to a socket of another process that has no name: protect the program while it has none"
     if any(isinstance(numbers, list) and sockets.UNKNOWN in numbers for numbers in _list(seen["passed"])):
         return (
-            f"{what} with descriptors on their way in it (SCM_RIGHTS) that cannot be looked at: it is kept as soon as they arrive"
+            f"{what} with descriptors on their way in it (SCM_RIGHTS) that failover cannot examine: "
+            "failover captures it as soon as they arrive"
         )
     if seen["passed"] and held.kin.pids and held.lent is None:
-        return f"{what} with descriptors on their way in it between several processes: it is kept as soon as they are received"
+        return (
+            f"{what} with descriptors on their way in it between several processes: "
+            "failover captures it as soon as the program has received them"
+        )
     if 0 in _list(seen["clients"]):
         return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"
     if number_of(seen["not_accepted"]) > 0:
-        return f"{what} whose connection waits to be accepted with data in it, which nobody can look at: {_ACCEPTED}"
+        return f"{what} whose connection waits to be accepted with data in it, which failover cannot read: {_ACCEPTED}"
     if seen["urgent"]:
-        return f"{what} in which an out-of-band byte waits (MSG_OOB): it is kept as soon as that is read"
+        return f"{what} in which an out-of-band byte waits (MSG_OOB): failover captures it as soon as the program has read that"
     if seen["too_long"]:
-        return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: it is kept as soon as they are read"
+        return (
+            f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: "
+            "failover captures it as soon as the program has read them"
+        )
     return unix_names.refuse(held) or sockets.refuse_filter(held) or other_holders.refuse(held, "a unix socket")
 
 

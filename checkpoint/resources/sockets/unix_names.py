@@ -148,7 +148,10 @@ def refuse(held: OpenFile) -> str | None:
     if not path:
         return None
     if seen["directory"] and ".." in told.split("/"):
-        return f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: let it bind a whole path"
+        return (
+            f"{held.name} is a unix socket with a name ({told}) from a directory that it has left: "
+            "let the program bind a whole path"
+        )
     if seen["mode"] == GONE and os.geteuid() and os.path.isabs(told) and _is_something_else(f"{procfs.outlook(held.pid)}{path}"):
         return f"{held.name} is a unix socket whose name is something else by now ({path}): bind another, or protect it as root"
     is_reached_by_name = seen["state"] != ESTABLISHED or seen["type"] == socket.SOCK_DGRAM
@@ -317,7 +320,7 @@ class Naming:
         made_file = table.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)  # a link may have taken its place meanwhile
         owner = one.facts.get("file_owner")
         if isinstance(owner, list) and owner:
-            lost = f"the name of the unix socket {path} belongs to whom the program runs as"
+            lost = f"the name of the unix socket {path} belongs to the user that the program runs as"
             ids = number_of(owner[0]), number_of(owner[1])
             table.attempt(lost, "fchownat", made_file, table.place_path(""), *ids, AT_EMPTY_PATH)
         again = table.place_path(f"/proc/self/fd/{made_file}")

@@ -233,7 +233,7 @@ class Work:
         assert isinstance(name, bytes)
         peer = self._held.get(_of(one, "peer"))
         address = packed(name) if peer is None else self._naming.address_of(peer)
-        lost = f"{one.name} is not connected to {os.fsdecode(name)!r}, where nobody receives here"
+        lost = f"{one.name} is not connected to {os.fsdecode(name)!r}, where no socket receives here"
         table.attempt(lost, "connect", self._made[_of(one, "socket")], table.place(address), len(address))
 
     def _fill(self, one: Resource) -> None:
@@ -270,7 +270,7 @@ class Work:
         may_remove = bool(path) and is_abandoned(os.path.join(self._working, path))
         if may_remove:
             table.attempt("", "unlinkat", AT_FDCWD, place, 0)
-        lost = f"what waits in {one.name} came from {os.fsdecode(source)!r}, and comes from nobody now"
+        lost = f"the data that waits in {one.name} came from {os.fsdecode(source)!r}, and has no sender now"
         table.attempt(lost, "bind", sender, table.place(address), len(address))
         if may_remove:
             table.attempt("", "unlinkat", AT_FDCWD, place, 0)

@@ -86,7 +86,7 @@ def demo(arguments: argparse.Namespace) -> int:
             except EndedEarlyError as error:
                 if length == LENGTHS[-1]:
                     raise
-                screen.say(f"{error}; once more, with programs that take longer")
+                screen.say(f"{error}; trying again, with programs that take longer")
     return _conclude(arguments, play, screen)
 
 
@@ -226,7 +226,7 @@ class Play:
     def _await_takeover(self, cut_ns: int) -> None:
         self._caption = "the power is cut"
         self._await(
-            f"{self._standby.name} to go on with every program", lambda: self._see_takeover(cut_ns), robots.POLL_S, TAKEOVER_S
+            f"{self._standby.name} to resume every program", lambda: self._see_takeover(cut_ns), robots.POLL_S, TAKEOVER_S
         )
 
     def _see_takeover(self, cut_ns: int) -> bool:
@@ -240,17 +240,17 @@ class Play:
             if act.outage_ms is None and arrived is not None:
                 act.outage_ms = (arrived - cut_ns) / 1e6
                 self._screen.say(
-                    f"{act.program.title} goes on at {self._standby.name}: next output {act.outage_ms:.0f} ms after the cut"
+                    f"{act.program.title} resumes at {self._standby.name}: next output {act.outage_ms:.0f} ms after the cut"
                 )
             if act.outage_ms is None and told_all:
-                _still_runs(act, component, f"before it was seen to go on at {self._standby.name}")
+                _still_runs(act, component, f"before this demo saw it resume at {self._standby.name}")
         return all(act.outage_ms is not None for act in self.acts)
 
     def _size_at_standby(self, act: Act) -> int:
         return len(whole_output(self._standby.socket, act.program.name)[0])
 
     def _await_end(self) -> None:
-        self._caption = f"going on at {self._standby.name}"
+        self._caption = f"resumed at {self._standby.name}"
         self._await("the programs to end", self._see_end, DRAW_S, END_S * self._length)
 
     def _see_end(self) -> bool:
@@ -335,8 +335,8 @@ def _still_runs(act: Act, component: dict[str, Any], when: str) -> None:
         return
     status = component.get("exit_status")
     if status:
-        raise FailoverError(f"{act.program.name} came to an end {when}: {team_tree.ending(status)}")
-    raise EndedEarlyError(f"{act.program.title} came to its end {when}: {act.snapshots} snapshots of it had arrived")
+        raise FailoverError(f"{act.program.name} ended {when}: {team_tree.ending(status)}")
+    raise EndedEarlyError(f"{act.program.title} ended {when}: {act.snapshots} of its snapshots had arrived")
 
 
 def _why(component: dict[str, Any]) -> str:
@@ -364,7 +364,7 @@ def _conclude(arguments: argparse.Namespace, play: Play, screen: PlainScreen) ->
     else:
         print()
         render.table(RESULT_COLUMNS, lines)
-        print("the programs outlived their robot" if equal else "this went wrong: the output differs, see above")
+        print("every program resumed, and its output is complete" if equal else "this went wrong: the output differs, see above")
     if arguments.picture:
         render.save_picture(arguments.picture, "./run demo", screen.transcript, RESULT_COLUMNS, lines)
     return 0 if equal else 1

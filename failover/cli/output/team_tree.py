@@ -173,7 +173,7 @@ def _kept_line(component: Mapping[str, Any]) -> str:
     found = component["kept"]
     older = f" and {found['older']} older" if found["older"] else ""
     ages = f"{milliseconds(found['newest_age_s'] * 1_000)} to {span(found['oldest_age_s'])} old"
-    whose = component.get("primary") or "whoever can run it"
+    whose = component.get("primary") or "the first robot that can run it"
     return f"kept for {whose}: {component['name']}, {found['checkpoints']} checkpoints{older}, {size(found['size'])}, {ages}"
 
 
@@ -237,8 +237,8 @@ def _unknown(seen: Mapping[str, Any]) -> str:
     """Where it should run, and that no answer came from there."""
     primary = seen.get("primary")
     if primary:
-        return f"{primary}, where it runs, has not answered: whether it is protected now is not known; ask there, or look again"
-    return "no robot that answered runs it; failover why tells what was decided"
+        return f"{primary}, which runs it, has not answered, so its protection is not known; ask there, or ask again"
+    return "no robot that answered runs it; see failover why"
 
 
 PASSING: Final = frozenset({"unknown key", "seen before, or too old", "from an earlier life of its sender"})

@@ -70,19 +70,19 @@ def _standing_by(arguments: argparse.Namespace) -> list[Offer]:
     lacking = [(one, lack) for one in held for lack in one["lacks"]]
     if lacking:
         return [Offer("lesser", one["name"], _what_is_lacking(one, lack)) for one, lack in lacking]
-    return [Offer("good", "standing by", f"nothing is lacking of what {one['name']} needs") for one in held]
+    return [Offer("good", "standing by", f"this robot has all that {one['name']} needs") for one in held]
 
 
 def _what_is_lacking(component: Mapping[str, Any], lack: str) -> str:
     brought = component.get("prepared_first")
-    return f"its hook before_resume is to bring what is lacking now: {lack}" if brought else f"could not go on here: {lack}"
+    return f"its hook before_resume must bring what is missing now: {lack}" if brought else f"could not resume here: {lack}"
 
 
 def _architecture() -> Offer:
     machine, kernel = platform.machine(), platform.release()
     if reason := why_unsupported():
         return Offer("missing", "processor", reason)
-    seen = "; so far its kind was seen to work on emulated machines only (docs/machines.md)" if machine in EMULATED else ""
+    seen = "; failover was tested on such processors in emulation only (docs/machines.md)" if machine in EMULATED else ""
     return Offer("good", "processor", f"{machine}, Linux {kernel}{seen}")
 
 
@@ -92,7 +92,7 @@ def _looking_into() -> list[Offer]:
         try:
             notes = _captured_once(stand_in.pid)
         except CheckpointError as error:
-            return [Offer("missing", "looking into programs", f"a program started here cannot be captured: {error}")]
+            return [Offer("missing", "looking into programs", f"cannot capture a program that was started here: {error}")]
         finally:
             stand_in.kill()
     try:
@@ -145,7 +145,7 @@ def _chosen_pids() -> Offer:
 
 def _real_time() -> Offer:
     if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[1] > 0:
-        return Offer("good", "real-time priority", "the agent's heart can have it")
+        return Offer("good", "real-time priority", "the agent's main loop can have it")
     text = "not for this user: a busy machine may look dead; set LimitRTPRIO=, see systemd/failover-agent.service"
     return Offer("lesser", "real-time priority", text)
 
@@ -153,14 +153,14 @@ def _real_time() -> Offer:
 def _memory_lock() -> Offer:
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
     if os.geteuid() == 0 or limit == resource.RLIM_INFINITY:
-        return Offer("good", "locked memory", "the agent's heart is never swapped out")
+        return Offer("good", "locked memory", "the agent's main loop is never swapped out")
     return Offer("lesser", "locked memory", f"limited to {limit >> 20} MiB for this user; set LimitMEMLOCK=infinity")
 
 
 def _watchdog() -> Offer:
     if Path("/dev/watchdog").exists():
         return Offer("good", "hardware watchdog", "there; systemd's RuntimeWatchdogSec= resets a hung machine")
-    return Offer("lesser", "hardware watchdog", "none: a robot whose kernel hangs halfway is not reset")
+    return Offer("lesser", "hardware watchdog", "none: nothing resets a robot whose kernel hangs halfway")
 
 
 def _network() -> Offer:

@@ -141,7 +141,7 @@ def reconnect(arguments: argparse.Namespace, name: str) -> Control:
         except NoAgentError as error:
             if time.monotonic() > deadline:
                 raise NoAgentError(
-                    f"the agent went away and did not come back within {RECONNECT_S:.0f} s; {name} runs on without it: "
+                    f"lost the agent, and none answered within {RECONNECT_S:.0f} s; {name} runs on without it: "
                     f"start failover-agent, then follow with: failover logs --follow {name}"
                 ) from error
             time.sleep(RECONNECT_EVERY_S)
@@ -157,7 +157,7 @@ def write_output(piece: Output) -> None:
 def exit_like(wait_status: int | None) -> int:
     """Our exit status for a program's wait status: its own, or 128 + the signal that ended it, as shells say it."""
     if wait_status is None:
-        print("failover: the program has ended; how is not known", file=sys.stderr)
+        print("failover: the program has ended; its exit status is not known", file=sys.stderr)
         return 1
     number = wait_status & 0x7F
     return 128 + number if number else (wait_status >> 8) & 0xFF

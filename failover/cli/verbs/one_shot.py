@@ -70,7 +70,7 @@ END_TIMEOUT_S: Final = 10.0
 IDS_TIMEOUT_S: Final = 2.0
 IDS_PAUSE_S: Final = 0.01
 """How long the ids of a program that has just been ended may take to be free, and how often that is looked at."""
-OWN_PIDS: Final = "it goes on in PIDs of its own, in which it has its old ones: here they are taken, or not ours to choose"
+OWN_PIDS: Final = "it runs in a PID namespace of its own, with its old PIDs: here they are taken, or not this user's to choose"
 
 ROOT: Final = 0
 
@@ -103,10 +103,10 @@ def _contested(keeper: Keeper, arguments: argparse.Namespace, file: int) -> tupl
     try:
         found, _ = keeper.ask(Compare(terms=terms_of(arguments), running=arguments.pid), Compared, (again,))
     except CheckpointError as untold:
-        return (f"who else writes to its files is not known: {untold}",)
+        return (f"cannot see which other programs write to its files: {untold}",)
     finally:
         os.close(again)
-    return tuple(f"a restore here is refused as it is now: {reason}" for reason in found.lacks)
+    return tuple(f"a restore here would be refused now: {reason}" for reason in found.lacks)
 
 
 def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captured:

@@ -38,7 +38,7 @@ def enrol(arguments: argparse.Namespace) -> int:
     role = arguments.role or (members.robots[arguments.name].role if arguments.name in members.robots else "robot")
     enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public))
     answer = {"robot": arguments.name, "role": role, "beats": beats, "bulk": bulk, "public_key": public}
-    sentence = f"{arguments.name} is enrolled as a {role}; carry {directory / team.TEAM_FILE} to every member"
+    sentence = f"{arguments.name} is enrolled as a {role}; copy {directory / team.TEAM_FILE} to every member"
     if secret:
         if arguments.replace:
             team.forget_secret_key(directory, arguments.name)

@@ -103,10 +103,10 @@ def _at_stake(line: Mapping[str, Any]) -> list[str]:
     number, age_ms, output = line.get("checkpoint"), line.get("checkpoint_age_ms"), line.get("output_pending")
     told = []
     if number:
-        age = "" if age_ms is None else f", {team_tree.milliseconds(age_ms)} old: what was computed since would be lost"
+        age = "" if age_ms is None else f", {team_tree.milliseconds(age_ms)} old: a takeover from it loses the work since then"
         told.append(f"newest checkpoint: {number}{age}")
     elif line.get("state") not in ("absent", "finished", "failed", "released"):
-        told.append("no checkpoint yet: all that was computed would be lost")
+        told.append("no checkpoint yet: a takeover loses all work")
     if output is not None:
         told.append(f"output in no checkpoint: {team_tree.size(output)}")
     return told
@@ -117,7 +117,7 @@ def told_of_robots(robots: Sequence[Mapping[str, Any]]) -> str:
     told = []
     for one in robots:
         if not one.get("answered"):
-            told.append(f"{one.get('robot')} did not tell its part: {one.get('reason')}")
+            told.append(f"{one.get('robot')} did not send its event log: {one.get('reason')}")
             continue
         offset_ms, doubt_ms = one.get("clock_offset_ms") or 0.0, one.get("clock_doubt_ms") or 0.0
         if abs(offset_ms) > max(doubt_ms, NEAR_MS):
@@ -127,7 +127,7 @@ def told_of_robots(robots: Sequence[Mapping[str, Any]]) -> str:
                 "all times above are this robot's"
             )
         if one.get("damaged"):
-            told.append(f"{one.get('robot')}: {one['damaged']} lines of its story cannot be read any more")
+            told.append(f"{one.get('robot')}: {one['damaged']} lines of its event log cannot be read any more")
     return "\n".join(told)
 
 

@@ -54,7 +54,7 @@ def consider(component: Component, turn: Turn) -> None:
     else:
         chosen = best is None or best < mine or (best == mine and first_of_equals(component, turn, entries, mine))
     if chosen and _may_go_on(component, turn):
-        claim(component, turn, mine, "nobody runs it")
+        claim(component, turn, mine, "no robot runs it")
 
 
 def unheard(component: Component, turn: Turn) -> tuple[str, ...]:
@@ -241,7 +241,7 @@ def renew(component: Component, turn: Turn, above: int) -> None:
     component.epoch = above + 1
     component.handing = None
     open_line(component, turn)
-    turn.say(component, f"{turn.me} goes on under epoch {component.epoch}: epoch {above} was claimed and runs nowhere")
+    turn.say(component, f"{turn.me} continues under epoch {component.epoch}: epoch {above} was claimed, and no robot runs it")
 
 
 def _consented(component: Component, turn: Turn) -> bool:
@@ -436,7 +436,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
         if component.state in _RUNS_HERE and not tidy:
             reason = f"{winner} holds epoch {entry.epoch}, this copy had epoch {component.epoch}"
             turn.order(acts.KeepAside(component.name, component.epoch, reason))
-            turn.say(component, f"{turn.me} is told stale: {reason}; its state is kept aside")
+            turn.say(component, f"{turn.me} hears that its copy is stale: {reason}; it keeps that state aside")
         clear_away(component, turn, entry.epoch)
     component.handing = component.flight = None
     component.standby, component.lease_ns, component.told_ns = "", 0, 0

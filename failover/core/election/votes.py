@@ -44,7 +44,7 @@ def consider(component: Component, turn: Turn) -> None:
         return
     mine = component.newest
     if _chosen(component, turn, mine) and majority.may_claim(component, turn, mine):
-        claim(component, turn, mine, "nobody runs it, and a majority is free to vote")
+        claim(component, turn, mine, "no robot runs it, and a majority is free to vote")
 
 
 def _chosen(component: Component, turn: Turn, mine: Position | None) -> bool:
@@ -111,7 +111,7 @@ def withdraw(component: Component, turn: Turn, why: str) -> None:
     component.ordered = False
     place = sorted((turn.me, *turn.config.peers), key=weight).index(turn.me) + 1
     component.retry_ns = turn.now_ns + place * WITHDRAWN_BEATS * turn.config.beat_ns
-    refuse_request(component, turn, f"cannot run {component.name}: {why}; failover status tells who is heard")
+    refuse_request(component, turn, f"cannot run {component.name}: {why}; failover status tells which robots {turn.me} hears")
     turn.say(component, f"{turn.me} withdraws its claim of epoch {component.epoch}: {why}")
 
 
@@ -119,7 +119,7 @@ def step_down(component: Component, turn: Turn) -> None:
     """A primary that has given way and was not relieved clears its copy away; its checkpoint is claimed anew."""
     component.handing = component.flight = None
     clear_away(component, turn, component.epoch)
-    turn.say(component, f"{turn.me} gives its copy up: what it handed over is claimed anew")
+    turn.say(component, f"{turn.me} gives its copy up: the component that it handed over is claimed anew")
 
 
 # Hearing

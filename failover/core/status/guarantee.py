@@ -21,19 +21,19 @@ def team(turn: Turn) -> str:
     at_odds, living = grounds(turn)
     if at_odds:
         return (
-            f"{turn.me} decides by rule = {turn.config.rule}, {' and '.join(at_odds)} by another: nothing is started, "
-            "taken over, moved or protected between them until all have the same rule in agent.toml."
+            f"{turn.me} decides by rule = {turn.config.rule}, {' and '.join(at_odds)} by another: between them they start, "
+            "take over, move and protect nothing until all have the same rule in agent.toml."
         )
     if not turn.team.peers:
         return f"{turn.me} is alone in its team: a lost robot takes its programs with it."
     if turn.config.by_majority:
         return _elected(turn, 1 + len(living))
     if not living:
-        return f"{turn.me} hears nobody: what runs here is not protected."
+        return f"{turn.me} hears no other robot: its programs are not protected."
     return (
-        f"{turn.me} and {', '.join(living)} protect each other: whoever is silent for {_silence(turn)} is replaced; "
-        "a total cut between two that live can run a component twice until they meet again, except where when_alone is freeze; "
-        "then the copy that never stopped goes on."
+        f"{turn.me} and {', '.join(living)} protect each other: a robot that is silent for {_silence(turn)} is replaced; "
+        "after a total cut two live robots can both run a component until they hear each other, "
+        "and then the copy that never stopped continues; when_alone = freeze prevents that."
     )
 
 
@@ -41,25 +41,25 @@ def _elected(turn: Turn, heard: int) -> str:
     voters, quorum = len(turn.team.peers) + 1, turn.config.quorum
     if heard < quorum:
         return (
-            f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: what runs here "
-            "stands still, and nothing is taken over, until more are heard."
+            f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: its programs "
+            "stand still, and it takes nothing over, until it hears more."
         )
     return (
         f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: no component acts at "
-        f"two robots at once; whoever is silent for {_silence(turn)} is replaced when a majority agrees."
+        f"two robots at once; a robot that is silent for {_silence(turn)} is replaced when a majority agrees."
     )
 
 
 def one(component: Component, turn: Turn, protection: Protection) -> str:
     """What becomes of a component if its robot is lost now."""
     if component.state in ENDED:
-        return f"It is {component.state}; nobody runs it."
+        return f"It is {component.state}; no robot runs it."
     if not component.holding:
         return _standing_by(component, turn)
     if component.unprotected:
         return f"If {turn.me} is lost now, so is its state: no robot keeps a checkpoint of it."
     if protection is not Protection.PROTECTED:
-        return "If this robot is lost now, it goes on from its last checkpoint, if there is one."
+        return "If this robot is lost now, the component resumes from its last checkpoint, if there is one."
     if component.waits:
         return f"If {turn.me} is lost, {component.standby} keeps its newest checkpoint until {turn.me} is back."
     if not turn.config.runs(component.standby):
@@ -69,7 +69,7 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
             f"If {turn.me} is silent for {_silence(turn)} and a majority agrees, {component.standby} runs it; "
             "it stands still here first."
         )
-    twice = "may run twice if both live on and cannot hear each other; then the copy that never stopped goes on"
+    twice = "may run twice if both live on and cannot hear each other; then the copy that never stopped continues"
     alone = "stands still here first" if component.freezes else twice
     return f"If {turn.me} is silent for {_silence(turn)}, {component.standby} runs it; it {alone}."
 
@@ -91,9 +91,9 @@ def exception(component: Component, turn: Turn) -> str:
 
 
 def _standing_by(component: Component, turn: Turn) -> str:
-    whose = component.primary or "whoever runs it"
+    whose = component.primary or "the robot that runs it"
     if not turn.config.keeps(turn.me):
-        return f"{turn.me} votes for who runs it; now that is {whose}."
+        return f"{turn.me} votes for the robot that runs it, now {whose}."
     return f"{turn.me} keeps its checkpoints for {whose}."
 
 

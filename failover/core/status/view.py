@@ -102,13 +102,13 @@ def _slow(component: Component, turn: Turn) -> str:
     period_ns = component.rules.period_ms * MS
     if not turn.alive(component.standby) or max(took_ns, least_ns) <= SLOW_FACTOR * period_ns:
         return ""
-    why = f"it takes that long until {component.standby} has one"
+    why = f"a snapshot takes that long to reach {component.standby}"
     if least_ns > took_ns:
         still_ms, part = component.still_us / US_PER_MS, f"1/{standby.STILL_SHARE}"
-        why = f"it stands still for {still_ms:.0f} ms each time, and does so for no more than {part} of its time"
+        why = f"each capture stops it for {still_ms:.0f} ms, and captures may take {part} of its time"
     return (
-        f"captured every {max(took_ns, least_ns) / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: {why}; what is "
-        "written meanwhile travels in the next one, once"
+        f"captured every {max(took_ns, least_ns) / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: {why}; "
+        "pages that it writes meanwhile travel once, in the next one"
     )
 
 
@@ -163,9 +163,9 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.holding and (slow := _slow(component, turn)):
         notes.append(slow)
     if _protection(component, turn) is Protection.NONE and component.holding and (ending := _ending(component, turn)):
-        notes.append(f"{' and '.join(ending)} cannot stand by yet: a copy of it that ran there is still being ended")
+        notes.append(f"{' and '.join(ending)} cannot stand by yet: that robot still ends its own copy")
     if component.holding and component.resumed_age_ns >= STALE_NS:
-        notes.append(f"it went on at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
+        notes.append(f"it resumed at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
     if staying := failback.note(component):
         notes.append(staying)
     if component.unstored and component.state is State.STANDBY:
@@ -175,16 +175,18 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
         notes.append(f"waiting: {unread}; failover promote does not wait")
     if component.unprotected:
-        notes.append("protected no longer, as on_unsupported = stop_protecting says; failover release, then protect, begins anew")
+        notes.append(
+            "not protected any more: on_unsupported = stop_protecting; to protect it again: failover release, then protect"
+        )
     if component.cold:
         notes.append(f"its program does not wait at {turn.me}, so a takeover would take longer, or fail: {component.cold}")
     if component.unable:
         notes.append(f"{turn.me} cannot run it: {component.unable}")
     if component.state is State.FROZEN:
-        who = "no majority" if component.elects else "nobody entrusted with it"
-        notes.append(f"held still: {who} hears this robot; it goes on when the peers are back")
+        who = "no majority" if component.elects else "no robot entrusted with it"
+        notes.append(f"held still: {who} hears this robot; it resumes when the peers are back")
     if component.state is State.CLAIMING and turn.now_ns > component.until_ns:
-        notes.append("waiting for the others' consent: when_alone = freeze")
+        notes.append("waiting until the other robots agree: when_alone = freeze")
     if spent := pair.exhaustion(component, turn.me):
         notes.append(spent)
     if component.reason:

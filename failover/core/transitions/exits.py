@@ -94,7 +94,7 @@ def overdue(component: Component, turn: Turn) -> None:
         return
     if component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING):
         seconds = turn.config.restore_ms // 1000
-        failed(component, turn, ActFailed(component.name, component.epoch, f"nothing was heard of it for {seconds} s"))
+        failed(component, turn, ActFailed(component.name, component.epoch, f"it did not answer for {seconds} s"))
     elif component.state is State.STOPPING:
         component.until_ns = turn.now_ns + turn.config.retry_ms * MS
         turn.order(acts.Stop(component.name, component.epoch))

@@ -37,7 +37,7 @@ def inquired(component: Component, turn: Turn, event: Inquired) -> None:
     if event.lacks:
         component.return_ns = turn.now_ns + UNFIT_PAUSE * turn.config.retry_ms * MS
         if event.lacks != component.unfit:
-            turn.say(component, f"it does not return to {event.to}, where it could not go on: {'; '.join(event.lacks)}")
+            turn.say(component, f"it does not return to {event.to}, which could not resume it: {'; '.join(event.lacks)}")
     component.unfit = event.lacks
     if not event.lacks:
         handover.begin(component, turn, event.to, 0)
@@ -48,4 +48,4 @@ def note(component: Component) -> str:
     prefer = component.rules.prefer
     if component.state is not State.PRIMARY or not component.unfit or prefer != component.standby:
         return ""
-    return f"its return to {prefer} waits, which could not go on with it: {'; '.join(component.unfit)}"
+    return f"its return waits: {prefer} could not resume it: {'; '.join(component.unfit)}"

@@ -59,7 +59,7 @@ def risks(component: Component, turn: Turn) -> tuple[str, ...]:
     doubts = [] if turn.config.by_majority else [_double(turn, robot) for robot in _may_act(component, turn)]
     newer = _newer(component, turn)
     if newer:
-        doubts.append(f"a newer checkpoint may be at {' or '.join(newer)}; what it has and this one has not is lost")
+        doubts.append(f"a newer checkpoint may be at {' or '.join(newer)}; the work that only that one holds is lost")
     return tuple(doubts)
 
 
@@ -75,18 +75,20 @@ def _refusal(component: Component, turn: Turn) -> str:
     if (component.holding and not waits) or component.state is State.STOPPING:
         return f"here it is {component.state}"
     if component.state not in (State.CLAIMING, State.FROZEN) and _best(component, turn) is None:
-        return f"neither {me} nor who is heard holds a checkpoint of it" + (f": {component.unable}" if component.unable else "")
+        return f"neither {me} nor a robot that it hears holds a checkpoint of it" + (
+            f": {component.unable}" if component.unable else ""
+        )
     if not vacant(component, turn, is_ordered=True):
         holder = _holder(component, turn)
         return (
             f"{holder} lives and has it; ask there"
             if holder
-            else f"some are neither heard nor silent for {_loyalty(turn)} ms yet"
+            else f"some robots are neither heard nor silent for {_loyalty(turn)} ms yet"
         )
     if turn.config.by_majority:
         return _no_majority(component, turn)
     if component.flight is not None and component.flight.position is None:
-        return f"a snapshot of {name} is being taken; try again"
+        return f"the agent is taking a snapshot of {name}; try again"
     return ""
 
 
@@ -142,9 +144,9 @@ def _go_on_with_the_claim(component: Component, turn: Turn, request: int) -> Non
     """It waits for the consent of robots that are silent: the operator gives it."""
     component.request = component.request or request
     component.alone_right, component.claimed, component.ordered = True, False, True
-    turn.say(component, f"{turn.me} goes on with its claim without the others: an operator promoted it")
+    turn.say(component, f"{turn.me} continues its claim without the others: an operator promoted it")
     if component.request != request:
-        turn.order(acts.Answer(request, True, f"{component.name} goes on at {turn.me}"))
+        turn.order(acts.Answer(request, True, f"{component.name} resumes at {turn.me}"))
 
 
 def _let_it_go_on(component: Component, turn: Turn, request: int) -> None:
@@ -152,7 +154,7 @@ def _let_it_go_on(component: Component, turn: Turn, request: int) -> None:
     component.entrusted, component.standby, component.ordered = (), "", True
     renew(component, turn, max(component.epoch, component.seen) + SKIPPED_EPOCHS)
     turn.say(component, f"{turn.me} does not wait for the others: an operator promoted it")
-    turn.order(acts.Answer(request, True, f"{component.name} goes on at {turn.me}"))
+    turn.order(acts.Answer(request, True, f"{component.name} resumes at {turn.me}"))
 
 
 def _may_act(component: Component, turn: Turn) -> list[str]:
@@ -170,12 +172,12 @@ def _double(turn: Turn, robot: str) -> str:
     silent_s = (turn.now_ns - turn.team.peers[robot].heard_ns) / (1_000 * MS)
     if unread := turn.team.unread(robot, turn.now_ns):
         return (
-            f"{robot} lives and cannot be authenticated ({unread}): it may run it too, until they hear each other: then "
-            f"{turn.me} goes on, and what {robot} did is kept aside"
+            f"{robot} lives and cannot be authenticated ({unread}): it may run it too, until they hear each other; then "
+            f"the copy of {turn.me} continues, and {robot} keeps its state aside"
         )
     return (
-        f"{robot} has not been heard for {silent_s:.0f} s; if it lives it may run it too, until they hear each other: then "
-        f"{turn.me} goes on, and what {robot} did is kept aside"
+        f"{robot} has not been heard for {silent_s:.0f} s; if it lives it may run it too, until they hear each other; then "
+        f"the copy of {turn.me} continues, and {robot} keeps its state aside"
     )
 
 
@@ -191,9 +193,9 @@ def _newer(component: Component, turn: Turn) -> list[str]:
 
 
 def _loss(component: Component, turn: Turn) -> str:
-    where = f"{component.name} would go on at {turn.me}"
+    where = f"{component.name} would resume at {turn.me}"
     if component.state is State.FROZEN:
-        return f"{where}, where it stands still"
+        return f"{where}, where it is frozen"
     best = _best(component, turn)
     if component.state is State.CLAIMING:
         best = (turn.me, component.plan) if component.plan else None
@@ -201,9 +203,9 @@ def _loss(component: Component, turn: Turn) -> str:
         return f"{where} from the beginning"
     keeper, position = best
     if keeper != turn.me:
-        return f"{where} from checkpoint {position.sequence}, which {keeper} keeps and sends first; what was done since is lost"
+        return f"{where} from checkpoint {position.sequence}, which {keeper} keeps and sends first; the work since then is lost"
     age = f", {(turn.now_ns - component.stored_ns) / (1_000 * MS):.1f} s old" if component.stored_ns >= 0 else ""
-    return f"{where} from checkpoint {position.sequence}{age}; what was done since is lost"
+    return f"{where} from checkpoint {position.sequence}{age}; the work since then is lost"
 
 
 def _holder(component: Component, turn: Turn) -> str:

@@ -505,7 +505,7 @@ def test_what_does_not_fit_the_state_is_refused_in_a_sentence(guard: GuardProces
         assert agent.ask(early) == Refused("nothing was started yet")
     guard.start(agent, "/bin/true")
     again = agent.ask(guard.order("/bin/true"))
-    assert isinstance(again, Refused) and "one program in its life" in again.message
+    assert isinstance(again, Refused) and "a guard serves one program only" in again.message
     agent.event(Exited)
     for late in (Freeze(), Thaw(), Commit()):
         refused = agent.ask(late)

@@ -191,7 +191,7 @@ def test_a_process_of_another_user_is_turned_away(end: TaskEnd) -> None:
         ([b"\x01"], "a packet of 1 bytes"),
         ([encode(Hello())[:4] + b"\x02\0\0\0"], "version 2"),
         ([encode(Hello()) + b"\0" * 4096], "kind 1 has 8 bytes"),
-        ([encode(Keeps())], "before it was said how to begin"),
+        ([encode(Keeps())], "before the guard told it how to begin"),
         ([encode(Safe(1))], "none that programs send"),
         ([encode(Hello()), encode(Hello())], "Hello was said twice"),
     ],

@@ -236,7 +236,7 @@ def test_rights_that_are_told_in_another_way_are_no_mistake_of_ours(kind: str, t
         threads=(replace(outline.threads[0], tid=7),),
         resources=(Resource(kind, "", {"descriptors": [], "threads": threads}),),
     )
-    with pytest.raises(FormatError, match="in a way that this version does not know"):
+    with pytest.raises(FormatError, match="does not understand the rights of its threads"):
         check_rights("/lab/r1/mapper", told, SOMEBODY, None)
 
 

@@ -201,7 +201,7 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
         snapshot = captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
         session.acknowledge(snapshot.position)
         monkeypatch.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
-        with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while it was looked at"):
+        with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while failover examined it"):
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         assert goes_on(worker)
         monkeypatch.undo()
@@ -239,7 +239,7 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
         assert goes_on(worker)
 
     monkeypatch.setattr(entry, "_wait_in_call", wait_too_long)
-    with pytest.raises(CaptureError, match="has run on while it was looked at"):
+    with pytest.raises(CaptureError, match="has run on while failover examined it"):
         ENGINE.protect(worker.pid, ProtectOrder("/test/worker")).close()
     monkeypatch.undo()
     with protected(worker) as session:
@@ -256,11 +256,11 @@ def test_a_sleep_is_not_cut_short_where_a_keeper_is_late(late: str, tmp_path: Pa
         if late == "a batch":
             with protected(program) as session:
                 monkeypatch.setattr(remote_syscalls, "_tables_when_done", too_late(remote_syscalls._tables_when_done))
-                with pytest.raises(CaptureError, match="has run on while it was looked at"):
+                with pytest.raises(CaptureError, match="has run on while failover examined it"):
                     session.capture(CaptureOrder(base=True, generation=1, sequence=1))
         else:
             monkeypatch.setattr(entry, "_wait_in_call", too_late(entry._wait_in_call))
-            with pytest.raises(CaptureError, match="has run on while it was looked at"):
+            with pytest.raises(CaptureError, match="has run on while failover examined it"):
                 ENGINE.protect(program.pid, ProtectOrder("/test/sleeper")).close()
         assert program.finish() == 0, program.output
         assert program.output.splitlines() == ["ready", "0 True"]
@@ -358,7 +358,7 @@ def test_a_keeper_that_is_late_sends_none_of_many_threads_back(
     with ended(start_tracee(compiled("threads", "-O2"), tmp_path, "many")) as tracee:
         with protected(tracee) as session:
             monkeypatch.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
-            with pytest.raises(CaptureError, match="has run on while it was looked at"):
+            with pytest.raises(CaptureError, match="has run on while failover examined it"):
                 session.capture(CaptureOrder(base=True, generation=1, sequence=1))
             monkeypatch.undo()
             captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))

@@ -249,7 +249,7 @@ def test_a_verb_says_in_a_sentence_what_came_of_it(agent: Start, words: list[str
     assert json.loads(failover(*words, "--json", socket=stand_in.path).stdout) == answer
 
 
-WOULD = {"name": "/a", "to": "r2", "epoch": 4, "promoted": False, "sentence": "/a would go on at r2", "risks": ["r1 may live"]}
+WOULD = {"name": "/a", "to": "r2", "epoch": 4, "promoted": False, "sentence": "/a would resume at r2", "risks": ["r1 may live"]}
 
 
 def promoting(agent: Start, would: dict[str, Any]) -> StandIn:
@@ -261,7 +261,7 @@ def promoting(agent: Start, would: dict[str, Any]) -> StandIn:
 def test_what_a_promotion_risks_is_told_and_without_a_yes_nothing_is_done(agent: Start) -> None:
     stand_in = promoting(agent, WOULD)
     ran = failover("promote", "/a", socket=stand_in.path)
-    assert ran.returncode == 1 and "/a would go on at r2\n  - r1 may live\n" in ran.stderr and "--yes" in ran.stderr
+    assert ran.returncode == 1 and "/a would resume at r2\n  - r1 may live\n" in ran.stderr and "--yes" in ran.stderr
     assert json.loads(failover("promote", "/a", "--json", socket=stand_in.path).stdout)["reasons"] == ["r1 may live"]
     assert not any(request.arguments.get("sure") for request in stand_in.asked)
 
@@ -310,7 +310,7 @@ def test_a_refusal_is_a_sentence_with_its_reasons_and_exit_status_1(agent: Start
 def test_an_agent_that_goes_away_is_an_error_and_not_a_hang(agent: Start) -> None:
     ran = failover("status", socket=agent(lambda request: []).path)
     assert ran.returncode == 1
-    assert "went away" in ran.stderr
+    assert "ended during status" in ran.stderr
 
 
 AGENT_VERBS = [

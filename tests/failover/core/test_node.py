@@ -61,7 +61,7 @@ def test_a_ballot_survives_its_bytes() -> None:
     written = Ballot((Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC),))
     assert vote_record.decode(vote_record.encode(written)) == written
     assert vote_record.decode(b"") == Ballot()
-    with pytest.raises(RulesError, match="cannot read the ballot"):
+    with pytest.raises(RulesError, match="cannot read the vote record"):
         vote_record.decode(b"{")
 
 

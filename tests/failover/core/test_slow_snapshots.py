@@ -111,7 +111,7 @@ def test_a_program_stands_still_for_no_more_than_a_tenth_of_its_time() -> None:
     primary.begin()
     for _ in range(2):
         primary.deliver(BEAT_MS, freeze_us=60_000)
-    assert "captured every 0.6 s instead of every 0.1 s: it stands still for 60 ms each time" in primary.notes()
+    assert "captured every 0.6 s instead of every 0.1 s: each capture stops it for 60 ms" in primary.notes()
     assert 500 <= ordered_after_ms(primary) <= 600
     primary.deliver(BEAT_MS, freeze_us=2_000)
     assert INSTEAD not in primary.notes()

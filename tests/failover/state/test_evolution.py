@@ -221,7 +221,7 @@ def test_migrations_are_done_one_after_the_other() -> None:
     ("migration", "sentence"),
     [
         (lambda state: state["nothing"], r"kept: its migration from version 1 failed: KeyError: 'nothing'; mend it"),
-        (lambda state: {"radians": object()}, r"kept: what its migration made cannot be stored: cannot keep kept\['radians'\]"),
+        (lambda state: {"radians": object()}, r"kept: cannot store the result of its migration: cannot keep kept\['radians'\]"),
         (lambda state: {**state, "radians": "x"}, r"kept\['radians'\]: stored as str 'x', wanted float"),
     ],
 )

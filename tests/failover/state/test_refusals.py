@@ -87,11 +87,14 @@ def test_what_cannot_be_kept_is_refused_when_it_is_declared(declared: Any, sente
     [
         (threading.Lock, "it holds a lock: a lock belongs to the threads of one process; make it anew at each start"),
         (threading.Event, "it holds an Event: a lock belongs to the threads"),
-        (threading.Thread, "it holds a Thread: what runs does not go on in another process; keep what it works on, and start"),
+        (
+            threading.Thread,
+            "it holds a Thread: a running one cannot move to another process; keep the values that it works on, and start",
+        ),
         (lambda: Path(os.devnull).open(), "it holds a TextIOWrapper: an open file .*; keep its path and position, and open it"),  # noqa: SIM115 - it is closed below
         (io.BytesIO, r"it holds a BytesIO: keep its bytes, getvalue\(\)"),
         (socket.socket, "it holds a socket: a connection belongs to one process; keep the address, and connect anew"),
-        (lambda: (number for number in range(3)), "it holds a generator: nobody can tell where it stands; keep the numbers"),
+        (lambda: (number for number in range(3)), "it holds a generator: its position cannot be read; keep the numbers"),
         (lambda: lambda: 3, "it holds a function: code is no data; keep a name or a member of an Enum, and look the function up"),
         (lambda: int, "it holds a type: code is no data; .* look the class up by it"),
         (lambda: memoryview(b"x"), r"it holds a memoryview: keep the array or bytearray that it looks into, or bytes\(it\)"),
@@ -136,7 +139,11 @@ def test_a_component_names_the_field_that_cannot_be_kept(field: Field, sentence:
 @pytest.mark.parametrize(
     ("declared", "value", "sentence"),
     [
-        (Pose, Pose(1, "north"), r"kept\.y: it holds a str, declared float; assign what is declared, or change the declaration"),  # type: ignore[arg-type]
+        (
+            Pose,
+            Pose(1, "north"),  # type: ignore[arg-type]
+            r"kept\.y: it holds a str, declared float; assign a value of the declared type, or change the declaration",
+        ),
         (list[Pose], [Pose(), Cell(1, 2)], r"kept\[1\]: it holds a Cell, declared Pose"),
         (list[Pose], [SpecialPose()], r"kept\[0\]: it holds a SpecialPose, declared Pose"),
         (list[int], (1, 2), r"kept: it holds a tuple, declared list\[int\]"),

@@ -96,7 +96,7 @@ def test_a_program_without_a_guard_keeps_its_state_itself(
     assert not caplog.records
     monkeypatch.setenv(VARIABLE, "@failover.0123456789abcdef")
     assert guarded() is None
-    assert "nobody listens" in caplog.text and VARIABLE not in os.environ
+    assert "no guard listens" in caplog.text and VARIABLE not in os.environ
 
 
 def test_a_program_is_told_why_its_guard_will_not_have_it(monkeypatch: pytest.MonkeyPatch) -> None:

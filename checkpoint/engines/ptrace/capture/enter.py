@@ -51,7 +51,7 @@ def enter_standing(threads: Threads, interruptions: Interruptions) -> Entered:
     """
     entered = _enter_once(threads, interruptions, last=False)
     if entered is None:
-        raise CaptureError(f"pid {threads.pid} stands in code of an earlier tracer; capture it again in a moment")
+        raise CaptureError(f"pid {threads.pid} is still in code of an earlier tracer; capture it again in a moment")
     tracker, notes = _tracker_for(threads.pid, entered)
     return Entered(entered.pages, tracker, interruptions, notes)
 

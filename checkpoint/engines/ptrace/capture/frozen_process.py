@@ -194,7 +194,7 @@ class Onlooker:
         shared_pending = tracee.pending(shared=True) if waits_shared else ()
         registers = where_it_stands(tracee, unread.registers, lambda: unread.rseq, self._interruptions)
         if self._borrowed.holds(arch.stand_of(registers)[0]):
-            raise CaptureError(f"pid {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
+            raise CaptureError(f"pid {tracee.pid} is still in code of an earlier capture; capture it again in a moment")
         others = self._others.places(of_others, self.rights.modes, mode)
         return Place(registers, unread, special, shared_pending, status, others, confined)
 

@@ -309,7 +309,7 @@ class ThreadOnlooker:
         registers = where_it_stands(tracee, unread.registers, lambda: unread.rseq, self._interruptions)
         pointer, _, _ = arch.stand_of(registers)
         if self._borrowed.holds(pointer):
-            raise CaptureError(f"thread {tracee.pid} still stands in code of an earlier look; capture it again in a moment")
+            raise CaptureError(f"thread {tracee.pid} is still in code of an earlier capture; capture it again in a moment")
         return ThreadPlace(tracee, life, inner_tid, registers, unread, comm, found)
 
     def ask(self, places: tuple[ThreadPlace, ...]) -> tuple[ThreadStanding, ...]:

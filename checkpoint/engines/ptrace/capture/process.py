@@ -137,7 +137,7 @@ class CapturedProcess:
             except ProcessGoneError:
                 if spokesman_of(pid) == met.threads.pid:
                     raise
-        raise CaptureError(f"cannot enter pid {pid}: its threads end while it is looked at; try again")
+        raise CaptureError(f"cannot enter pid {pid}: its threads end while failover examines it; try again")
 
     def has_lost_its_voice(self) -> bool:
         """Whether the thread by which it is looked at has ended, and another lives by which it could be.

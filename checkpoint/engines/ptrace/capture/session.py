@@ -221,7 +221,9 @@ class PtraceSession:
             except CaptureError:
                 if not self._speaks_by_another():
                     raise
-        raise CaptureError(f"cannot capture {self.component} (pid {self.pid}): its threads end while it is looked at; try again")
+        raise CaptureError(
+            f"cannot capture {self.component} (pid {self.pid}): its threads end while failover examines it; try again"
+        )
 
     def _captured_once(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
         parent = None if order.base else self._first.memory.acknowledged
@@ -241,7 +243,7 @@ class PtraceSession:
         try:
             return self._described(order, parent, frozen)
         except (FileNotFoundError, ProcessLookupError) as error:
-            gone = ProcessGoneError(f"{self.component} (pid {self.pid}) ended while it was being described")
+            gone = ProcessGoneError(f"{self.component} (pid {self.pid}) ended while failover captured it")
             raise self._explained(gone) from error
         except ProcessGoneError as error:  # a child that it has a pidfd of, for one
             raise self._explained(error) from error
@@ -395,7 +397,7 @@ class PtraceSession:
             except ProcessGoneError as error:
                 raise MovedError(f"process {process.pid} ended as soon as it ran again; capture it again") from error
             if not is_whole:
-                raise MovedError(f"pid {process.pid} may have given up what it wrote to its mapping of a file; capture it again")
+                raise MovedError(f"pid {process.pid} may have dropped its changes to a mapped file; capture it again")
             if held := process.onlooker.overlooked(seen.standing.opened):
                 raise MovedError(
                     f"{held.name} of pid {process.pid} was given an owner of its signals (F_SETOWN); capture it again"

@@ -119,7 +119,7 @@ class SeenOthers(Struct):
                 if not process.onlooker.is_entered():
                     raise MovedError(f"process {process.pid} has executed another program; capture it again")
             except ProcessGoneError as error:
-                raise MovedError(f"process {process.pid} ended while it was being described; capture it again") from error
+                raise MovedError(f"process {process.pid} ended while failover captured it; capture it again") from error
         self.later.clear()
 
     def looks(self) -> list[tuple[CapturedProcess, Look]]:

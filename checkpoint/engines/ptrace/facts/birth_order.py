@@ -63,7 +63,7 @@ CAPABILITIES: Final = (
         Area.THERE,
         "PIDs of a program of several processes that are taken, or that failover may not choose",
         "free them, or start the program with `failover run`, which gives it PIDs of its own",
-        "by which they know it, cannot be had",
+        "by which they know it, is not available",
         "processes, which takes the right to choose their pids",
     ),
 )

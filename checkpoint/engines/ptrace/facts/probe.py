@@ -55,7 +55,7 @@ def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: boo
         refusals.require_traceable(pid, procfs.status(pid))
         return told_by_spokesman(pid, functools.partial(_probe, pid, around, files_kept))
     except ProcessGoneError as error:
-        raise ProbeError(f"cannot look at pid {pid}: there is no such process (any more)") from error
+        raise ProbeError(f"cannot examine pid {pid}: there is no such process (any more)") from error
 
 
 def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -> Report:
@@ -209,7 +209,7 @@ def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) 
         ProbeError: that is no process.
     """
     if not 0 < pid < procfs.pid_max():
-        raise ProbeError(f"cannot look at pid {pid}: that is not the number of a process")
+        raise ProbeError(f"cannot examine pid {pid}: that is not the number of a process")
     return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices, terms.connections)
 
 
@@ -222,7 +222,7 @@ def _require_permission(pid: int, status: Status) -> None:
         raise ProcessGoneError(f"pid {pid} ({status.name}) has ended, or becomes another program") from error
     except (ProbeError, PermissionError) as error:
         raise ProbeError(
-            f"cannot look at pid {pid} ({status.name}) of uid {status.uids[0]}: not permitted; run as that user or as root"
+            f"cannot examine pid {pid} ({status.name}) of uid {status.uids[0]}: not permitted; run as that user or as root"
         ) from error
 
 
@@ -256,7 +256,7 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
     """What another robot's processor must have."""
     level = cpu_baseline.level_in(procfs.read_bytes(pid, "environ"))
     if level:
-        yield Finding("process", "processor", KEPT, f"started for {level}: it can go on where that is")
+        yield Finding("process", "processor", KEPT, f"started for {level}: it can resume on such processors")
         return
     needed = ", ".join(cpu_baseline.lacking(cpuid.features(), ())) or "nothing special"
     yield Finding("process", "processor", KEPT, f"not started with failover run --portable: it may have chosen {needed}")

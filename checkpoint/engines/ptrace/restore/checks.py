@@ -57,7 +57,7 @@ CAPABILITIES: Final = (
         "is of another type here",
         "bytes here and {} there",
         "has another content here",
-        "what was brought of it ({}) is damaged",
+        "the brought copy of it ({}) is damaged",
     ),
     refused(
         Area.THERE,
@@ -86,13 +86,13 @@ CAPABILITIES: Final = (
         "a processor without registers that a thread is just using; AMX tiles in use",
         "use the same processor, or another checkpoint. Registers at rest do not count, nor does the place where the "
         "processor puts them",
-        "is using {}, which cannot be had here",
+        "is using {}, which this machine lacks",
     ),
     refused(
         Area.THERE,
         "a kernel without a feature that the program uses",
         "boot a kernel that has it",
-        "which our kernel ({}) does not know",
+        "which this kernel ({}) does not know",
     ),
     refused(
         Area.THERE,
@@ -106,13 +106,13 @@ CAPABILITIES: Final = (
         "a snapshot of another version, or an incomplete one",
         "use the version that captured it, or capture again",
         "which this version does not know",
-        "its first thread is not told",
+        "its first thread is missing",
         "are not those of this processor",
     ),
 )
 
 _FAR: str = "bring it here from the machine that ran the program"
-_CARRIED: str = f"{_FAR}; or, as the program writes to it, let it travel: --carry, for it or its folder"
+_CARRIED: str = f"{_FAR}; or, as the program writes to it, carry it: --carry, for it or its folder"
 """While the program runs no copy would do for long."""
 
 
@@ -166,7 +166,7 @@ def _compare(
     architecture = os.uname().machine
     if state.machine.architecture != architecture:
         reason = f"it was taken on {state.machine.architecture}, this machine is {architecture}: restore it on such a machine"
-        reason += "; a program that keeps its state itself goes on on either (docs/decorator.md)"
+        reason += "; a program that keeps its state itself resumes on either (docs/decorator.md)"
         return (reason,), Brought()
     if unsupported_here := cpuid.why_unsupported():
         return (unsupported_here,), Brought()
@@ -259,7 +259,7 @@ def _of_machine(state: Snapshot, options: RestoreOptions, content_at: ContentAt 
     yield from mapping_kinds.refuse(state)
     yield from aio.mismatches(state.vmas)
     if any(vma.guards for vma in state.vmas) and not can_install_guards():
-        yield f"it has guard pages of madvise(2), which our kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
+        yield f"it has guard pages of madvise(2), which this kernel ({here.kernel}) does not know: boot Linux 6.13 or later"
     if not os.path.isdir(state.process.root_directory):
         yield f"its root directory {state.process.root_directory} is missing: make it"
     directory = state.process.working_directory
@@ -284,7 +284,7 @@ def missing_directories(state: Snapshot) -> tuple[str, ...]:
 
 def _of_threads(state: Snapshot) -> Iterator[str]:
     if not state.threads or state.threads[0].tid != state.process.pid:
-        yield "its first thread is not told: capture it again"
+        yield "its first thread is missing: capture it again"
     for thread in state.threads:
         registers = thread.registers
         if len(registers.get("prstatus", b"")) != cpu.REGISTERS_SIZE or not registers.get("xstate"):
@@ -292,7 +292,7 @@ def _of_threads(state: Snapshot) -> Iterator[str]:
             continue
         if names := ", ".join(extended.lacking(registers["xstate"], *xstate_layouts(state))):
             cure = "use the same processor, or another checkpoint"
-            yield f"its thread {thread.tid} is using {names}, which cannot be had here: {cure}"
+            yield f"its thread {thread.tid} is using {names}, which this machine lacks: {cure}"
 
 
 def xstate_layouts(state: Snapshot) -> tuple[extended.Layout, extended.Layout]:
@@ -355,7 +355,7 @@ def _content(options: RestoreOptions, digest: bytes, digest_of: DigestOf) -> tup
             return path, ""
     except OSError:
         return "", ""
-    return "", f"; what was brought of it ({path}) is damaged: remove that, it is brought again"
+    return "", f"; the brought copy of it ({path}) is damaged: remove that copy, and failover brings it again"
 
 
 def _is_made(state: Snapshot, path: str) -> bool:

@@ -225,7 +225,7 @@ class ProcessRestore:
             return
         if len(self._state.threads) > 1:
             count, wanted = len(self._state.threads), self._state.process.pid
-            reason = f"it has {count} threads, and pid {wanted}, by which they know it, cannot be had"
+            reason = f"it has {count} threads, and pid {wanted}, by which they know it, is not available"
             raise MismatchError(
                 f"cannot restore {self._state.component} as pid {vessel.inner_pid}: {reason}; "
                 "free that pid, or run it in PIDs of its own (failover run isolates)",
@@ -241,7 +241,7 @@ class ProcessRestore:
                 f"cannot restore {self._state.component} as pid {vessel.inner_pid}: it holds a lock that names its own pid "
                 f"{self._state.process.pid}; "
                 "free that pid, or run it in PIDs of its own (failover run isolates)",
-                (f"pid {self._state.process.pid} cannot be had, and a lock that the program holds names it",),
+                (f"pid {self._state.process.pid} is not available, and a lock that the program holds names it",),
             )
 
     def _build_and_run(self, vessel: Vessel, mappings: tuple[procfs.MapsLine, ...]) -> None:
@@ -394,7 +394,7 @@ class ProcessRestore:
             if content is not None and held.kind == regular.KIND and key not in self._objects:
                 self._objects[key] = table.open(content, flags)
         elsewhere = sorted({**self._brought.run, **self._brought.opened})
-        self.notes += [f"{path} is not this machine's: the program goes on with what was brought of it" for path in elsewhere]
+        self.notes += [f"{path} is not this machine's: the program resumes with its brought copy" for path in elsewhere]
         return run
 
     def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:

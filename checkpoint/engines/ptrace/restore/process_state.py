@@ -549,7 +549,7 @@ def _capabilities(table: CallTable, theirs: Credentials, ours: Credentials) -> l
     if not is_same:
         _set_capabilities(table, effective & have, permitted & have, kept)
     if permitted & ~have:
-        return [f"capabilities {permitted & ~have:#x} of the program are not kept: we do not have them"]
+        return [f"capabilities {permitted & ~have:#x} of the program are not kept: failover does not have them"]
     return []
 
 

@@ -165,7 +165,7 @@ class TreeRestore:
         wanted = self._state.process.pid
         count = 1 + len(self._state.members) + len(self._state.zombies)
         if vessel.inner_pid != wanted:
-            reason = f"it has {count} processes, and pid {wanted}, by which they know it, cannot be had"
+            reason = f"it has {count} processes, and pid {wanted}, by which they know it, is not available"
         elif not vessel.may_choose_executable:
             reason = f"it has {count} processes, which takes the right to choose their pids (CAP_CHECKPOINT_RESTORE)"
         else:

@@ -78,7 +78,7 @@ def entry_address(state: Snapshot) -> int:
 def refuse(state: Snapshot, content_at: ContentAt) -> Iterator[str]:
     """Why a program of another kernel cannot be led to this one's vdso."""
     image = _image_mapping(state)
-    named = f"the vdso of its kernel ({state.machine.kernel}) differs from ours ({this_machine().kernel})"
+    named = f"the vdso of its kernel ({state.machine.kernel}) differs from that of this kernel ({this_machine().kernel})"
     if image is None:
         yield f"{named}, and the program has moved or unmapped it: boot the same kernel"
         return

@@ -51,7 +51,7 @@ def _of_process(state: Snapshot, *, is_kin: bool) -> Iterator[str]:
         elif mapping_kinds.is_special(vma):
             yield f"it has huge or droppable pages ({named})"
     if exited_processes.of(state.resources, state.process.working_directory):
-        yield "it holds what is left of processes that have ended"
+        yield "it holds remains of processes that have ended"
     if len(clean_private_pages.of(state.resources)):
         yield "it has memory that must stay untouched until it is used"
     if mapping_kinds.keys_of(state):
@@ -65,7 +65,7 @@ def _of_kin(state: Snapshot) -> Iterator[str]:
     if shared_with_parent.flags_of(state.resources) & shared_with_parent.CLONE_FILES:
         yield "processes of it share a table of descriptors"
     if job_control.stop_of(state.resources):
-        yield "a process of it is stopped, or its parent has not been told that it goes on"
+        yield "a process of it is stopped, or its parent has not been told that it continues"
     if any(held.kind == pseudo_terminals.KIND and held.facts.get("session") for held in state.resources):
         yield "it has a controlling terminal"
 

@@ -25,7 +25,7 @@ def lay(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOptions) -
     require_room(outline)
     state, stored = held_or_stored(base)
     copy = _copy_of(vessel_pid, state, options, stored)
-    with ended_on_error(copy, f"lay a ready copy of {state.component} in pid {vessel_pid}"):
+    with ended_on_error(copy, f"build a ready copy of {state.component} in pid {vessel_pid}"):
         copy.lay()
     return copy
 

@@ -180,7 +180,7 @@ def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
         same = page_set.intersection(before[key], extents)
         is_of_one = key[0] is True and key[2] is None
         if is_of_one and len(same) and len(page_set.difference(extents, before[key])):
-            raise RestoreError("the ready copy must be laid again: its shared memory has grown in its place")
+            raise RestoreError("the ready copy must be built again: its shared memory has grown in its place")
         kept = page_set.union(kept, same)
     return page_set.difference(_extents(old), kept), page_set.difference(_extents(new), kept)
 

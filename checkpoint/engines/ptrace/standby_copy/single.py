@@ -191,7 +191,7 @@ class ReadyCopy(ProcessRestore):
         self._require_whole()
         chain.check_continues(self.position, delta)
         if delta.is_tree:
-            raise RestoreError(f"the ready copy of {delta.component} must be laid again: it has several processes by now")
+            raise RestoreError(f"the ready copy of {delta.component} must be built again: it has several processes by now")
         require_covered(delta)
         plan = self.planned(xor_delta.resolved(delta, self.rows_at))
         self.torn = True
@@ -293,7 +293,7 @@ class ReadyCopy(ProcessRestore):
 
     def _require_whole(self) -> None:
         if self.torn:
-            raise RestoreError(f"the ready copy of {self._state.component} is torn: lay it again from the chain")
+            raise RestoreError(f"the ready copy of {self._state.component} is torn: build it again from the chain")
 
     def _require_same_birth(self, delta: Snapshot) -> None:
         """What was fixed when the vessel was born and laid out."""
@@ -305,10 +305,10 @@ class ReadyCopy(ProcessRestore):
             ("its kernel", ours.machine.vdso_digest == theirs.machine.vdso_digest),
             ("its vdso", memory.kernel_pages_of(ours.vmas) == memory.kernel_pages_of(theirs.vmas)),
             ("its confinement", options_for(ours) == options_for(theirs)),
-            ("the place of our stub", not self._overlaps_stub(theirs)),
+            ("the address of failover's stub", not self._overlaps_stub(theirs)),
         )
         if changed := ", ".join(what for what, is_same in fixed if not is_same):
-            raise RestoreError(f"the ready copy of {ours.component} must be laid again: changed are {changed}")
+            raise RestoreError(f"the ready copy of {ours.component} must be built again: these have changed: {changed}")
 
     def _overlaps_stub(self, state: Snapshot) -> bool:
         start, end = self._stub.base, self._stub.base + self._area_size
@@ -326,7 +326,7 @@ class ReadyCopy(ProcessRestore):
         off_ns = self._clocks_ahead_ns(elapsed_ns)
         if off_ns is not None and (off_ns + elapsed_ns < 0 or off_ns > AHEAD_NS):
             where = f"{off_ns / 1e9:.1f} s ahead" if off_ns > 0 else f"{-off_ns / 1e9:.1f} s behind"
-            raise RestoreError(f"the ready copy of {self._state.component} must be laid again: its clocks are {where}")
+            raise RestoreError(f"the ready copy of {self._state.component} must be built again: its clocks are {where}")
 
     def _clocks_ahead_ns(self, elapsed_ns: int) -> int | None:
         """How far its monotonic time is ahead of the program's; None where it has this machine's, for nothing can be set then."""

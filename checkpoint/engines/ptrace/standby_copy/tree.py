@@ -260,18 +260,18 @@ class FamilyCopy(TreeRestore):
 
     def _require_whole(self) -> None:
         if self.torn:
-            raise RestoreError(f"the ready copy of {self._state.component} is torn: lay it again from the chain")
+            raise RestoreError(f"the ready copy of {self._state.component} is torn: build it again from the chain")
 
     def _require_same_shape(self, delta: Snapshot) -> None:
         if _shape_of(delta) != _shape_of(self._state):
-            raise RestoreError(f"the ready copy of {self._state.component} must be laid again: its processes are others by now")
+            raise RestoreError(f"the ready copy of {self._state.component} must be built again: its processes have changed")
 
     def _require_same_objects(self, views: Sequence[Snapshot]) -> None:
         ours, theirs = self._objects, _objects_of(views)
         is_same = theirs.keys() <= ours.keys() and all(_fits(ours[key], theirs.get(key)) for key in ours)
         if not is_same:
             raise RestoreError(
-                f"the ready copy of {self._state.component} must be laid again: shared memory has come, gone, or changed in size"
+                f"the ready copy of {self._state.component} must be built again: shared memory has come, gone, or changed in size"
             )
 
     def _brought_for(self, view: Snapshot) -> Brought:

@@ -54,7 +54,7 @@ class Fickle(ReadyCopy):
         self._news.set()
 
     async def _bring_on(self, position: Any = None) -> None:
-        raise RestoreError("its processes are others by now")
+        raise RestoreError("its processes have changed")
 
     async def _until_news(self) -> None:
         await self._news.wait()

@@ -37,7 +37,7 @@ def test_a_watchdog_of_which_the_kernel_tells_nothing_is_not_called_one_that_nob
 ) -> None:
     found = fencing_status.watchdog(machine(tmp_path, **facts))
     assert found == Watchdog(name, 0, is_told=False)
-    assert f"({name}) would help, and this kernel does not tell whether anybody feeds it" in fencing_status.sentence(found)
+    assert f"({name}) would help, and this kernel does not tell whether a program feeds it" in fencing_status.sentence(found)
 
 
 def test_a_machine_without_watchdogs_is_told_so(tmp_path: Path) -> None:

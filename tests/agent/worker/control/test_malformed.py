@@ -193,7 +193,7 @@ def test_an_answer_that_is_none_is_a_refusal(content: bytes) -> None:
         sent = ends.said[0]
         assert isinstance(sent, Errand)
         ends.errands.done("robot1", ErrandDone(sent.number, content))
-        with pytest.raises(RefusedError, match="answered stop in a way not understood"):
+        with pytest.raises(RefusedError, match=r"does not understand the answer of .* to stop"):
             await asked
 
     asyncio.run(body())

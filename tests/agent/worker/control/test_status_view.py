@@ -24,8 +24,11 @@ VIEW = ComponentView(NAME, State.STANDBY, 1, "robot1", "robot2", Protection.NONE
 @pytest.mark.parametrize(
     ("hooks", "sentence"),
     [
-        (HooksConfig(), f"robot2 could not go on with it: {LACK}"),
-        (HooksConfig(before_resume=("/bin/mount-maps",)), f"robot2 lacks now, and its hook before_resume is to bring: {LACK}"),
+        (HooksConfig(), f"robot2 could not resume it: {LACK}"),
+        (
+            HooksConfig(before_resume=("/bin/mount-maps",)),
+            f"robot2 lacks this now, and the hook before_resume must bring it: {LACK}",
+        ),
     ],
 )
 def test_what_a_hook_perhaps_brings_is_lacking_now_and_no_refusal(hooks: HooksConfig, sentence: str, tmp_path: Path) -> None:

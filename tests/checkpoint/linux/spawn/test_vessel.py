@@ -96,7 +96,7 @@ def test_a_pid_of_one_that_was_not_waited_for_is_said_to_be_so() -> None:
         os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
         born = vessel.spawn_vessel(Birth(inner_pid=ended.pid))
         vessel.discard(born)
-        wanted = f"{ended.pid} cannot be had, it has ended, but its parent, pid {os.getpid()}, has not waited for it yet"
+        wanted = f"{ended.pid} is not available, it has ended, but its parent, pid {os.getpid()}, has not waited for it yet"
         assert any(wanted in note for note in born.notes), born.notes
 
 

@@ -68,7 +68,7 @@ def test_who_goes_on_by_itself_because_its_keeper_is_late_has_them_all(holder: P
         snapshot = captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))
         session.acknowledge(snapshot.position)
         monkeypatch.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
-        with pytest.raises(CaptureError, match="has run on while it was looked at"):
+        with pytest.raises(CaptureError, match="has run on while failover examined it"):
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         monkeypatch.undo()
     expect_undisturbed(holder)
@@ -82,7 +82,7 @@ def test_who_goes_on_by_itself_after_a_first_entry_has_them_all(holder: Program,
         await_all_by_themselves(holder)
 
     monkeypatch.setattr(entry, "_wait_in_call", wait_too_long)
-    with pytest.raises(CaptureError, match="has run on while it was looked at"):
+    with pytest.raises(CaptureError, match="has run on while failover examined it"):
         ENGINE.protect(holder.pid, ProtectOrder("/test/holder")).close()
     monkeypatch.undo()
     expect_undisturbed(holder)

@@ -123,7 +123,7 @@ def test_a_thread_that_does_not_stop_is_let_go_later_and_nobody_else_waits_for_i
             assert "t" not in states(tracee.pid)
         assert "other rights" not in " ".join(ENGINE.probe(tracee.pid).reasons)  # we trace one thread still, and not the first
         late = next(tid for tid in thread_ids(tracee.pid) if tracer_of(tracee.pid, tid) == os.getpid())
-        with pytest.raises(CaptureError, match="is ours since an earlier look"):
+        with pytest.raises(CaptureError, match="failover traces it since an earlier capture"):
             Tracee(late).seize()
         (tmp_path / "leave").touch()
         tracee.wait_for_line("came out")

@@ -436,7 +436,7 @@ def test_a_path_that_cannot_be_laid_down_leaves_the_others_as_they_were(tmp_path
     if not built:
         top.chmod(0o555)
     before = contents(top)
-    with pytest.raises(RestoreError, match=f"cannot lay down {other}, which .* see to room and rights there"):
+    with pytest.raises(RestoreError, match=f"cannot write {other}, which .* see to room and rights there"):
         restore.lay_down(state, Eyes(round_trip.NOBODY, round_trip.NOBODY), frozenset())
     assert contents(top) == before
 
@@ -475,7 +475,7 @@ def test_what_cannot_be_moved_back_is_not_removed_and_is_said(tmp_path: Path, mo
         real(old, new, flag)
 
     monkeypatch.setattr(reversible_moves, "_renameat2", renameat2)
-    with pytest.raises(RestoreError, match=f"nor undo it: what stood at {top}/a is at {top}/.failover-new"):
+    with pytest.raises(RestoreError, match=f"nor undo it: the former {top}/a is at {top}/.failover-new"):
         restore.lay_down(state, None, frozenset())
     (left,) = top.glob(".failover-new-*/new/state")
     assert left.read_text() == "newer"

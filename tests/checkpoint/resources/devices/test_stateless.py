@@ -238,6 +238,6 @@ def test_what_a_robot_lacks_is_told_beforehand() -> None:
         DeviceRule("/dev/x", "hook"),
     )
     assert missing(rules) == (
-        "lacks /dev/none: the program could not go on here",
+        "lacks /dev/none: the program could not resume here",
         "lacks /dev/some: it would be found hung up",
     )

@@ -281,7 +281,7 @@ def test_where_no_way_leads_to_the_peer_it_is_reset_and_that_is_said(machines_4:
     caller.wait()
     machines_4.ip("two", "link", "set", "eth0", "down")
     pid, notes = restored(machines_4, "two", file)
-    assert "with 10.77.0.1 port 7000 is reset (no way leads to 10.77.0.1 from here: Network is unreachable)" in notes
+    assert "with 10.77.0.1 port 7000 is reset (no route leads to 10.77.0.1 from here: Network is unreachable)" in notes
     called.kill()
     finish(machines_4, pid, called)
     assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"
@@ -292,7 +292,7 @@ def test_it_is_reset_where_who_restores_wants_it_so(machines_4: Machines) -> Non
     file = captured(machines_4, caller.pid, "--connections", "carry")
     caller.wait()
     pid, notes = restored(machines_4, "one", file, "--connections", "reset")
-    assert "is reset (it goes on from an older state)" in notes
+    assert "is reset (the program resumes from an older state)" in notes
     called.kill()
     finish(machines_4, pid, called)
     assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"
@@ -313,6 +313,6 @@ def test_one_that_is_on_its_way_in_a_message_is_reset_and_that_is_said(machines_
     file = captured(machines_4, caller.pid, "--connections", "carry")
     caller.wait()
     pid, notes = restored(machines_4, "one", file)
-    assert "is reset (it was on its way in a unix socket: received, it is taken along)" in notes, notes
+    assert "is reset (it was on its way in a unix socket; once received, it is taken along)" in notes, notes
     finish(machines_4, pid, called)
     assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"

@@ -172,7 +172,7 @@ def test_a_restore_that_comes_to_nothing_in_the_middle_leaves_a_vessel_that_can_
     file = os.open(snapshot, os.O_RDONLY | os.O_CLOEXEC)
     born = spawn_vessel(Birth())
     with Keeper.spawn() as keeper:
-        with pytest.raises(CheckpointError, match=f"pid {pid}, by which they know it, cannot be had"):
+        with pytest.raises(CheckpointError, match=f"pid {pid}, by which they know it, is not available"):
             keeper.ask(Restore(born.pid, "/test/taken", 0), Restored, (file,))
         with contextlib.suppress(ProcessLookupError):
             os.kill(born.pid, signal.SIGKILL)
@@ -188,7 +188,7 @@ def test_a_program_whose_pids_are_taken_goes_on_in_pids_of_its_own(taken: tuple[
     back = int(restored.stdout)
     try:
         assert back != pid
-        assert "it goes on in PIDs of its own" in restored.stderr
+        assert "it runs in a PID namespace of its own" in restored.stderr
         assert procfs.status(back).pids[-1] == pid
     finally:
         os.kill(back, signal.SIGKILL)

@@ -26,7 +26,7 @@ CLAIM: dict[str, Any] = {
     "doubt_ms": 0.0,
     "robot": "robot2",
     "component": "/lab/robot1/mapper",
-    "did": "robot2 claims epoch 2, to run it from its newest checkpoint: nobody runs it",
+    "did": "robot2 claims epoch 2, to run it from its newest checkpoint: no robot runs it",
     "life": 1,
     "number": 9,
     "repeats": 0,
@@ -53,7 +53,7 @@ def test_a_decision_is_told_with_what_was_seen_the_epochs_and_what_it_cost() -> 
         "robot1: counted as dead, silent for 221 ms (the limit is 220 ms) (eth0 221 ms, wlan0 230 ms); "
         "it said: primary, epoch 1, primary robot1",
         "here: claiming, epoch 1 → 2",
-        "newest checkpoint: 17, 310 ms old: what was computed since would be lost",
+        "newest checkpoint: 17, 310 ms old: a takeover from it loses the work since then",
     ]
 
 
@@ -62,7 +62,7 @@ def test_a_decision_is_told_with_what_was_seen_the_epochs_and_what_it_cost() -> 
     [
         ({"lease_left_ms": 90.0, "state": "primary"}, "here: primary, epoch 1 → 2, may act for 90 ms more"),
         ({"lease_left_ms": 0.0, "state": "frozen"}, "here: frozen, epoch 1 → 2, its lease is over"),
-        ({"checkpoint": None}, "no checkpoint yet: all that was computed would be lost"),
+        ({"checkpoint": None}, "no checkpoint yet: a takeover loses all work"),
         ({"checkpoint_age_ms": None}, "newest checkpoint: 17"),
         ({"output_pending": 1_204}, "output in no checkpoint: 1.2 KB"),
         ({"late_ms": 340.0}, "its own loop had been late by 340 ms"),
@@ -94,13 +94,13 @@ def test_who_did_not_answer_and_whose_clock_is_wrong_is_said() -> None:
             {**exact, "robot": "robot1"},
             {**exact, "robot": "robot2", "clock_offset_ms": -5_002.0},
             {**exact, "robot": "robot3", "damaged": 2},
-            {**exact, "robot": "robot4", "answered": False, "reason": "the bulk lane is connecting"},
+            {**exact, "robot": "robot4", "answered": False, "reason": "the replication link is connecting"},
         ]
     )
     assert told.splitlines() == [
         "robot2: its clock is 5.002 s behind this robot's (± 0.3 ms); all times above are this robot's",
-        "robot3: 2 lines of its story cannot be read any more",
-        "robot4 did not tell its part: the bulk lane is connecting",
+        "robot3: 2 lines of its event log cannot be read any more",
+        "robot4 did not send its event log: the replication link is connecting",
     ]
 
 

@@ -194,7 +194,7 @@ def test_why_nobody_stands_by_is_told_while_a_peer_ends_a_copy_of_its_own() -> N
     assert not notes_of(talk)
     talk.hear("robot2", entry(State.STOPPING, 1, "robot1"))
     talk.tick(5)
-    assert notes_of(talk) == ("robot2 cannot stand by yet: a copy of it that ran there is still being ended",)
+    assert notes_of(talk) == ("robot2 cannot stand by yet: that robot still ends its own copy",)
     talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
     talk.tick(5)
     assert not notes_of(talk)

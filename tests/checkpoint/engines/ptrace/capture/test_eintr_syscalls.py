@@ -210,7 +210,7 @@ def test_a_wait_that_went_on_while_its_keeper_was_late_does_not_end_with_eintr(
         with protected(program) as session:
             program.wait_until(lambda: waiting_in in calls_of(program.pid), "the wait")
             monkeypatch.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
-            with pytest.raises(CaptureError, match="has run on while it was looked at"):
+            with pytest.raises(CaptureError, match="has run on while failover examined it"):
                 session.capture(CaptureOrder(base=True, generation=1, sequence=1))
             monkeypatch.undo()
         program.wait_until(lambda: has_done_enough(program), "its waits")

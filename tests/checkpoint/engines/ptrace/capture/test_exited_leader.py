@@ -225,7 +225,7 @@ def test_spokesmen_that_end_one_after_the_other_are_not_followed_for_ever(monkey
         asked.append(tid)
         assert len(asked) <= SPOKESMEN_MAX, "for ever"
 
-    with pytest.raises(ProbeError, match="its threads end while it is looked at"):
+    with pytest.raises(ProbeError, match="its threads end while failover examines it"):
         told_by_spokesman(1, question)
 
 

@@ -405,7 +405,7 @@ def test_a_copy_is_to_be_laid_again_when_a_process_was_born(tmp_path: Path) -> N
                 (tmp_path / "fork").touch()
                 program.wait_for_line("ready")
                 delta = transported(captured_at_last(session, CaptureOrder(base=False, sequence=2, hold=True)))
-                with pytest.raises(RestoreError, match="its processes are others by now"):
+                with pytest.raises(RestoreError, match="its processes have changed"):
                     standby.copy.advance(delta)
                 assert not standby.copy.torn
             program.kill()
