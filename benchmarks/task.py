@@ -118,7 +118,7 @@ def _others(directory: Path, value: Callable[[], Any]) -> Iterator[Case]:
     directory.mkdir()
     yield "pickle, fsync, rename", lambda: _write_aside(directory / "pickled", pickle.dumps(value(), protocol=5))
     with shelve.open(str(directory / "shelf")) as shelf:
-        yield "shelve, sync", lambda: (shelf.__setitem__("state", value()), shelf.sync())
+        yield "shelve, sync", lambda: _replace_entry(shelf, value())
     with closing(sqlite3.connect(directory / "rows")) as rows:
         rows.execute("CREATE TABLE states (name TEXT PRIMARY KEY, state BLOB)")
         yield "sqlite3 of a pickle", lambda: _replace_row(rows, pickle.dumps(value(), protocol=5))
@@ -140,6 +140,11 @@ def _dump_aside(joblib: Any, path: Path, value: object) -> None:
         file.flush()
         os.fsync(file.fileno())
     path.with_suffix(".new").rename(path)
+
+
+def _replace_entry(shelf: shelve.Shelf[Any], value: Any) -> None:
+    shelf["state"] = value
+    shelf.sync()
 
 
 def _replace_row(rows: sqlite3.Connection, content: bytes) -> None:

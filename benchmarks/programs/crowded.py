@@ -9,19 +9,21 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
+from typing import NoReturn
 
 
-def sleep_on():
+def sleep_on() -> NoReturn:
     while True:
         time.sleep(1)
 
 
-def threads(count):
+def threads(count: int) -> None:
     for _ in range(count):
         threading.Thread(target=sleep_on, daemon=True).start()
 
 
-MAKERS = (
+MAKERS: tuple[Callable[[int], object], ...] = (
     threads,
     lambda count: [os.open(__file__, os.O_RDONLY) for _ in range(count)],
     lambda count: [os.pipe() for _ in range(count // 2)],

@@ -15,6 +15,7 @@ PAGE = 4096
 
 size, dirty = int(sys.argv[1]) * 1_000_000, int(sys.argv[2]) * 1000
 by_chance = sys.argv[3:] == ["1"]
+memory: bytearray | mmap.mmap
 if by_chance:
     memory = mmap.mmap(-1, size // PAGE * PAGE, flags=mmap.MAP_PRIVATE)
     memory[:] = os.urandom(len(memory))

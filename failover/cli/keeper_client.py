@@ -66,6 +66,14 @@ class Keeper:
             raise CheckpointError(f"the keeper answered {type(request).__name__} with {type(answer).__name__}; same version?")
         return answer, found
 
+    def tell(self, request: msgspec.Struct) -> None:
+        """Send a request that has no answer.
+
+        Raises:
+            ChannelError: the keeper has gone.
+        """
+        self._link.send(request)
+
     def _last_words(self) -> str:
         """The last line of what it wrote to standard error."""
         self._process.wait(LEAVE_S)
