@@ -127,6 +127,8 @@ class Terms(Struct, frozen=True):
             None: with those that its process has; it may have any, for its owner is root, or the keeper has no rights to lend.
         shared: files, and folders with all that is in them, that others write to as well: they keep the content that they have
             where the program goes on, and only its offsets are set; absolute.
+        detaches_memory: shared memory that other processes have mapped, too, becomes the program's own copy where it resumes;
+            otherwise the program is refused (`checkpoint.resources.ipc.shared_memory`).
     """
 
     carry: Carry = NOTHING_CARRIED
@@ -135,6 +137,7 @@ class Terms(Struct, frozen=True):
     freeze_budget_ns: int = 0
     shared: tuple[str, ...] = ()
     owner: Owner | None = None
+    detaches_memory: bool = False
 
     def is_shared(self, path: str) -> bool:
         """Whether a file is one of those that are shared, or lies in such a folder."""
