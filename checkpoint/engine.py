@@ -278,12 +278,23 @@ class Session(Protocol):
         ...
 
 
+RESET_NOTE: Final = "its connections were reset"
+COPY_NOTE: Final = "its shared memory"
+LASTING_NOTES: Final = (RESET_NOTE, COPY_NOTE)
+"""How those notes of a restore begin that an operator should find in the status while the program runs."""
+
+
 class Restored(Protocol):
     """A program that was brought back and stands still until `resume`."""
 
     position: Position
     """Of the snapshot that it stands at."""
     notes: tuple[str, ...]
+
+    @property
+    def connections(self) -> int:
+        """How many TCP connections it had open at the capture."""
+        ...
 
     @property
     def pid(self) -> int:

@@ -25,6 +25,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.capability import Area, by_rule, refused
+from checkpoint.engine import COPY_NOTE
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux.memory.tracker import ANONYMOUS, MEMORY_PLACE
 from checkpoint.linux.procfs import procfs
@@ -206,7 +207,7 @@ def notes(resources: Iterable[Resource]) -> tuple[str, ...]:
         return ()
     more = f" and {len(told) - NAMES_TOLD} more" if len(told) > NAMES_TOLD else ""
     names = ", ".join(told[:NAMES_TOLD])
-    return (f'its shared memory {names}{more} is a copy of its own (shared_memory = "detach"): no other process sees it',)
+    return (f'{COPY_NOTE} {names}{more} is a copy of its own (shared_memory = "detach"): no other process sees it',)
 
 
 def _names(fact: Fact) -> list[str]:
