@@ -7,9 +7,11 @@ import ctypes
 import json
 import os
 import secrets
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +21,21 @@ from checkpoint.engine import CaptureOrder, ProtectOrder, Session, Terms
 from checkpoint.errors import UnsupportedError
 from checkpoint.model import Snapshot
 from checkpoint.resources.ipc import middlewares
-from tests.checkpoint.round_trip import ENGINE, Program, at_last, captured_at_last, ended, restored, start, transported
+from tests.checkpoint.round_trip import (
+    ENGINE,
+    Program,
+    as_nobody,
+    at_last,
+    captured_at_last,
+    ended,
+    restored,
+    start,
+    transported,
+)
 
 PROGRAM = Path(__file__).with_name("shares_memory.py")
+PYTHON = "/usr/bin/python3" if os.path.exists("/usr/bin/python3") else sys.executable
+"""One that an ordinary user may run too."""
 SIZE = 4 * 4096
 PLACE = 8192
 """Where something is said in each piece."""
@@ -46,7 +60,7 @@ class Shared:
                 file.truncate(SIZE)
             os.chmod(path, 0o666)
             self.say(path, "before")
-        words = [sys.executable, "-c", OTHER, str(segment), *self.paths]
+        words = [PYTHON, "-S", "-c", OTHER, str(segment), *self.paths]
         self.other = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert self.other.stdout is not None
         assert self.other.stdout.readline() == b"ready\n"
@@ -93,7 +107,7 @@ def detaching(program: Program) -> Iterator[Session]:
 
 def started(tmp_path: Path, own: str, read: str = "", segment: int = -1, memory_file: int = -1, *rest: str) -> Program:
     """The program, when it has mapped everything."""
-    words = [sys.executable, PROGRAM, own, read, str(segment), str(memory_file), *rest]
+    words = [PYTHON, "-S", "-c", PROGRAM.read_text(), own, read, str(segment), str(memory_file), *rest]
     program = start(words, tmp_path, isolate="child" in rest)  # with its namespace all of them end
     program.wait_for_line("ready")
     return program
@@ -219,6 +233,44 @@ def test_on_a_machine_without_that_memory_the_program_has_its_copy(tmp_path: Pat
 
 
 @pytest.mark.root
+def test_an_ordinary_user_has_his_programs_memory_detached_too() -> None:
+    """He may not look into mappings (/proc/PID/map_files): what others wrote to them is carried all the same."""
+    text, place = PROGRAM.read_text(), Path(tempfile.mkdtemp(dir="/tmp"))  # not below a folder of root's alone
+    place.chmod(0o777)
+    with shared(unique(), unique()) as pieces:
+
+        def act() -> str:
+            words = [PYTHON, "-S", "-c", text, *pieces.paths, "-1", "-1"]
+            with ended(start(words, place)) as program:
+                program.wait_for_line("ready")
+                with detaching(program) as session:
+                    base = transported(captured_at_last(session, CaptureOrder()))
+                    program.kill()
+            for path in pieces.paths:
+                pieces.say(path, "afterwards")
+            with ended(restored(base, place, keep_pid=False)) as program:
+                found = answer(program)
+            return f"{found['own']}, {found['read']}"
+
+        try:
+            assert as_nobody_with(pieces, act) == "before, before"
+        finally:
+            shutil.rmtree(place)
+
+
+def as_nobody_with(pieces: Shared, act: Callable[[], str]) -> str:
+    """Run it as an ordinary user, who sees another process of his that has mapped the pieces."""
+
+    def with_other() -> str:
+        with contextlib.ExitStack() as opened:
+            for path in pieces.paths:
+                opened.enter_context(_mapping(path))
+            return act()
+
+    return as_nobody(with_other)
+
+
+@pytest.mark.root
 def test_a_system_v_segment_is_detached_too(tmp_path: Path) -> None:
     libc = ctypes.CDLL(None)
     libc.shmat.restype = ctypes.c_void_p
@@ -261,7 +313,7 @@ def test_a_memory_file_is_detached_too(tmp_path: Path) -> None:
 @contextlib.contextmanager
 def _mapping(path: str) -> Iterator[None]:
     """Another process that has mapped a file, for the body."""
-    words = [sys.executable, "-c", OTHER, "-1", path]
+    words = [PYTHON, "-S", "-c", OTHER, "-1", path]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == b"ready\n"
