@@ -36,6 +36,8 @@ while True:
     time.sleep(0.01)
 """
 
+pytestmark = pytest.mark.timeout(300)
+
 Pair = tuple[RobotMachine, RobotMachine]
 
 
