@@ -101,6 +101,8 @@ class ComponentConfig:
         carry_limit: what they may hold while it runs here.
         carry_at: where they are laid down here, by their path on the other robots; the same path for those not named.
         shared: files and folders that others write to as well: they keep the content that they have here.
+        shared_memory: detach: shared memory that others have mapped, too, becomes its own copy where it resumes; refuse: it is
+            not captured while it has any.
     """
 
     on_loss: Literal["takeover", "hold"] = "takeover"
@@ -124,6 +126,7 @@ class ComponentConfig:
     carry_limit: str = "256MB"
     carry_at: dict[str, str] = field(default_factory=dict)
     shared: tuple[str, ...] = field(default_factory=tuple)
+    shared_memory: Literal["refuse", "detach"] = "refuse"
 
     def device_rules(self) -> tuple[DeviceRule, ...]:
         """This robot's own rules for its devices.

@@ -127,6 +127,8 @@ class Terms(Struct, frozen=True):
             None: with those that its process has; it may have any, for its owner is root, or the keeper has no rights to lend.
         shared: files, and folders with all that is in them, that others write to as well: they keep the content that they have
             where the program goes on, and only its offsets are set; absolute.
+        detaches_memory: shared memory that other processes have mapped, too, becomes the program's own copy where it resumes;
+            otherwise the program is refused (`checkpoint.resources.ipc.shared_memory`).
     """
 
     carry: Carry = NOTHING_CARRIED
@@ -135,6 +137,7 @@ class Terms(Struct, frozen=True):
     freeze_budget_ns: int = 0
     shared: tuple[str, ...] = ()
     owner: Owner | None = None
+    detaches_memory: bool = False
 
     def is_shared(self, path: str) -> bool:
         """Whether a file is one of those that are shared, or lies in such a folder."""
@@ -275,12 +278,23 @@ class Session(Protocol):
         ...
 
 
+RESET_NOTE: Final = "its connections were reset"
+COPY_NOTE: Final = "its shared memory"
+LASTING_NOTES: Final = (RESET_NOTE, COPY_NOTE)
+"""How those notes of a restore begin that an operator should find in the status while the program runs."""
+
+
 class Restored(Protocol):
     """A program that was brought back and stands still until `resume`."""
 
     position: Position
     """Of the snapshot that it stands at."""
     notes: tuple[str, ...]
+
+    @property
+    def connections(self) -> int:
+        """How many TCP connections it had open at the capture."""
+        ...
 
     @property
     def pid(self) -> int:

@@ -25,7 +25,18 @@ import msgspec
 
 import checkpoint
 from checkpoint import engine
-from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored, RestoreOptions, Session, Streams
+from checkpoint.engine import (
+    LASTING_NOTES,
+    RESET_NOTE,
+    CaptureOrder,
+    Copy,
+    Engine,
+    ProtectOrder,
+    Restored,
+    RestoreOptions,
+    Session,
+    Streams,
+)
 from checkpoint.engines import registry
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, ProcessGoneError, RestoreError, StoreError, let_go
 from checkpoint.keeper import messages
@@ -34,6 +45,7 @@ from checkpoint.linux.signal_wakeup import waking
 from checkpoint.linux.spawn import namespaces
 from checkpoint.linux.unix_address import address_of
 from checkpoint.model import Position, Snapshot
+from checkpoint.resources.sockets import tcp
 from checkpoint.runtime import allocator, parallel, slim_imports
 from checkpoint.snapshot import carried_files, format, untrusted
 from checkpoint.snapshot.credentials import Owner
@@ -89,6 +101,8 @@ class Keeper:
         self._session: Session | None = None
         self._restored: Restored | None = None
         self._copy: Copy | None = None
+        self._lasting: tuple[str, ...] = ()
+        self._connections = 0
         self._revived: tuple[messages.Restore, Streams | None] | None = None
         self._sender = Sender()
         self._robot = ""
@@ -180,7 +194,7 @@ class Keeper:
             size=made.size,
             freeze_us=snapshot.freeze_us,
             dirty_bytes=made.dirty_bytes,
-            notes=snapshot.notes,
+            notes=(*self._lasting_notes(snapshot), *snapshot.notes),
             totals=session.totals,
             commit=commit,
             age_ns=age_ns,
@@ -190,6 +204,14 @@ class Keeper:
             wanted_bytes=self._sender.wanted,
         )
         return answer, made.descriptors
+
+    def _lasting_notes(self, snapshot: Snapshot) -> tuple[str, ...]:
+        """What the restore lost and the program still lacks; it has its connections again once it has opened as many."""
+        if any(note.startswith(RESET_NOTE) for note in self._lasting):
+            count = tcp.established(held for told in snapshot.processes for held in told.resources)
+            if count >= self._connections:
+                self._lasting = tuple(note for note in self._lasting if not note.startswith(RESET_NOTE))
+        return self._lasting
 
     def _made(self, session: Session, order: CaptureOrder, target: int | None, request: messages.Capture) -> _Encoded:
         """Capture, and encode what was captured: into the target, or into a memory file where there is none."""
@@ -341,6 +363,8 @@ class Keeper:
             messages.close_all(descriptors)
             raise RestoreError("cannot resume: nothing was restored by this keeper")
         self._restored = self._revived = None
+        self._lasting = tuple(note for note in restored.notes if note.startswith(LASTING_NOTES))
+        self._connections = restored.connections
         restored.resume()
         let_go_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         order, streams = revived

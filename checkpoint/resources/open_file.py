@@ -128,12 +128,15 @@ class Surroundings(Struct, frozen=True):
         devices: what the operator wants to become of devices.
         connections: TCP connections with others go along where it is handed over.
         is_first: it is about the first process of a component.
+        detached: by device and inode number, the shared memory that becomes the program's own copy, and how much of it, from its
+            beginning on, the component has mapped; None where the operator's rules say that such a program is refused.
     """
 
     pipes: Mapping[str, int] = field(default_factory=dict)
     devices: tuple[DeviceRule, ...] = ()
     connections: bool = False
     is_first: bool = True
+    detached: Mapping[tuple[int, int], int] | None = None
 
 
 class Held(Struct, frozen=True):

@@ -41,7 +41,7 @@ from checkpoint.resources.files import (
     regular,
     unlinked,
 )
-from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, standard_streams, system_v_memory
+from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.process import (
     audit_login,
     job_control,
@@ -108,6 +108,7 @@ SOCKETS: Final = (unix_kind.KIND, tcp.KIND, inet.KIND, *OF_KERNEL)
 NOT_OPEN: Final = (
     mlockall.KIND,
     system_v_memory.KIND,
+    shared_memory.KIND,
     credentials.KIND,
     scheduling.KIND,
     parent_death_signals.KIND,
@@ -170,7 +171,7 @@ def rebuild_all(
     if not wanted:
         for number in (*objects.values(), *inherited, *(STREAMS if descriptions is not None else ())):
             table.close(number)
-        return ()
+        return shared_memory.notes(state.resources)
     moved = _move_streams_away(table, max(wanted[-1].number, *table.descriptors, 0) + 1)
     piped = pipes.rebuild(table, [held for held in state.resources if _is_own(held, given, pipes.KIND)], moved[-1] + 1)
     disguise = Disguise(procfs.status(vessel_pid), state.process, options.own_eyes, inner_pid)
@@ -204,7 +205,7 @@ def rebuild_all(
         if one.resource.facts.get("travelling"):  # it was sent, and is open no more
             table.close(one.number)
     of_tcp = tcp.notes([held for held in state.resources if _is_own(held, given, tcp.KIND)])
-    return (*of_tcp, *unix.notes())
+    return (*of_tcp, *unix.notes(), *shared_memory.notes(state.resources))
 
 
 def deleted_directory(state: Snapshot) -> int | None:

@@ -308,6 +308,7 @@ def refuse_process(
     kin: Collection[int] = (),
     *,
     files_kept: bool = False,
+    detaches_memory: bool = False,
     lines: Sequence[MapsLine] | None = None,
 ) -> Iterator[str]:
     """Why a process as a whole cannot be captured.
@@ -315,11 +316,13 @@ def refuse_process(
     Args:
         kin: all processes of its component, if there are several.
         files_kept: somebody keeps its program file by content, so that it need not be there any more.
+        detaches_memory: shared memory that others have mapped, too, becomes its own copy.
         lines: its mappings, where they are known.
     """
     lines = procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines
     yield from refused_threads.refuse(pid, status)
-    yield from shared_memory.refuse(pid, lines, kin)
+    if not detaches_memory:
+        yield from shared_memory.refuse(pid, lines, kin)
     yield from refuse_entering(pid, status, files_kept=files_kept, lines=lines)
     yield from _refuse_places(pid)
     yield from _refuse_namespaces(pid)

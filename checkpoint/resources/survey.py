@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from msgspec.structs import replace
@@ -23,7 +23,7 @@ from checkpoint.resources.descriptor_groups import Grouping
 from checkpoint.resources.devices import by_rule
 from checkpoint.resources.events import epoll, fd_signals
 from checkpoint.resources.files import locks, regular
-from checkpoint.resources.ipc import pipes, standard_streams
+from checkpoint.resources.ipc import pipes, shared_memory, standard_streams
 from checkpoint.resources.open_file import ALONE, Held, Kin, Opened, OpenFile, Owners, Surroundings
 from checkpoint.resources.socket_cache import Recollection
 from checkpoint.resources.sockets import scm_rights, sockets
@@ -215,6 +215,9 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     resources, findings = [], []
     for held in opened:
         of_any = locks.refuse(held) or (None if held.is_echo else fd_signals.refuse(held))
+        if surroundings.detached:
+            of_any = of_any or shared_memory.refuse_partial(held.first, surroundings.detached)
+            held = _detached(held, surroundings.detached)
         for kind in registry.ASKED:
             if reason := kind.refuse(held, surroundings) or of_any:
                 findings.append(Finding(kind.KIND, held.name, REFUSED, reason))
@@ -228,6 +231,12 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
                 findings.append(Finding(kind.KIND, held.name, KEPT, f"{held.name} is {held.first.target}"))
                 break
     return Held(tuple(resources), tuple(findings))
+
+
+def _detached(held: OpenFile, objects: Mapping[tuple[int, int], int]) -> OpenFile:
+    """An open file of shared memory that becomes the program's own copy, as one without a name; any other as it is."""
+    found = tuple(shared_memory.descriptor_detached(one, objects) for one in held.descriptors)
+    return held if found == held.descriptors else replace(held, descriptors=found)
 
 
 def _of_every_kind(held: OpenFile, resource: Resource) -> dict[str, Fact]:

@@ -110,6 +110,7 @@ def run(room: argparse.ArgumentParser) -> None:
     _shared(room)
     _devices(room)
     _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
+    _shared_memory(room, "as agent.toml says: refuse")
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
     _agent(room)
@@ -154,6 +155,16 @@ def _connections(room: argparse.ArgumentParser, what: str, default: str = "") ->
     room.add_argument("--connections", choices=("reset", "carry"), default=default, help=f"{what} (see docs/connections.md)")
 
 
+def _shared_memory(room: argparse.ArgumentParser, default: str) -> None:
+    room.add_argument(
+        "--shared-memory",
+        choices=("refuse", "detach"),
+        default="",
+        help="detach: shared memory that other processes have mapped too becomes a copy of its own where it resumes; the others "
+        f"no longer see what it writes there (default: {default}; see docs/shared-memory.md)",
+    )
+
+
 def device(text: str) -> tuple[str, str]:
     """A path and its rule, which the agent reads."""
     path, is_there, rule = text.rpartition("=")
@@ -170,6 +181,7 @@ def protect(room: argparse.ArgumentParser) -> None:
     _shared(room)
     _devices(room)
     _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
+    _shared_memory(room, "as agent.toml says: refuse")
     _agent(room)
 
 
@@ -264,6 +276,7 @@ def capture(room: argparse.ArgumentParser) -> None:
     _shared(room)
     _devices(room)
     _connections(room, "carry: take its TCP connections with others along (default: reset)", "reset")
+    _shared_memory(room, "refuse")
     _json(room)
 
 

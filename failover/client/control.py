@@ -17,6 +17,7 @@ verb           arguments                                                result, 
                ``user`` "", ``engine`` "auto", ``output`` "immediate",  ``{name, exit_status}`` (a wait status); else at once
                ``devices`` {}: path → rule, ``carry`` [], ``shared`` [],
                ``connections`` "": reset, or carry,
+               ``shared_memory`` "": refuse, or detach,
                ``hooks`` {}: occasion → words of a command,
                ``portable`` "": a level, or "no"
 ``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``

@@ -123,6 +123,13 @@ CARRY = "carry"
 """They are taken along where it goes on from the state in which it stood still for good: by a handover, a failback."""
 
 
+REFUSE = "refuse"
+"""A program with shared memory that other processes have mapped, too, is not captured."""
+
+DETACH = "detach"
+"""Where it resumes, that memory is a copy of its own."""
+
+
 class Launch(Struct, frozen=True):
     """How a program begins. The rules carry it and never look inside.
 
@@ -139,6 +146,7 @@ class Launch(Struct, frozen=True):
         devices: (path, rule) of devices that it has open, where a robot has no rule of its own; see `checkpoint.device_rules`.
         connections: `RESET` or `CARRY`: what becomes of its TCP connections with others.
         shared: files and folders that others write to as well, as absolute paths: they keep the content that each robot has.
+        shared_memory: `REFUSE` or `DETACH`: what becomes of shared memory that other processes have mapped, too.
     """
 
     argv: tuple[str, ...] = ()
@@ -156,6 +164,7 @@ class Launch(Struct, frozen=True):
     devices: tuple[tuple[str, str], ...] = ()
     connections: str = RESET
     shared: tuple[str, ...] = ()
+    shared_memory: str = REFUSE
 
 
 class Rules(Struct, frozen=True):

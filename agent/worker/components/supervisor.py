@@ -31,7 +31,7 @@ from agent.worker.components.restore_limits import bound_of
 from agent.worker.components.snapshots import Snapshots, newest_of
 from agent.worker.components.statistics import NOT_WANTED, Commits, CopyFigures, Figures, shortened
 from agent.worker.components.warm_program import Standby
-from checkpoint.engine import COOPERATIVE
+from checkpoint.engine import COOPERATIVE, LASTING_NOTES
 from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
 from checkpoint.keeper.messages import close_all
 from failover.core import acts, events
@@ -371,6 +371,7 @@ class Charge:
         self.figures.restores += 1
         self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()
+        self.figures.notes = tuple(note for note in component.notes if note.startswith(LASTING_NOTES))
         self.figures.outage_ms = (silent_ns + acts_ns - began_ns) / 1e6
         since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
         protecting = f"; protecting it again {(clock.now_ns() - acts_ns) / 1e6:.1f} ms" if component.let_go_ns else ""

@@ -33,6 +33,9 @@ HookName = Literal["before_capture", "before_resume", "after_resume"]
 Connections = Literal["", "reset", "carry"]
 """What becomes of TCP connections; "" for what this robot's operator says."""
 
+SharedMemory = Literal["", "refuse", "detach"]
+"""What becomes of shared memory that others have mapped, too; "" for what this robot's operator says."""
+
 T = TypeVar("T")
 
 
@@ -67,6 +70,7 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     shared: list[Text] = []
     devices: dict[Text, Text] = {}
     connections: Connections = ""
+    shared_memory: SharedMemory = ""
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -78,6 +82,7 @@ class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
     shared: list[Text] = []
     devices: dict[Text, Text] = {}
     connections: Connections = ""
+    shared_memory: SharedMemory = ""
 
 
 class StopArguments(msgspec.Struct, forbid_unknown_fields=True):

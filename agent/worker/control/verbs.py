@@ -139,6 +139,7 @@ class Verbs(Questions):
             shared=self._shared(name, wanted.shared, wanted.carry),
             devices=self._device_rules(name, wanted.devices),
             connections=self._connections(name, wanted.connections),
+            shared_memory=wanted.shared_memory or self._lanes.settings.component(name).shared_memory,
         )
         charge = await self._begin(name, launch, inheritance.uid, say.caller.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
@@ -188,6 +189,7 @@ class Verbs(Questions):
             devices=devices,
             connections=connections,
             shared=shared,
+            shared_memory=wanted.shared_memory or self._lanes.settings.component(name).shared_memory,
         )
         charge = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}

@@ -129,6 +129,8 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} that is sealed against writing and mapped, which is not kept: let the program unmap it"
     if held.first.target == ANONYMOUS and _is_mapped(held):
         return f"{what} that was opened through /proc/self/map_files and mapped, which is not kept: let the program close it"
+    if (held.first.device, held.first.inode) in (surroundings.detached or ()):
+        return None
     return other_holders.refuse(held, "a memory file")
 
 

@@ -15,7 +15,7 @@ Source: shmget(2), shmop(2); ipc/shm.c: the inode number of a mapping is the id.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from msgspec import Struct, field
@@ -43,7 +43,7 @@ CAPABILITIES: Final = (
     refused(
         Area.MEMORY,
         "System V shared memory that other programs have too, or that is partly unmapped",
-        "use a file in /dev/shm, or protect the program after the others have ended",
+        "protect them as one component, or give the program a copy of its own (`--shared-memory detach`)",
         "attached by other processes, too",
         "of which it has unmapped a part",
     ),
@@ -61,11 +61,21 @@ def is_segment(mapping: MapsLine | Vma) -> bool:
     return mapping.shared and mapping.name.startswith(PREFIX)
 
 
-def describe(lines: Iterable[MapsLine]) -> tuple[Resource, ...]:
-    """Every segment that a program has attached."""
-    wanted = {line.inode for line in lines if is_segment(line)}
+def describe(lines: Iterable[MapsLine], detached: Collection[tuple[int, int]] = ()) -> tuple[Resource, ...]:
+    """Every segment that a program has attached.
+
+    Args:
+        detached: device and inode number of those that become its own copy: without a key, by which others would find it, and
+            gone with the program.
+    """
+    wanted = {line.inode: (line.device, line.inode) in detached for line in lines if is_segment(line)}
     known = system_v_ipc.segments() if wanted else {}
-    return tuple(_described(known[identifier]) for identifier in sorted(wanted) if identifier in known)
+    told = ((known[identifier], wanted[identifier]) for identifier in sorted(wanted) if identifier in known)
+    return tuple(_described(_own_copy(segment) if is_detached else segment) for segment, is_detached in told)
+
+
+def _own_copy(segment: Segment) -> Segment:
+    return replace(segment, key=0, permissions=segment.permissions | SHM_DEST, changed=0)
 
 
 def _described(segment: Segment) -> Resource:
@@ -90,12 +100,13 @@ def here(lines: Iterable[MapsLine]) -> dict[int, Segment]:
     return system_v_ipc.segments() if any(map(is_segment, lines)) else {}
 
 
-def refuse(lines: Iterable[MapsLine], known: Mapping[int, Segment]) -> Iterator[str]:
+def refuse(lines: Iterable[MapsLine], known: Mapping[int, Segment], *, detaches: bool = False) -> Iterator[str]:
     """Why a segment of a program cannot be kept.
 
     Args:
         lines: the mappings of all of its processes.
         known: the segments of this machine, of the same instant.
+        detaches: what others have, too, becomes its own copy.
     """
     found: dict[int, list[MapsLine]] = {}
     for line in lines:
@@ -105,8 +116,11 @@ def refuse(lines: Iterable[MapsLine], known: Mapping[int, Segment]) -> Iterator[
         segment, what = known.get(identifier), f"System V shared memory {identifier} is"
         if segment is None:
             continue  # it has just gone
-        if segment.attached > len(pieces):
-            yield f"{what} attached by other processes, too, which stay behind: protect the program when they have ended"
+        if segment.attached > len(pieces) and not detaches:
+            yield (
+                f"{what} attached by other processes, too, which stay behind: protect all of them as one component, or give the "
+                "program a copy of its own (--shared-memory detach, see docs/shared-memory.md)"
+            )
         if not _is_whole(pieces, segment.size):
             yield f"{what} one of which it has unmapped a part: let the program keep the whole"
 

@@ -33,7 +33,7 @@ from ipaddress import ip_address
 from typing import Final
 
 from checkpoint.capability import Area, by_rule, preserved, refused
-from checkpoint.engine import NOTED, REFUSED, Finding
+from checkpoint.engine import NOTED, REFUSED, RESET_NOTE, Finding
 from checkpoint.linux.net import tcp_repair, time_wait
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -86,6 +86,9 @@ CLOSING: Final = 11
 _WE_ENDED: Final = (CLOSED, FIN_WAIT_1, FIN_WAIT_2, LAST_ACK, CLOSING)
 _PEER_SPEAKS: Final = (ESTABLISHED, FIN_WAIT_1, FIN_WAIT_2)
 _PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
+
+PEERS_TOLD: Final = 3
+"""Of those whose connections are reset, in one sentence."""
 
 TAKEN: Final = "carried"
 """Everything that must be known of a connection to take it up elsewhere."""
@@ -254,6 +257,40 @@ def notes(held: Sequence[Resource]) -> tuple[str, ...]:
     others = pairs(held)
     ending = (one for one in held if one.kind == KIND and TAKEN not in one.facts and _number(one, "socket") not in others)
     return tuple(text for one in ending if (text := note(one)))
+
+
+def established(held: Iterable[Resource]) -> int:
+    """How many of these are connections that are open."""
+    return sum(one.kind == KIND and one.facts["state"] == ESTABLISHED for one in held)
+
+
+def summary(held: Sequence[Resource]) -> tuple[str, ...]:
+    """What a restore of a whole program resets, as a sentence for its status: with whom, and what to do.
+
+    Args:
+        held: what all of its processes have.
+    """
+    others = pairs(held)
+    ended = {
+        _number(one, "socket"): one
+        for one in held
+        if one.kind == KIND and TAKEN not in one.facts and _number(one, "socket") not in others and note(one)
+    }
+    if not ended:
+        return ()
+    ports = {_plain(one.facts["address"])[1] for one in held if one.kind == inet.KIND and one.facts["state"] == LISTENING}
+    accepted = [one for one in ended.values() if _plain(one.facts["address"])[1] in ports]
+    peers = [in_words(peer) for one in ended.values() if isinstance(peer := one.facts["peer"], list) and peer]
+    named = list(dict.fromkeys(peers))
+    more = f" and {len(named) - PEERS_TOLD} more" if len(named) > PEERS_TOLD else ""
+    figure = f"{len(ended)} TCP connection{'s' * (len(ended) > 1)}"
+    with_whom = f" with {', '.join(named[:PEERS_TOLD])}{more}" if named else ""
+    to_ports = ", ".join(map(str, sorted({_plain(one.facts["address"])[1] for one in accepted})))
+    opened = f"; others had opened {len(accepted)} of them, to its port {to_ports}" if accepted else ""
+    return (
+        f"{RESET_NOTE}: {figure}{with_whom}{opened}. If they are not opened anew, let an after_resume command see to that, or "
+        "protect it and its peers as one component (docs/recipes.md)",
+    )
 
 
 def pairs(held: Iterable[Resource]) -> dict[int, Resource]:

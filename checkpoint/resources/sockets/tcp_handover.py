@@ -187,14 +187,23 @@ class Arriving:
     """Connections that a program takes up again: made once it has its descriptors, and heard from when it goes on.
 
     Attributes:
-        notes: what is to be done for them.
+        notes: what is to be done for them, and what was reset.
+        established: connections that were open at the capture.
     """
 
-    def __init__(self, arrivals: Iterable[_Arrival] = (), ended: Iterable[Connection] = ()) -> None:
+    established = 0
+
+    def __init__(
+        self, arrivals: Iterable[_Arrival] = (), ended: Iterable[Connection] = (), state: Snapshot | None = None
+    ) -> None:
         """Of those that it takes up, and of those that have ended: this machine resets them, also where it was to be silent."""
         self._arrivals = tuple(arrivals)
         self._ended = tuple(ended)
         self.notes = tuple(_missing(one) for one in self._arrivals if not inet_addresses.is_ours(_ends(one.resource)[0]))
+        if state is not None:
+            everything = [held for told in state.processes for held in told.resources]
+            self.notes += tcp.summary(everything)
+            self.established = tcp.established(everything)
         self._made: list[tuple[socket.socket, _Arrival, int]] = []
 
     def connect(self, pids: Sequence[int]) -> None:
@@ -273,7 +282,8 @@ def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
             return held
         return replace(held, facts={**{name: fact for name, fact in held.facts.items() if name != TAKEN}, LEFT: reason})
 
-    return Arriving(arrivals, ended), _changed(state, without) if lost else state
+    state = _changed(state, without) if lost else state
+    return Arriving(arrivals, ended, state), state
 
 
 def _changed(state: Snapshot, change: Callable[[Resource], Resource]) -> Snapshot:

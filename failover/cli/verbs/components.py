@@ -36,6 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted["portable"] = arguments.portable
     wanted |= {"carry": [os.path.realpath(path) for path in arguments.carry], "devices": dict(arguments.devices)}
     wanted |= {"connections": arguments.connections, "shared": [os.path.realpath(path) for path in arguments.shared]}
+    wanted["shared_memory"] = arguments.shared_memory
     if arguments.name:
         wanted["name"] = arguments.name
     if arguments.user:
@@ -184,6 +185,7 @@ def protect(arguments: argparse.Namespace) -> int:
         carry = [os.path.realpath(path) for path in arguments.carry]
         shared = [os.path.realpath(path) for path in arguments.shared]
         rules = {"devices": dict(arguments.devices), "connections": arguments.connections, "shared": shared}
+        rules["shared_memory"] = arguments.shared_memory
         answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, **rules)
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 

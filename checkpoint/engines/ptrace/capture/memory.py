@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Collection
 from typing import Final
 
 import numpy as np
@@ -40,6 +41,7 @@ from checkpoint.pages.merge import Copy
 from checkpoint.pages.page_set import Words
 from checkpoint.resources.events import aio
 from checkpoint.resources.ipc import system_v_memory
+from checkpoint.resources.ipc.shared_memory import Object, seen_detached
 from checkpoint.runtime import parallel
 
 READ_CHUNK: Final = 8 << 20
@@ -164,6 +166,7 @@ class MemoryCapture:
         self._private: list[MapsLine] = []
         self._shared_lines: list[MapsLine] = []
         self._told_elsewhere: SharedPlaces = frozenset()
+        self._detached: Collection[Object] = frozenset()
         self._had_shared = False
         self._mapped: Words = NONE
         self._vdso: Words = NONE
@@ -376,6 +379,12 @@ class MemoryCapture:
             self._told_elsewhere = places
             self._sort_shared()
 
+    def detach(self, objects: Collection[Object]) -> None:
+        """Tell of these shared objects as of ones without a name: all that they hold, also what is mapped to be read alone."""
+        if objects != self._detached:
+            self._detached = objects
+            self._sort()
+
     def shared_places(self) -> SharedPlaces:
         """The shared memory that this process tells all of, as `leave_out` takes it."""
         may_look = digest_tracker.may_look_into_mappings()  # of a file with a name each tells what it has in its page tables
@@ -406,7 +415,8 @@ class MemoryCapture:
 
     def _sort(self) -> None:
         self._has_moved = True
-        self.lines = tuple(line for line in self._maps.lines if not self.borrowed.holds(line.start))
+        theirs = (line for line in self._maps.lines if not self.borrowed.holds(line.start))
+        self.lines = tuple(seen_detached(line, self._detached) for line in theirs)
         self._private = [line for line in self.lines if memory_tracker.is_private(line)]
         self._sort_shared()
         self.has_rings = any(map(aio.is_ring, self._shared_lines))

@@ -97,6 +97,7 @@ class CapturedProcess:
         slot: see `checkpoint.snapshot.process_tree`.
         born: when it began, which tells it from a later process with its pid.
         is_new: no snapshot tells of it yet.
+        detached: device and inode number of shared memory that becomes the component's own copy, see `detach`.
     """
 
     def __init__(self, threads: Threads, entered: Entered, order: ProtectOrder, slot: int = 0, born: int = 0) -> None:
@@ -115,6 +116,7 @@ class CapturedProcess:
             entered.tracker.close()
             raise
         self.identities = Identities(self.pid, order.names or {})
+        self.detached: Collection[tuple[int, int]] = frozenset()
         self._flags = FlagsReader(self.pid)
         self._of_mappings = Memo[tuple[str, ...]]()
 
@@ -181,6 +183,11 @@ class CapturedProcess:
         return self.born == born
 
     # Before the freeze
+
+    def detach(self, objects: Collection[tuple[int, int]]) -> None:
+        """Tell of these pieces of shared memory as the component's own, to which no name leads."""
+        self.detached = self.identities.detached = objects
+        self.memory.detach(objects)
 
     def prepare(self, *, base: bool) -> None:
         """Look at what is asked again while it stands still; for a base at the files, too, for that takes long."""
@@ -259,7 +266,14 @@ class CapturedProcess:
             self._flags.refresh(self.memory.lines)
             lines = look.taken.lines
             of_mappings = self._of_mappings.of(lines, self._flags.flags, make=lambda: self._refused(lines))
-            of_process = refusals.refuse_process(self.pid, look.standing.status, kin, files_kept=self.files_kept, lines=lines)
+            of_process = refusals.refuse_process(
+                self.pid,
+                look.standing.status,
+                kin,
+                files_kept=self.files_kept,
+                detaches_memory=self.order.terms.detaches_memory,
+                lines=lines,
+            )
             of_rings = aio.refuse(look.standing.opened) if self.memory.has_rings else ()
             return (
                 *of_process,
@@ -293,7 +307,7 @@ class CapturedProcess:
         of_program = (told.get(line.start, ()) for line in look.taken.lines if line.name not in NOT_CARRIED)
         return (
             *mlockall.describe(of_program, ours),
-            *system_v_memory.describe(look.taken.lines),
+            *system_v_memory.describe(look.taken.lines, self.detached),
             *clean_private_pages.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
             *self._limits(look.standing),
             *scheduling.describe(self.pid),

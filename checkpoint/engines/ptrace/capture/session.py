@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import time
 from collections.abc import Iterator, Mapping
 from typing import Final
@@ -53,7 +54,7 @@ from checkpoint.program import cpu_baseline, epoch_variable
 from checkpoint.resources import registry
 from checkpoint.resources.carried import capture as carried_capture
 from checkpoint.resources.carried.capture import NO_PARCEL, CarriedTrees, Parcel, Seen
-from checkpoint.resources.ipc import system_v_memory
+from checkpoint.resources.ipc import shared_memory, system_v_memory
 from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.process import refused_threads, thread_credentials
 from checkpoint.resources.sockets import tcp_handover
@@ -114,6 +115,8 @@ class PtraceSession:
         self.totals: Totals = (0, 0)
         self.frozen_size = 0
         self._surroundings = surroundings
+        self._detached: tuple[shared_memory.Mapped, ...] = ()
+        self._names_detached: dict[shared_memory.Object, str] = {}
         self._level = cpu_baseline.level_in(told_by_spokesman(self.pid, lambda tid: procfs.read_bytes(tid, "environ")))
         self._first = first
         self._tree = CapturedTree(first, kin)
@@ -287,6 +290,7 @@ class PtraceSession:
         while True:
             try:
                 self._tree.admit(held=self._held)
+                self._detach()
                 if base and (others := self._tree.processes()):
                     self._refuse(memory_limits.refuse_capture((self.pid, *(process.pid for process in others))))
                 copied = None if may_stay and not self._tree.processes() else self._copied_running(order, base=base)
@@ -302,6 +306,42 @@ class PtraceSession:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(MOVED_PAUSE_S)
+
+    def _detach(self) -> None:
+        """Where the rules say so: find the shared memory that others have mapped, too, and tell of it as of its own."""
+        known = self._surroundings.detached
+        if known is None:
+            return
+        processes = (self._first, *self._tree.processes())
+        for process in processes:
+            process.memory.refresh()
+        lines = {process.pid: process.memory.lines for process in processes}
+        self._detached = shared_memory.of_all(lines)
+        mapped = {(line.device, line.inode) for of_one in lines.values() for line in of_one if line.shared}
+        names = {one.key: one.name for one in self._detached}
+        self._names_detached = {key: name for key, name in (self._names_detached | names).items() if key in mapped}
+        objects = self._names_detached
+        covered = shared_memory.covered(itertools.chain.from_iterable(lines.values()), objects)
+        self._surroundings = replace(self._surroundings, detached=covered)
+        for process in processes:
+            process.detach(covered.keys())
+
+    def _require_detached(self, first: Look, others: SeenOthers | None) -> None:
+        """All that others have mapped is told as its own, and whole.
+
+        Raises:
+            CaptureError: it was shared, or unmapped, in the middle of the capture; the next one succeeds.
+        """
+        known = self._surroundings.detached
+        if known is None:
+            return
+        looks = [(self._first, first), *(others.looks() if others else ())]
+        lines = {process.pid: seen.taken.lines for process, seen in looks}
+        found = shared_memory.of_all(lines)
+        covered = shared_memory.covered(_lines_of_all(first, others), known)
+        if any(one.key not in known for one in found) or any(covered[key] < size for key, size in known.items()):
+            what = "another process has mapped shared memory of it in the middle of the capture, or it has unmapped some"
+            raise CaptureError(f"cannot capture {self.component} (pid {self.pid}): {what}; capture it again")
 
     def _copied_running(self, order: CaptureOrder, *, base: bool) -> RunningCopy:
         """What is copied of the first process before the freeze; those of the others are kept by the tree."""
@@ -472,7 +512,9 @@ class PtraceSession:
         pids = others.pids if others else ()
         every = (*held.resources, *(others.resources() if others else ()))
         of_all = registry.reasons_of_all(every)
-        of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments)
+        detaches = self._surroundings.detached is not None
+        of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments, detaches=detaches)
+        self._require_detached(first, others)
         self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_segments, *of_files))
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         outline = replace(
@@ -481,6 +523,7 @@ class PtraceSession:
                 *self._first.known(held.resources),
                 *self._first.unopened(first),
                 *self._first.stopped(),
+                *shared_memory.describe(self._names_detached.items()),
                 *parcel.resources,
             ),
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
@@ -539,7 +582,7 @@ class PtraceSession:
             vmas=(*self._first.mappings(first, others.pids if others else frozenset()), *parcel.vmas),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,
-            notes=self.notes,
+            notes=(*self.notes, *shared_memory.detached(self._detached)),
             members=others.members(first) if others else (),
             zombies=others.zombies(first) if others else (),
         )

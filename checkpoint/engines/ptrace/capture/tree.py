@@ -286,6 +286,7 @@ class CapturedTree:
     def _add(self, process: CapturedProcess) -> None:
         process.threads.is_one_of_many = True
         process.memory.buffer = self._first.memory.buffer
+        process.detach(self._first.detached)
         self._known[process.pid] = process
 
     def _forget(self, pid: int) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import stat
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from msgspec.structs import replace
@@ -55,6 +55,7 @@ class Identities:
         self._pid = pid
         self._names = names
         self.kin: frozenset[int] = frozenset()
+        self.detached: Collection[tuple[int, int]] = frozenset()
         self._mapped_twice: frozenset[int] = frozenset()
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
         self._without_name: dict[tuple[int, int, str], tuple[int, frozenset[int]]] = {}
@@ -135,6 +136,8 @@ class Identities:
         is_gone = line.name.endswith(DELETED)
         if not line.shared or not line.name.startswith("/") or not (is_gone or line.name.startswith(MEMORY_PLACE)):
             return ""
+        if (line.device, line.inode) in self.detached:
+            return ""
         path, file, key = line.name.removesuffix(DELETED), (line.device, line.inode), _key(line)
         try:
             about = os.stat(f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}")
@@ -156,7 +159,8 @@ class Identities:
 
     def _place(self, line: MapsLine) -> str:
         """Where the very file that is mapped is read: its name may lead elsewhere by now, to what we may read and it may not."""
-        named = f"{procfs.outlook(self._pid)}{line.name}"
+        is_detached = (line.device, line.inode) in self.detached
+        named = f"{procfs.outlook(self._pid)}{line.name.removesuffix(DELETED) if is_detached else line.name}"
         with contextlib.suppress(OSError):  # it is gone, or closed to us
             about = os.stat(named)
             if (about.st_dev, about.st_ino) == (line.device, line.inode):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,7 +27,7 @@ from checkpoint.linux.trace.entry import leftovers
 from checkpoint.program import cpu_baseline
 from checkpoint.resources import refusals, registry, shared_descriptions
 from checkpoint.resources.events import aio
-from checkpoint.resources.ipc import pseudo_terminals, standard_streams, system_v_memory
+from checkpoint.resources.ipc import pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.open_file import Held, Kin, Opened, OpenFile, Surroundings
 from checkpoint.resources.process import refused_threads
 from checkpoint.resources.survey import gather, glance, look, pipes_of
@@ -63,16 +64,19 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -
     _require_permission(first, status)
     _await_execution(first)
     kin, opened = _all_opened(pid, first, is_guarded=bool(surroundings.pipes))
+    surroundings, detached = _with_detached(kin, surroundings)
     looked = _looked(opened, first, surroundings)
+    detaches = surroundings.detached is not None
     findings = (
-        *_process_findings(first, status, kin, files_kept),
+        *(Finding("memory", "shared memory", NOTED, text) for text in shared_memory.detached(detached)),
+        *_process_findings(first, status, kin, files_kept, detaches=detaches),
         *_root_findings(first),
         *_processor_findings(first),
         *_memory_findings(first, opened[first]),
-        *_segments_findings(pid, first, is_guarded=bool(surroundings.pipes)),
+        *_segments_findings(pid, first, is_guarded=bool(surroundings.pipes), detaches=detaches),
         *looked[first].findings,
         *registry.findings_of_all([held for one in looked.values() for held in one.resources], standing=False),
-        *_others_findings(opened, pid, first, looked),
+        *_others_findings(opened, pid, first, looked, detaches=detaches),
     )
     return Report(pid, _command(first, status), status.resident_size, choose_tracker.best_tracking(), findings)
 
@@ -89,10 +93,26 @@ def reasons_of(pid: int, surroundings: Surroundings, *, files_kept: bool = False
 def _reasons_of(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -> tuple[str, ...]:
     _await_execution(first)
     kin, opened = _all_opened(pid, first, is_guarded=bool(surroundings.pipes))
+    surroundings, _ = _with_detached(kin, surroundings)
+    detaches = surroundings.detached is not None
     looked = _looked(opened, first, surroundings)
-    others = [found.text for found in _others_findings(opened, pid, first, looked) if found.verdict == REFUSED]
-    of_first = refusals.refuse_process(first, procfs.status(first), kin, files_kept=files_kept)
+    of_others = _others_findings(opened, pid, first, looked, detaches=detaches)
+    others = [found.text for found in of_others if found.verdict == REFUSED]
+    of_first = refusals.refuse_process(first, procfs.status(first), kin, files_kept=files_kept, detaches_memory=detaches)
     return (*looked[first].reasons, *of_first, *others)
+
+
+def _with_detached(kin: Iterable[int], surroundings: Surroundings) -> tuple[Surroundings, tuple[shared_memory.Mapped, ...]]:
+    """Where the rules say so, the shared memory of these processes that becomes the program's own copy."""
+    if surroundings.detached is None:
+        return surroundings, ()
+    lines: dict[int, tuple[MapsLine, ...]] = {}
+    for pid in kin:
+        with contextlib.suppress(ProcessGoneError):
+            lines[pid] = procfs.parse_maps(procfs.read_text(pid, "maps"))
+    found = shared_memory.of_all(lines)
+    covered = shared_memory.covered(itertools.chain.from_iterable(lines.values()), [one.key for one in found])
+    return replace(surroundings, detached=covered), found
 
 
 def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, ...], shared_descriptions.OpenedByAll]:
@@ -158,23 +178,23 @@ def _looked(opened: shared_descriptions.OpenedByAll, first: int, surroundings: S
 
 
 def _others_findings(
-    opened: shared_descriptions.OpenedByAll, process: int, first: int, looked: Mapping[int, Held]
+    opened: shared_descriptions.OpenedByAll, process: int, first: int, looked: Mapping[int, Held], *, detaches: bool
 ) -> Iterator[Finding]:
     """What stands against the processes besides the first; one that ends meanwhile does not."""
     if first != process and len(opened) > 1:
         yield Finding("process", "threads", REFUSED, refused_threads.OF_SEVERAL)
     for pid, held in looked.items():
         if pid != first:
-            for reason in (*_named(pid, held.reasons), *lasting(functools.partial(_against, pid, opened))):
+            for reason in (*_named(pid, held.reasons), *lasting(functools.partial(_against, pid, opened, detaches))):
                 yield Finding("process", f"pid {pid}", REFUSED, reason)
     for reason in lasting(functools.partial(_births_refused, process)):
         yield Finding("process", "births", REFUSED, reason)
 
 
-def _against(pid: int, opened: shared_descriptions.OpenedByAll) -> tuple[str, ...]:
+def _against(pid: int, opened: shared_descriptions.OpenedByAll, detaches: bool) -> tuple[str, ...]:
     """What stands against a process besides the first, but for what it has open."""
     try:
-        reasons = list(refusals.refuse_process(pid, procfs.status(pid), tuple(opened)))
+        reasons = list(refusals.refuse_process(pid, procfs.status(pid), tuple(opened), detaches_memory=detaches))
         mapped = _Mapped.by(pid)
     except (CheckpointError, FileNotFoundError, ProcessLookupError):
         return ()
@@ -210,7 +230,8 @@ def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) 
     """
     if not 0 < pid < procfs.pid_max():
         raise ProbeError(f"cannot examine pid {pid}: that is not the number of a process")
-    return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices, terms.connections)
+    detached: Mapping[tuple[int, int], int] | None = {} if terms.detaches_memory else None
+    return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices, terms.connections, detached=detached)
 
 
 def _require_permission(pid: int, status: Status) -> None:
@@ -237,8 +258,8 @@ def _await_execution(pid: int) -> None:
         time.sleep(EXECUTION_PAUSE_S)
 
 
-def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept: bool) -> Iterator[Finding]:
-    for reason in refusals.refuse_process(pid, status, kin, files_kept=files_kept):
+def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept: bool, *, detaches: bool) -> Iterator[Finding]:
+    for reason in refusals.refuse_process(pid, status, kin, files_kept=files_kept, detaches_memory=detaches):
         yield Finding("process", f"pid {pid}", REFUSED, reason)
     if status.ppid and len(status.pids) == 1:
         text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"
@@ -313,18 +334,18 @@ def _memory_findings(pid: int, opened: Sequence[OpenFile]) -> Iterator[Finding]:
         yield Finding("memory", path, NOTED, note)
 
 
-def _segments_findings(pid: int, first: int, *, is_guarded: bool) -> Iterator[Finding]:
-    for reason in lasting(lambda: _segments_refused(_kin(pid, first, is_guarded=is_guarded))):
+def _segments_findings(pid: int, first: int, *, is_guarded: bool, detaches: bool) -> Iterator[Finding]:
+    for reason in lasting(lambda: _segments_refused(_kin(pid, first, is_guarded=is_guarded), detaches=detaches)):
         yield Finding("memory", "System V shared memory", REFUSED, reason)
 
 
-def _segments_refused(kin: Iterable[int]) -> tuple[str, ...]:
+def _segments_refused(kin: Iterable[int], *, detaches: bool) -> tuple[str, ...]:
     """Why their System V shared memory cannot be kept; one may be born or end in between, so this may not last."""
     lines: list[MapsLine] = []
     for pid in kin:
         with contextlib.suppress(ProcessGoneError):
             lines += procfs.parse_maps(procfs.read_text(pid, "maps"))
-    return tuple(system_v_memory.refuse(lines, system_v_memory.here(lines)))
+    return tuple(system_v_memory.refuse(lines, system_v_memory.here(lines), detaches=detaches))
 
 
 def _command(pid: int, status: Status) -> str:

@@ -55,6 +55,11 @@ class RestoredProgram(Struct):
         """As this process sees it."""
         return self.threads.pid
 
+    @property
+    def connections(self) -> int:
+        """See ``checkpoint.engine.Restored.connections``."""
+        return self.arriving.established
+
     def resume(self) -> None:
         """Let it go on, without us: all of its threads at once. Should we die halfway, it dies, too, or all of it goes on."""
         self.arriving.let_go()
