@@ -13,7 +13,7 @@ from checkpoint.program import cpu_baseline
 from checkpoint.store.retention import Retention
 from failover.config.quantities import size_bytes, span_ms
 from failover.core import types
-from failover.core.types import CARRY, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
+from failover.core.types import CARRY, REFUSE, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
 
 NO_LEVEL: Final = "no"
 """Of ``failover run --portable``: whatever this processor has, whatever the operator says."""
@@ -95,7 +95,8 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
         return Terms(carry, component.device_rules(), freeze_budget_ns=budget_ns, shared=component.shared)
     devices = merged(arrived(launch.devices), component.device_rules())
     shared = tuple(dict.fromkeys((*launch.shared, *component.shared)))
-    return Terms(carry, devices, launch.connections == CARRY, budget_ns, shared)
+    refuses = launch.connections == REFUSE
+    return Terms(carry, devices, launch.connections == CARRY, budget_ns, shared, refuses_connections=refuses)
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:

@@ -12,7 +12,7 @@ from msgspec import Struct, field
 from msgspec.structs import astuple, replace
 
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import REFUSED, Finding
+from checkpoint.engine import NO_TERMS, REFUSED, Finding, Terms
 from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.kernel_listings import Listings
@@ -128,12 +128,17 @@ class Surroundings(Struct, frozen=True):
         devices: what the operator wants to become of devices.
         connections: TCP connections with others go along where it is handed over.
         is_first: it is about the first process of a component.
+        terms: what else the operator has ruled.
+        may_repeat: the program may go on from an older state than its last output, as after a takeover: unlike a restore of what
+            stood still for good.
     """
 
     pipes: Mapping[str, int] = field(default_factory=dict)
     devices: tuple[DeviceRule, ...] = ()
     connections: bool = False
     is_first: bool = True
+    terms: Terms = NO_TERMS
+    may_repeat: bool = True
 
 
 class Held(Struct, frozen=True):

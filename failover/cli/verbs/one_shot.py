@@ -57,7 +57,7 @@ from checkpoint.snapshot.credentials import Owner
 from failover.cli.keeper_client import Keeper
 from failover.cli.output import render, team_tree
 from failover.cli.verbs.components import exit_like
-from failover.core.types import CARRY
+from failover.core.types import CARRY, REFUSE
 from failover.errors import FailoverError
 
 CAPTURE_TRIES: Final = 12
@@ -233,7 +233,13 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
         FailoverError: a rule is none.
     """
     shared = tuple(os.path.realpath(path) for path in arguments.shared)
-    return Terms(devices=device_rules(arguments), connections=arguments.connections == CARRY, shared=shared)
+    connections = arguments.connections
+    return Terms(
+        devices=device_rules(arguments),
+        connections=connections == CARRY,
+        shared=shared,
+        refuses_connections=connections == REFUSE,
+    )
 
 
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
