@@ -342,7 +342,7 @@ def _is_log(held: Resource) -> bool:
     assert isinstance(flags, int) and isinstance(mode, int)
     if flags & O_PATH or held.facts.get("deleted") or not stat.S_ISREG(mode):
         return False
-    at_end = flags & os.O_ACCMODE == os.O_WRONLY and held.facts["offset"] == held.facts["size"]
+    at_end = flags & os.O_ACCMODE == os.O_WRONLY and held.facts["offset"] == held.facts["size"] != 0  # no lock's file
     return at_end or (bool(flags & os.O_APPEND) and flags & os.O_ACCMODE != os.O_RDONLY)
 
 

@@ -29,12 +29,16 @@ CAPABILITIES: Final = (
     preserved(
         Area.TERMINALS,
         "standard input, output and error",
-        "become the streams of the component at the other robot; nothing written is lost or repeated",
+        "become the streams of the component at the other robot; nothing written is lost or repeated. Where another process "
+        "read the output of a program that failover protect took, the lines since the last checkpoint come twice: failover "
+        "check says so",
+        "another process",
+        "pid {} ({})",
     ),
 )
 
 STANDARD: Final = (0, 1, 2)
-OUTPUTS: Final = {1: "standard output", 2: "standard error"}
+OUTPUTS: Final = {1: "output", 2: "error"}
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
@@ -67,11 +71,12 @@ def findings(opened: Sequence[OpenFile], surroundings: Surroundings) -> Iterator
     """Output of the first process of a component that another process reads: it does not go along."""
     for held in opened if surroundings.may_repeat else ():
         is_read = stat.S_ISFIFO(held.first.mode) or stat.S_ISSOCK(held.first.mode)
-        outputs = [OUTPUTS[one.number] for one in held.descriptors if one.number in OUTPUTS]
+        outputs = [f"standard {OUTPUTS[one.number]}" for one in held.descriptors if one.number in OUTPUTS]
         if not (is_read and outputs) or held.first.target in surroundings.pipes or _stream_of(held, surroundings) is None:
             continue
+        read = f"its {' and '.join(outputs)} {'is' if len(outputs) == 1 else 'are'} read by {_reader_of(held)}"
         text = (
-            f"its {' and '.join(outputs)} is read by {_reader_of(held)}, which does not move along: after a takeover failover "
+            f"{read}, which does not move along: after a takeover failover "
             "logs shows its output, and the lines since the last checkpoint come twice. Start it by failover run --output "
             "committed instead"
         )

@@ -58,12 +58,14 @@ CAPABILITIES: Final = (
         "the program sees what it would see if its peer had died: what it had received, then the end of file; EPIPE where it "
         "sends. It may exit, unless it connects again; failover check says so beforehand. A socket for datagrams (/dev/log) is "
         "connected to the same name again. Connections that wait at a listener of the program end",
+        "the unix socket {} with {} ends",
+        "as if its peer had died",
+        "do so",
     ),
     refused(
         Area.SOCKETS,
         'a connection with others, of TCP or of a unix socket, where the operator wants that (`connections = "refuse"`)',
         "wait: failover captures it as soon as the program has closed the connection",
-        'which connections = "refuse" rules out',
     ),
     refused(
         Area.SOCKETS,
