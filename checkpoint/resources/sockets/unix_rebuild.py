@@ -178,7 +178,8 @@ class Work:
     def _pair(self, one: Resource) -> tuple[int, int]:
         kind = _of(one, "type") | CLOSE_ON_EXEC
         place = self._table.place(bytes(8))
-        with self._disguise.as_maker(self._table, one):
+        ends = self._ends(one)
+        with self._disguise.as_program(self._table) if ends else self._disguise.as_maker(self._table, one):
             return self._table.obtain_pair(f"make the sockets of {one.name}", "socketpair", socket.AF_UNIX, kind, 0, place)
 
     def _through_listener(self, named: Resource, client: Resource) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ from tests.checkpoint.round_trip import (
     ENGINE,
     PATIENCE_S,
     Program,
+    as_nobody,
     at_last,
     captured_and_killed,
     captured_at_last,
@@ -30,9 +32,12 @@ from tests.checkpoint.round_trip import (
     restored,
     start,
 )
+from tests.failover.cli.test_verbs import failover
 
 pytestmark = [pytest.mark.root]
 
+PYTHON = shutil.which("python3", path="/usr/bin:/usr/local/bin")
+"""That an ordinary user may execute, too."""
 DAEMON = shutil.which("dbus-daemon")
 
 ASKS = """
@@ -132,6 +137,19 @@ while not os.path.exists("go"):
 theirs.shutdown(socket.SHUT_WR)
 theirs.recv(100)
 print("child", talks.recv(100), talks.recv(100), flush=True)
+"""
+
+ANSWERS = """
+import os, socket, sys, time
+listener = socket.socket(socket.AF_UNIX)
+listener.bind(sys.argv[1])
+os.chmod(sys.argv[1], 0o777)
+listener.listen()
+print("ready", flush=True)
+accepted, _ = listener.accept()
+accepted.recv(100)
+accepted.sendall(b"onetwo")
+time.sleep(1000)
 """
 
 SD_BUS = """
@@ -434,6 +452,62 @@ def test_a_file_that_was_on_its_way_from_another_process_arrives(tmp_path: Path)
         peer.close()
         with ended(restored(state, tmp_path)) as program:
             assert last_words(program)[1:] == ["b'take' b'content' b''"]
+
+
+@pytest.mark.skipif(not PYTHON, reason="the system has no Python that an ordinary user may execute")
+def test_an_ordinary_users_program_finds_the_same_at_its_end_of_root_s_server() -> None:
+    assert PYTHON is not None
+    with tempfile.TemporaryDirectory() as place:
+        directory = Path(place)
+        directory.chmod(0o777)
+        server = subprocess.Popen([sys.executable, "-c", ANSWERS, directory / "peer"], stdout=subprocess.PIPE, text=True)
+        assert server.stdout is not None and server.stdout.readline() == "ready\n"
+
+        def act() -> str:
+            with ended(start([PYTHON, "-c", ASKS, "SOCK_STREAM", str(directory / "peer"), "ask", "1"], directory)) as program:
+                program.wait_for_line("ready")
+                state = captured_and_killed(program)
+            with ended(restored(state, directory, own_eyes=True)) as program:
+                return ", ".join(last_words(program)[2:])
+
+        try:
+            found = as_nobody(act)
+        finally:
+            server.kill()
+            server.wait()
+            server.stdout.close()
+        reads = "read b'onetwo', read b'', read b'', read b''"
+        assert found.startswith(f"{reads}, sent EPIPE, sent EPIPE, polled"), found
+
+
+def test_the_commands_say_what_ends_and_take_the_rule(tmp_path: Path) -> None:
+    path = tmp_path / "peer"
+    words = [sys.executable, "-c", ASKS, "SOCK_STREAM", str(path), "ask", "1"]
+    peer = Peer(path, socket.SOCK_STREAM, b"answer")
+    with contextlib.closing(peer), (tmp_path / "out").open("wb") as out:
+        program = subprocess.Popen(words, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=out, stderr=out)
+        try:
+            peer.serve()
+            deadline = time.monotonic() + PATIENCE_S
+            while not (tmp_path / "out").stat().st_size:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            checked = failover("check", str(program.pid), "--json")
+            assert checked.returncode == 0 and f"with {path} ends" in checked.stdout and "may exit" in checked.stdout, checked
+            file = str(tmp_path / "snapshot")
+            refused = failover("capture", str(program.pid), "-o", file, "--connections", "refuse")
+            assert refused.returncode == 1 and 'connections = "refuse" rules out' in refused.stderr, refused
+            assert program.poll() is None and not os.path.exists(file)
+            captured = failover("capture", str(program.pid), "-o", file)
+            assert captured.returncode == 0 and f"with {path} ends when the program comes back" in captured.stderr, captured
+        finally:
+            program.kill()
+            program.wait()
+    (tmp_path / "go").touch()
+    back = failover("restore", file, "--wait", cwd=tmp_path)
+    assert back.returncode == 0 and f"with {path} ends\n" in back.stderr, back
+    found = (tmp_path / "out").read_text()
+    assert "read b'answer'\nread b''\n" in found and "sent EPIPE" in found, found
 
 
 @contextlib.contextmanager
