@@ -210,7 +210,9 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
             f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: "
             "failover captures it as soon as the program has read them"
         )
-    return unix_names.refuse(held) or sockets.refuse_filter(held) or other_holders.refuse(held, "a unix socket")
+    ends = _is_lost(seen) and bool(seen["peer"])  # whoever holds it too keeps what the program loses
+    of_others = None if ends else other_holders.refuse(held, "a unix socket")
+    return unix_names.refuse(held) or sockets.refuse_filter(held) or of_others
 
 
 def findings(held: Sequence[Resource], surroundings: Surroundings) -> Iterator[Finding]:
@@ -247,8 +249,12 @@ def leads_outside(one: Resource, known: Collection[int], awaited: Collection[int
     if facts.get("not_accepted", NOT_WAITING) != NOT_WAITING:
         return number_of(facts["socket"]) not in awaited
     peer = number_of(facts["peer"])
-    is_named = facts["type"] == socket.SOCK_DGRAM and bool(facts["peer_name"])
-    return bool(peer) and not facts.get("peer_is_ours") and peer not in known and not is_named
+    return bool(peer) and peer not in known and _is_lost(facts)
+
+
+def _is_lost(facts: Mapping[str, Fact]) -> bool:
+    """Whether its peer, if it has one, is another process's, and has no name by which it could be connected to again."""
+    return not facts.get("peer_is_ours") and not (facts["type"] == socket.SOCK_DGRAM and facts["peer_name"])
 
 
 def note(one: Resource) -> str:

@@ -152,6 +152,24 @@ accepted.sendall(b"onetwo")
 time.sleep(1000)
 """
 
+LAUNCHES = """
+import socket, subprocess, sys
+ours, theirs = socket.socketpair()
+ours.sendall(b"hello")
+child = subprocess.Popen([sys.executable, "-c", sys.argv[1], str(theirs.fileno())], pass_fds=[theirs.fileno()])
+print(child.pid, flush=True)
+child.wait()
+"""
+
+INHERITS = """
+import os, socket, sys, time
+with socket.socket(fileno=int(sys.argv[1])) as talks:
+    print("ready", flush=True)
+    while not os.path.exists("go"):
+        time.sleep(0.01)
+    print("read", talks.recv(100), talks.recv(100), flush=True)
+"""
+
 SD_BUS = """
 import ctypes, os, sys, time
 sd = ctypes.CDLL("libsystemd.so.0")
@@ -508,6 +526,29 @@ def test_the_commands_say_what_ends_and_take_the_rule(tmp_path: Path) -> None:
     assert back.returncode == 0 and f"with {path} ends\n" in back.stderr, back
     found = (tmp_path / "out").read_text()
     assert "read b'answer'\nread b''\n" in found and "sent EPIPE" in found, found
+
+
+def test_an_end_that_who_started_the_program_has_too_stands_not_against_a_capture(tmp_path: Path) -> None:
+    """A launcher keeps both ends of a pair, of which its child has inherited one."""
+    with (tmp_path / "out").open("wb") as out:
+        launcher = subprocess.Popen(
+            [sys.executable, "-c", LAUNCHES, INHERITS], cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=out
+        )
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while not (tmp_path / "out").read_bytes().endswith(b"ready\n"):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        pid = (tmp_path / "out").read_text().split()[0]
+        assert failover("check", pid).returncode == 0
+        captured = failover("capture", pid, "-o", str(tmp_path / "snapshot"))
+        assert captured.returncode == 0, captured
+    finally:
+        launcher.kill()
+        launcher.wait()
+    (tmp_path / "go").touch()
+    back = failover("restore", str(tmp_path / "snapshot"), "--wait", cwd=tmp_path)
+    assert back.returncode == 0 and (tmp_path / "out").read_text().endswith("read b'hello' b''\n"), back
 
 
 @contextlib.contextmanager
