@@ -95,7 +95,8 @@ class ComponentConfig:
         environment: and with these variables besides, or instead.
         hooks: this robot's own commands around it.
         devices: what becomes of devices that it has open, by path: see `checkpoint.device_rules`.
-        connections: carry: its TCP connections with others go along where it is handed over; reset: they never do.
+        connections: reset: its connections with others, of TCP and of unix sockets, end where it goes on; carry: those of TCP go
+            along where it is handed over; refuse: it is not captured while it has one.
         bring_data: files that it has open for reading only are brought to its standby, as its program is, when it runs here.
         carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
         carry_limit: what they may hold while it runs here.
@@ -120,7 +121,7 @@ class ComponentConfig:
     environment: dict[str, str] = field(default_factory=dict)
     hooks: HooksConfig = field(default_factory=HooksConfig)
     devices: dict[str, DeviceConfig | Literal["reopen", "hook", "optional"]] = field(default_factory=dict)
-    connections: Literal["reset", "carry"] = "reset"
+    connections: Literal["reset", "carry", "refuse"] = "reset"
     bring_data: bool = False
     carry: tuple[str, ...] = field(default_factory=tuple)
     carry_limit: str = "256MB"

@@ -13,7 +13,7 @@ from checkpoint.program import cpu_baseline
 from checkpoint.store.retention import Retention
 from failover.config.quantities import size_bytes, span_ms
 from failover.core import types
-from failover.core.types import CARRY, DETACH, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
+from failover.core.types import CARRY, DETACH, REFUSE, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
 
 NO_LEVEL: Final = "no"
 """Of ``failover run --portable``: whatever this processor has, whatever the operator says."""
@@ -97,7 +97,15 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
         return Terms(carry, rules, freeze_budget_ns=budget_ns, shared=component.shared, detaches_memory=detaches)
     devices = merged(arrived(launch.devices), component.device_rules())
     shared = tuple(dict.fromkeys((*launch.shared, *component.shared)))
-    return Terms(carry, devices, launch.connections == CARRY, budget_ns, shared, detaches_memory=detaches)
+    return Terms(
+        carry,
+        devices,
+        launch.connections == CARRY,
+        budget_ns,
+        shared,
+        refuses_connections=launch.connections == REFUSE,
+        detaches_memory=detaches,
+    )
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:

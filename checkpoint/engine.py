@@ -121,6 +121,8 @@ class Terms(Struct, frozen=True):
         carry: its files that travel with it.
         devices: what becomes of devices that it has open.
         connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
+        refuses_connections: a connection with others, of TCP or of unix sockets, stands against a capture; else it ends where the
+            program goes on without it.
         freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
             far as needed; 0: as short as can be.
         owner: with whose rights its files are opened, and beyond whose rights nothing of it is captured: each capture asks again.
@@ -138,10 +140,19 @@ class Terms(Struct, frozen=True):
     shared: tuple[str, ...] = ()
     owner: Owner | None = None
     detaches_memory: bool = False
+    refuses_connections: bool = False
 
     def is_shared(self, path: str) -> bool:
         """Whether a file is one of those that are shared, or lies in such a folder."""
-        return any(path == one or path.startswith(f"{one}/") for one in self.shared)
+        return _leads_into(path, self.shared)
+
+    def is_carried(self, path: str) -> bool:
+        """Whether a file is one of those that travel, or lies in such a folder."""
+        return _leads_into(path, self.carry.paths)
+
+
+def _leads_into(path: str, places: Iterable[str]) -> bool:
+    return any(path == one or path.startswith(f"{one}/") for one in places)
 
 
 NO_TERMS: Final = Terms()

@@ -12,7 +12,7 @@ from msgspec import Struct, field
 from msgspec.structs import astuple, replace
 
 from checkpoint.device_rules import DeviceRule
-from checkpoint.engine import REFUSED, Finding
+from checkpoint.engine import NO_TERMS, REFUSED, Finding, Terms
 from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.kernel_listings import Listings
@@ -130,6 +130,9 @@ class Surroundings(Struct, frozen=True):
         is_first: it is about the first process of a component.
         detached: by device and inode number, the shared memory that becomes the program's own copy, and how much of it, from its
             beginning on, the component has mapped; None where the operator's rules say that such a program is refused.
+        terms: what else the operator has ruled.
+        may_repeat: the program may go on from an older state than its last output, as after a takeover: unlike a restore of what
+            stood still for good.
     """
 
     pipes: Mapping[str, int] = field(default_factory=dict)
@@ -137,6 +140,8 @@ class Surroundings(Struct, frozen=True):
     connections: bool = False
     is_first: bool = True
     detached: Mapping[tuple[int, int], int] | None = None
+    terms: Terms = NO_TERMS
+    may_repeat: bool = True
 
 
 class Held(Struct, frozen=True):

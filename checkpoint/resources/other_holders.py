@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import time
 from collections.abc import Iterator
 from functools import lru_cache
@@ -81,6 +82,17 @@ def _target(pid: int, number: int) -> str:
 def has_end(held: OpenFile) -> bool:
     """Whether a process of no component of ours holds an end of a pipe; one born within the last second may be missed."""
     return next(_others(held), None) is not None
+
+
+def reader_of(held: OpenFile) -> int | None:
+    """Another process that reads what is written to a pipe, or has the other end of a unix socket; as `opener_of`."""
+    peer = held.observed.get("peer")
+    name = f"socket:[{peer}]" if isinstance(peer, int) else ""
+    for other, number in _others(held, name):
+        with contextlib.suppress(OSError):  # closed meanwhile
+            if name or os.lstat(f"/proc/{other}/fd/{number}").st_mode & stat.S_IRUSR:
+                return other
+    return None
 
 
 def opener_of(held: OpenFile) -> int | None:

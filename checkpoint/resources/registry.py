@@ -7,7 +7,7 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol
 
-from checkpoint.engine import REFUSED, Finding
+from checkpoint.engine import Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.model import Fact, Resource
@@ -122,23 +122,22 @@ def _observe_internet_socket(
     return facts | tcp.observe(held, looked, facts, opened.listings) if tcp.is_connection(facts) else facts
 
 
-def findings_of_all(resources: Sequence[Resource], *, standing: bool) -> tuple[Finding, ...]:
+def findings_of_all(resources: Sequence[Resource], surroundings: Surroundings, *, standing: bool) -> tuple[Finding, ...]:
     """What can be told only of all resources of all processes of a component together.
 
     Args:
         standing: they all stood still.
     """
     return (
-        *tcp.findings(resources, standing=standing),
-        *inet.findings(resources),
-        *unix.findings(resources),
+        *tcp.findings(resources, surroundings, standing=standing),
+        *inet.findings(resources, surroundings),
+        *unix.findings(resources, surroundings),
         *netlink.findings(resources),
         *packet.findings(resources),
-        *regular.findings(resources),
+        *regular.findings(resources, surroundings),
         *pidfd.findings(resources),
     )
 
 
-def reasons_of_all(resources: Sequence[Resource]) -> tuple[str, ...]:
-    """Why all of them together, of processes that stood still, cannot be kept, one sentence each."""
-    return tuple(finding.text for finding in findings_of_all(resources, standing=True) if finding.verdict == REFUSED)
+OF_ALL: Final = frozenset(kind.KIND for kind in (tcp, inet, unix, netlink, packet, regular, pidfd))
+"""Kinds of `findings_of_all`: what is noted of these may be otherwise at the next capture."""

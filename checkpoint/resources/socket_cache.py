@@ -28,7 +28,7 @@ from checkpoint.resources.ipc import pipes
 from checkpoint.resources.kernel_listings import Group
 from checkpoint.resources.open_file import Opened, OpenFile, Recalled
 from checkpoint.resources.restore_context import number_of
-from checkpoint.resources.sockets import inet, inet_addresses, sockets, tcp, unix
+from checkpoint.resources.sockets import inet, inet_addresses, sockets, tcp, unix, unix_names
 from checkpoint.runtime.identity_memo import Memo
 
 COPIES_MAX: Final = 128
@@ -366,7 +366,7 @@ def _is_quiet(facts: Mapping[str, Fact]) -> bool:
     if any(facts.get(name) for name in ("queue", "urgent", "too_long", "failed", "lost", "groups", "unread", "waiting", "corks")):
         return False
     if facts["family"] == socket.AF_UNIX:
-        return facts["not_accepted"] == unix.NOT_WAITING
+        return facts["not_accepted"] == unix_names.NOT_WAITING
     if facts["family"] not in inet.FAMILIES or facts["type"] == socket.SOCK_RAW:
         return False
     if facts["protocol"] == socket.IPPROTO_TCP:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from textwrap import dedent
 from typing import Any, Final
 
@@ -109,7 +110,7 @@ def run(room: argparse.ArgumentParser) -> None:
     _carry(room)
     _shared(room)
     _devices(room)
-    _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
+    _connections(room, f"{RESETS}; carry: a handover takes those of TCP along; {REFUSES} (default: as agent.toml says: reset)")
     _shared_memory(room, "as agent.toml says: refuse")
     room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
     room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
@@ -151,8 +152,14 @@ def _devices(room: argparse.ArgumentParser) -> None:
     )
 
 
-def _connections(room: argparse.ArgumentParser, what: str, default: str = "") -> None:
-    room.add_argument("--connections", choices=("reset", "carry"), default=default, help=f"{what} (see docs/connections.md)")
+RESETS: Final = "reset: its connections with others, of TCP and unix sockets, end where it resumes"
+REFUSES: Final = "refuse: do not capture it while it has one"
+
+
+def _connections(
+    room: argparse.ArgumentParser, what: str, default: str = "", choices: Sequence[str] = ("reset", "carry", "refuse")
+) -> None:
+    room.add_argument("--connections", choices=choices, default=default, help=f"{what} (see docs/connections.md)")
 
 
 def _shared_memory(room: argparse.ArgumentParser, default: str) -> None:
@@ -180,7 +187,7 @@ def protect(room: argparse.ArgumentParser) -> None:
     _carry(room)
     _shared(room)
     _devices(room)
-    _connections(room, "carry: take its TCP connections with others along by a handover (default: as agent.toml says: reset)")
+    _connections(room, f"{RESETS}; carry: a handover takes those of TCP along; {REFUSES} (default: as agent.toml says: reset)")
     _shared_memory(room, "as agent.toml says: refuse")
     _agent(room)
 
@@ -275,7 +282,7 @@ def capture(room: argparse.ArgumentParser) -> None:
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
     _shared(room)
     _devices(room)
-    _connections(room, "carry: take its TCP connections with others along (default: reset)", "reset")
+    _connections(room, f"{RESETS}; carry: take those of TCP along; {REFUSES} (default: reset)", "reset")
     _shared_memory(room, "refuse")
     _json(room)
 
@@ -291,7 +298,8 @@ def restore(room: argparse.ArgumentParser) -> None:
     )
     _shared(room)
     _devices(room)
-    _connections(room, "reset: do not take up TCP connections that the capture took along (default: carry)", "carry")
+    taken_up = "reset: do not take up TCP connections that the capture took along (default: carry)"
+    _connections(room, taken_up, "carry", choices=("reset", "carry"))
     _json(room)
 
 

@@ -16,7 +16,7 @@ verb           arguments                                                result, 
                ``umask`` 18, ``isolate`` true, ``wait`` true,           notes}}``; with ``wait`` Output … and Result
                ``user`` "", ``engine`` "auto", ``output`` "immediate",  ``{name, exit_status}`` (a wait status); else at once
                ``devices`` {}: path → rule, ``carry`` [], ``shared`` [],
-               ``connections`` "": reset, or carry,
+               ``connections`` "": reset, carry or refuse,
                ``shared_memory`` "": refuse, or detach,
                ``hooks`` {}: occasion → words of a command,
                ``portable`` "": a level, or "no"

@@ -117,10 +117,13 @@ COMMITTED = "committed"
 
 
 RESET = "reset"
-"""TCP connections with others are reset wherever the program goes on."""
+"""Connections with others, of TCP and of unix sockets, end wherever the program goes on."""
 
 CARRY = "carry"
-"""They are taken along where it goes on from the state in which it stood still for good: by a handover, a failback."""
+"""Those of TCP are taken along where it goes on from the state in which it stood still for good: by a handover, a failback."""
+
+REFUSE = "refuse"
+"""A program that has such a connection is not captured."""
 
 
 REFUSE = "refuse"
@@ -144,7 +147,7 @@ class Launch(Struct, frozen=True):
             agent's own.
         carry: files and folders that travel with it, as absolute paths.
         devices: (path, rule) of devices that it has open, where a robot has no rule of its own; see `checkpoint.device_rules`.
-        connections: `RESET` or `CARRY`: what becomes of its TCP connections with others.
+        connections: `RESET`, `CARRY` or `REFUSE`: what becomes of its connections with others.
         shared: files and folders that others write to as well, as absolute paths: they keep the content that each robot has.
         shared_memory: `REFUSE` or `DETACH`: what becomes of shared memory that other processes have mapped, too.
     """

@@ -65,6 +65,24 @@ def test_a_stranger_is_protected_again_by_the_robot_that_took_it_over(pair: Pair
     expect_more(written)
 
 
+def test_output_that_comes_twice_after_a_takeover_is_told_by_protect_and_by_the_status(pair: Pair, tmp_path: Path) -> None:
+    """Another process reads its output, and it appends to a file that does not travel."""
+    (tmp_path / "count").write_text(f"echo $$ >{tmp_path}/pid; exec /usr/bin/python3 -S -c '{COUNT}' 2>>{tmp_path}/errors")
+    enter = ["nsenter", f"--target={pair[0].processes()[0]}", "--all", "setsid", "sh", "-c"]
+    begin = f"sh {tmp_path}/count </dev/null 2>&1 | cat >{tmp_path}/read &"
+    subprocess.run([*enter, begin], check=True)
+    robots.until(lambda: (tmp_path / "read").exists() and counted(tmp_path / "read"), "the stranger to count")
+    pid = (tmp_path / "pid").read_text().strip()
+    ran = robots.failover(pair[0], "protect", pid, "--name", "count")
+    for said in (f"appends to {tmp_path}/errors", "(cat), which does not move along"):
+        assert ran.returncode == 0 and said in ran.stdout + ran.stderr, ran
+        robots.until(lambda said=said: any(said in one for one in robots.component(pair[0], "count")["notes"]), said)  # type: ignore[misc]
+    robots.until_protected(pair[0])
+    shown = robots.component(pair[0], "count")["notes"]
+    assert sum("come twice" in note for note in shown) == 2, shown
+    assert robots.failover(pair[0], "status").returncode == 0, "that is no fault"
+
+
 def test_a_stranger_that_cannot_be_kept_is_refused_by_name_and_not_touched(pair: Pair, tmp_path: Path) -> None:
     written = tmp_path / "stranger.out"
     pid = stranger(pair[0], HOLDING_ANOTHER, written)

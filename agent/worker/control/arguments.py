@@ -30,8 +30,8 @@ Age = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
 HookName = Literal["before_capture", "before_resume", "after_resume"]
 """Occasions for a command that comes with a program, see `agent.worker.components.hooks`."""
 
-Connections = Literal["", "reset", "carry"]
-"""What becomes of TCP connections; "" for what this robot's operator says."""
+Connections = Literal["", "reset", "carry", "refuse"]
+"""What becomes of connections with others; "" for what this robot's operator says."""
 
 SharedMemory = Literal["", "refuse", "detach"]
 """What becomes of shared memory that others have mapped, too; "" for what this robot's operator says."""

@@ -347,7 +347,7 @@ class Verbs(Questions):
         return paths
 
     def _connections(self, name: str, wanted: str) -> str:
-        """What becomes of a component's TCP connections: what was asked for, else what this robot's operator wants."""
+        """What becomes of a component's connections with others: what was asked for, else what this robot's operator wants."""
         return wanted or self._lanes.settings.component(name).connections
 
     def _device_rules(self, name: str, wanted: dict[str, str]) -> tuple[tuple[str, str], ...]:

@@ -14,13 +14,13 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from blake3 import blake3
 
 from checkpoint.capability import Area, preserved, refused
-from checkpoint.engine import REFUSED, Finding
+from checkpoint.engine import NOTED, REFUSED, Finding
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux.memory.digest_tracker import filled_extents
 from checkpoint.linux.procfs import procfs
@@ -86,6 +86,9 @@ LOOKS: Final = 5
 """How often a file is looked for that seems to have no name."""
 
 CHUNK: Final = 1 << 20
+
+LOGS_TOLD: Final = 2
+"""Files that one note names."""
 
 O_PATH: Final = 0o10000000
 
@@ -315,13 +318,32 @@ def _digested(path: str, version: tuple[int, int, int, int]) -> bytes:
         return digest.digest()
 
 
-def findings(resources: Iterable[Resource]) -> Iterator[Finding]:
-    """Whether all open files of a component together hold more than there is room for beside its memory."""
+def findings(resources: Sequence[Resource], surroundings: Surroundings) -> Iterator[Finding]:
+    """What can be told only of all files of a component: too much content in all, and which logs its readers get twice."""
     size = sum(_size_of(fact) for held in resources for fact in held.facts.values())
     if size > CONTENTS_LIMIT:
         kept = f"up to {CONTENTS_LIMIT >> 20} are kept: use files with a name"
         reason = f"its pipes, sockets, memory files and deleted files hold {size >> 20} MiB in all; {kept}"
         yield Finding(KIND, "contents", REFUSED, reason)
+    logs = tuple(dict.fromkeys(str(held.facts["path"]) for held in resources if held.kind == KIND and _is_log(held)))
+    left = [path for path in logs if not surroundings.terms.is_carried(path)]
+    if left and surroundings.may_repeat:
+        more = f" and {len(left) - LOGS_TOLD} more" if len(left) > LOGS_TOLD else ""
+        text = (
+            f"it appends to {', '.join(left[:LOGS_TOLD])}{more}, which its checkpoints do not carry: after a takeover it writes "
+            f"the lines since the last checkpoint again, so that they come twice to a reader: --carry {left[0]}"
+        )
+        yield Finding(KIND, "logs", NOTED, text)
+
+
+def _is_log(held: Resource) -> bool:
+    """Whether the program only appends to a regular file that has a name."""
+    flags, mode = (held.facts[name] for name in ("flags", "mode"))
+    assert isinstance(flags, int) and isinstance(mode, int)
+    if flags & O_PATH or held.facts.get("deleted") or not stat.S_ISREG(mode):
+        return False
+    at_end = flags & os.O_ACCMODE == os.O_WRONLY and held.facts["offset"] == held.facts["size"] != 0  # no lock's file
+    return at_end or (bool(flags & os.O_APPEND) and flags & os.O_ACCMODE != os.O_RDONLY)
 
 
 def _size_of(fact: Fact) -> int:

@@ -9,13 +9,18 @@ Facts: ``descriptors``; ``stream``, 0, 1 or 2: which of the vessel's own it beco
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from checkpoint.capability import Area, preserved
+from checkpoint.engine import NOTED, Finding
+from checkpoint.errors import ProbeError, ProcessGoneError
+from checkpoint.linux.procfs import procfs
 from checkpoint.model import Resource
+from checkpoint.resources import other_holders
 from checkpoint.resources.open_file import OpenFile, Surroundings
 
 KIND: Final = "streams"
@@ -24,11 +29,16 @@ CAPABILITIES: Final = (
     preserved(
         Area.TERMINALS,
         "standard input, output and error",
-        "become the streams of the component at the other robot; nothing written is lost or repeated",
+        "become the streams of the component at the other robot; nothing written is lost or repeated. Where another process "
+        "read the output of a program that failover protect took, the lines since the last checkpoint come twice: failover "
+        "check says so",
+        "another process",
+        "pid {} ({})",
     ),
 )
 
 STANDARD: Final = (0, 1, 2)
+OUTPUTS: Final = {1: "output", 2: "error"}
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
@@ -55,6 +65,29 @@ def _stream_of(held: OpenFile, surroundings: Surroundings) -> int | None:
     if standard is not None and (stat.S_ISFIFO(held.first.mode) or stat.S_ISSOCK(held.first.mode) or _is_terminal(held)):
         return standard
     return None
+
+
+def findings(opened: Sequence[OpenFile], surroundings: Surroundings) -> Iterator[Finding]:
+    """Output of the first process of a component that another process reads: it does not go along."""
+    for held in opened if surroundings.may_repeat else ():
+        is_read = stat.S_ISFIFO(held.first.mode) or stat.S_ISSOCK(held.first.mode)
+        outputs = [f"standard {OUTPUTS[one.number]}" for one in held.descriptors if one.number in OUTPUTS]
+        if not (is_read and outputs) or held.first.target in surroundings.pipes or _stream_of(held, surroundings) is None:
+            continue
+        read = f"its {' and '.join(outputs)} {'is' if len(outputs) == 1 else 'are'} read by {_reader_of(held)}"
+        text = (
+            f"{read}, which does not move along: after a takeover failover "
+            "logs shows its output, and the lines since the last checkpoint come twice. Start it by failover run --output "
+            "committed instead"
+        )
+        yield Finding(KIND, held.name, NOTED, text)
+
+
+def _reader_of(held: OpenFile) -> str:
+    if (reader := other_holders.reader_of(held)) is not None:
+        with contextlib.suppress(ProbeError, ProcessGoneError):
+            return f"pid {reader} ({procfs.status(reader).name})"
+    return "another process"
 
 
 def _is_terminal(held: OpenFile) -> bool:

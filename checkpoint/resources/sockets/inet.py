@@ -249,7 +249,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     return sockets.refuse_filter(held) or other_holders.refuse(held, name)
 
 
-def findings(held: Iterable[Resource]) -> Iterator[Finding]:
+def findings(held: Iterable[Resource], surroundings: Surroundings) -> Iterator[Finding]:
     """Connections and datagrams that are lost."""
     for one in held:
         if one.kind == KIND and one.facts.get("failed"):
@@ -264,8 +264,8 @@ def findings(held: Iterable[Resource]) -> Iterator[Finding]:
             )
         if one.kind == KIND and number_of(one.facts["waiting"]):
             count = number_of(one.facts["waiting"])
-            text = f"{count} connections that {one.name} has not accepted yet are reset when the program comes back"
-            yield Finding(KIND, one.name, NOTED, text)
+            text = f"{count} connections that {one.name} has not accepted yet are reset"
+            yield sockets.ends(KIND, one.name, text, surroundings)
 
 
 def mismatches(held: Resource) -> Iterator[str]:

@@ -31,11 +31,12 @@ from typing import Final
 from msgspec import Struct
 
 from checkpoint.capability import Area, refused
+from checkpoint.engine import NOTED, REFUSED, Finding
 from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.linux.procfs.descriptors import copy_of
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
-from checkpoint.resources.open_file import Opened, OpenFile
+from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
 
 CAPABILITIES: Final = (
@@ -234,6 +235,18 @@ def refuse_filter(held: OpenFile) -> str | None:
     if held.observed.get("filter") != UNTOLD:
         return None
     return f"{held.name} is a socket with a filter of extended BPF, which the kernel does not tell: use a classic one"
+
+
+def ends(kind: str, name: str, what: str, surroundings: Surroundings, more: str = "") -> Finding:
+    """That a connection with others ends by a restore; it stands against a capture where the operator wants that.
+
+    Args:
+        more: what that means for the program.
+    """
+    if surroundings.terms.refuses_connections:
+        cure = "failover captures it as soon as the program has closed the connection"
+        return Finding(kind, name, REFUSED, f'{what} by a restore, which connections = "refuse" rules out: {cure}')
+    return Finding(kind, name, NOTED, f"{what} when the program comes back{more}")
 
 
 def _options(looked: socket.socket, form: Form) -> Iterator[list[Fact]]:

@@ -196,7 +196,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     return sockets.refuse_filter(held) or other_holders.refuse(held, "a TCP connection")
 
 
-def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:
+def findings(held: Sequence[Resource], surroundings: Surroundings, *, standing: bool) -> Iterator[Finding]:
     """What can be told only of all connections together: which cannot be made again yet, and which end.
 
     Args:
@@ -211,9 +211,10 @@ def findings(held: Sequence[Resource], *, standing: bool) -> Iterator[Finding]:
             reasons = _refuse_end(one, other) if standing else ()
             yield from (Finding(KIND, one.name, REFUSED, reason) for reason in reasons)
         elif TAKEN not in one.facts and (text := note(one)):
-            may_move = MAY_MOVE in one.facts and LEFT not in one.facts
-            when = "should the program crash; a handover takes it along" if may_move else "when the program comes back"
-            yield Finding(KIND, one.name, NOTED, f"{text} {when}")
+            if MAY_MOVE in one.facts and LEFT not in one.facts:
+                yield Finding(KIND, one.name, NOTED, f"{text} should the program crash; a handover takes it along")
+            else:
+                yield sockets.ends(KIND, one.name, text, surroundings)
 
 
 def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:

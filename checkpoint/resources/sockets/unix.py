@@ -4,6 +4,10 @@ Waiting data is restored, in the same messages, from the same names; so are conn
 datagrams that was connected to a name outside (``/dev/log``) is connected to that name again.
 `checkpoint.resources.sockets.unix_rebuild` says how they are made again.
 
+A connection with another process cannot be made again: the other end stays behind. The program finds what it finds when that
+process has died: what it had received, then the end of file; EPIPE where it sends; ECONNRESET where its connection was not
+accepted yet. A socket for datagrams whose peer has no name, or is not there, finds ECONNREFUSED once, then ENOTCONN.
+
 Facts besides those of every socket, of `checkpoint.resources.sockets.unix_names` and of
 `checkpoint.resources.sockets.peer_credentials`: ``state`` of `checkpoint.linux.net.unix_diag`; ``name``; ``peer``: inode number
 of its other end, 0 when that is gone; ``peer_name``; ``backlog``; ``shutdown``; ``clients``: the sockets whose connections wait
@@ -20,11 +24,11 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Final
 
-from checkpoint.capability import Area, preserved, refused
+from checkpoint.capability import Area, by_rule, preserved, refused
 from checkpoint.engine import REFUSED, Finding
 from checkpoint.errors import CaptureError
 from checkpoint.linux.net.unix_diag import ESTABLISHED, UnixSocket, parsed
@@ -33,6 +37,7 @@ from checkpoint.resources import other_holders
 from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import peer_credentials, scm_rights, sockets, unix_names
+from checkpoint.resources.sockets.unix_names import NOT_WAITING
 
 KIND: Final = "unix_sockets"
 
@@ -47,12 +52,20 @@ CAPABILITIES: Final = (
         "unix listeners, and unix sockets for datagrams",
         "bound to their names again, or connected to the same names again",
     ),
+    by_rule(
+        Area.SOCKETS,
+        "unix sockets connected to another process (D-Bus, X, a logger’s stream)",
+        "the program sees what it would see if its peer had died: what it had received, then the end of file; EPIPE where it "
+        "sends. It may exit, unless it connects again; failover check says so beforehand. A socket for datagrams (/dev/log) is "
+        "connected to the same name again. Connections that wait at a listener of the program end",
+        "the unix socket {} with {} ends",
+        "as if its peer had died",
+        "do so",
+    ),
     refused(
         Area.SOCKETS,
-        "a unix socket that is connected to another process",
-        "open it only for a moment, then close it: failover captures in between",
-        "connected to another process",
-        "connected to a socket of another process",
+        'a connection with others, of TCP or of a unix socket, where the operator wants that (`connections = "refuse"`)',
+        "wait: failover captures it as soon as the program has closed the connection",
     ),
     refused(
         Area.SOCKETS,
@@ -65,17 +78,22 @@ CAPABILITIES: Final = (
     ),
     refused(
         Area.SOCKETS,
-        "a unix listener where a connection of another process waits, or a connection with data in it, or of a client "
-        "that has gone",
+        "a unix listener where a connection waits of a process of the program that has sent data already, or of a client that "
+        "has gone",
         "wait: failover captures it as soon as the program has accepted the connection",
         "waits to be accepted",
     ),
 )
 
 BOTH_DIRECTIONS: Final = 3
-NOT_WAITING: Final = -1
 _ACCEPTED: Final = "failover captures it as soon as the program has accepted it"
-_ALONE: Final = "protect the program while it has no such connection"
+_EXITING: Final = (
+    ("dbus", "clients of libdbus and GDBus do so by default"),
+    ("/bus", "clients of libdbus and GDBus do so by default"),
+    (".X11-unix", "clients of Xlib do so"),
+    ("wayland-", "most clients of Wayland do so"),
+)
+"""What is known of clients, by a part of the name of their server."""
 
 
 def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
@@ -173,11 +191,6 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     if seen.get("family") != socket.AF_UNIX:
         return None
     what = f"{held.name} is a unix socket"
-    leads_outside = bool(seen["peer"]) and not seen["peer_is_ours"] and seen["peer"] not in held.kin.sockets
-    if leads_outside and seen["type"] != socket.SOCK_DGRAM:
-        return f"{what} connected to another process, which stays behind: protect the program while it has no such connection"
-    if leads_outside and not seen["peer_name"]:
-        return f"{what} connected to a socket of another process that has no name: protect the program while it has none"
     if any(isinstance(numbers, list) and sockets.UNKNOWN in numbers for numbers in _list(seen["passed"])):
         return (
             f"{what} with descriptors on their way in it (SCM_RIGHTS) that failover cannot examine: "
@@ -190,8 +203,6 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         )
     if 0 in _list(seen["clients"]):
         return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"
-    if number_of(seen["not_accepted"]) > 0:
-        return f"{what} whose connection waits to be accepted with data in it, which failover cannot read: {_ACCEPTED}"
     if seen["urgent"]:
         return f"{what} in which an out-of-band byte waits (MSG_OOB): failover captures it as soon as the program has read that"
     if seen["too_long"]:
@@ -199,22 +210,74 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
             f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: "
             "failover captures it as soon as the program has read them"
         )
-    return unix_names.refuse(held) or sockets.refuse_filter(held) or other_holders.refuse(held, "a unix socket")
+    ends = _is_lost(seen) and bool(seen["peer"])  # whoever holds it too keeps what the program loses
+    of_others = None if ends else other_holders.refuse(held, "a unix socket")
+    return unix_names.refuse(held) or sockets.refuse_filter(held) or of_others
 
 
-def findings(held: Sequence[Resource]) -> Iterator[Finding]:
-    """What can be told only of all sockets together: connections that wait to be accepted by others, or of others."""
+def findings(held: Sequence[Resource], surroundings: Surroundings) -> Iterator[Finding]:
+    """What can be told only of all sockets together: which of them end, and connections that wait to be accepted."""
     ours = [one for one in held if one.kind == KIND]
-    clients = {number_of(one.facts["socket"]) for one in ours if one.facts["not_accepted"] != NOT_WAITING}
-    awaited = {number_of(inode) for one in ours for inode in _list(one.facts["clients"])}
+    awaited = awaited_here(ours)
+    known = {number_of(one.facts["socket"]) for one in ours}
     for one in ours:
-        text = ""
-        if one.facts["not_accepted"] != NOT_WAITING and number_of(one.facts["socket"]) not in awaited:
-            text = f"{one.name} is a unix socket connected to another process, where it waits to be accepted: {_ALONE}"
-        elif not clients.issuperset(map(number_of, _list(one.facts["clients"]))):
-            text = f"{one.name} is a unix socket where a connection of another process waits to be accepted: {_ACCEPTED}"
-        if text:
-            yield Finding(KIND, one.name, REFUSED, text)
+        if number_of(one.facts["not_accepted"]) > 0 and number_of(one.facts["socket"]) in awaited:
+            text = (
+                f"{one.name} is a unix socket whose connection waits to be accepted with data in it, which failover cannot read"
+            )
+            yield Finding(KIND, one.name, REFUSED, f"{text}: {_ACCEPTED}")
+        elif leads_outside(one, known, awaited):
+            yield sockets.ends(KIND, one.name, note(one), surroundings, _may_exit(one))
+        if count := len({number_of(client) for client in _list(one.facts["clients"])} - known - {0}):
+            which = "1 connection that waits" if count == 1 else f"{count} connections that wait"
+            text = f"{which} at {one.name} to be accepted end{'s' if count == 1 else ''}"
+            yield sockets.ends(KIND, one.name, text, surroundings)
+
+
+def awaited_here(held: Iterable[Resource]) -> set[int]:
+    """The sockets whose connections wait at listeners among these, by their numbers."""
+    return {number_of(inode) for one in held for inode in _list(one.facts.get("clients", []))}
+
+
+def leads_outside(one: Resource, known: Collection[int], awaited: Collection[int]) -> bool:
+    """Whether a socket is connected to another process, which it has no name of to be connected to again.
+
+    Args:
+        known: the program's own sockets, by their numbers.
+    """
+    facts = one.facts
+    if facts.get("not_accepted", NOT_WAITING) != NOT_WAITING:
+        return number_of(facts["socket"]) not in awaited
+    peer = number_of(facts["peer"])
+    return bool(peer) and peer not in known and _is_lost(facts)
+
+
+def _is_lost(facts: Mapping[str, Fact]) -> bool:
+    """Whether its peer, if it has one, is another process's, and has no name by which it could be connected to again."""
+    return not facts.get("peer_is_ours") and not (facts["type"] == socket.SOCK_DGRAM and facts["peer_name"])
+
+
+def note(one: Resource) -> str:
+    """That a connection with another process ends."""
+    own, peer = _name_for_people(one, "name"), _name_for_people(one, "peer_name")
+    where = peer or (f"a client of {own}" if own else "another process")
+    return f"the unix socket {one.name} with {where} ends"
+
+
+def _may_exit(one: Resource) -> str:
+    """What that may do to a program that is no server."""
+    peer = _name_for_people(one, "peer_name")
+    if _name_for_people(one, "name") and not peer:
+        return ""
+    known = next((f" ({what})" for part, what in _EXITING if part in peer), "")
+    return f", as if its peer had died: it may exit{known}, unless it connects again"
+
+
+def _name_for_people(one: Resource, which: str) -> str:
+    """A name for people."""
+    name = one.facts[which]
+    assert isinstance(name, bytes)
+    return unix_names.in_words(name)
 
 
 def _list(fact: Fact) -> list[Fact]:

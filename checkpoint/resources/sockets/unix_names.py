@@ -67,6 +67,8 @@ GONE: Final = -1
 FREED_S: Final = 1.0
 """How long the kernel may take to find sockets that nobody can reach any more."""
 AT_EMPTY_PATH: Final = 0x1000
+NOT_WAITING: Final = -1
+"""Fact ``not_accepted`` of a socket whose connection does not wait to be accepted."""
 REMOVE_DIRECTORY: Final = 0x200
 """AT_REMOVEDIR of unlinkat(2)."""
 
@@ -144,7 +146,7 @@ def _leads_to_it(pid: int, told: str, path: str, about: os.stat_result | None) -
 def refuse(held: OpenFile) -> str | None:
     """Why a socket cannot be given its name again."""
     seen = held.observed
-    path, told = str(seen["path"]), _told(seen["name"])
+    path, told = str(seen["path"]), in_words(seen["name"])
     if not path:
         return None
     if seen["directory"] and ".." in told.split("/"):
@@ -163,7 +165,7 @@ def refuse(held: OpenFile) -> str | None:
     return None
 
 
-def _told(name: Fact) -> str:
+def in_words(name: Fact) -> str:
     """A name for people, and for open(2) where it is a path."""
     assert isinstance(name, bytes)
     return "@" + os.fsdecode(name[1:]) if name[:1] == b"\0" else os.fsdecode(name.rstrip(b"\0"))
@@ -177,14 +179,16 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why it could not have its name here."""
     path, name = str(held.facts["path"]), held.facts["name"]
     assert isinstance(name, bytes)
-    path = _told(name) if is_ghost(held) else path  # where that is bound for the while
+    path = in_words(name) if is_ghost(held) else path  # where that is bound for the while
     has_own = held.facts["type"] == socket.SOCK_DGRAM or held.facts["state"] != ESTABLISHED  # no accepted end has
+    if not has_own and not held.facts.get("peer_is_ours", True) and held.facts["not_accepted"] == NOT_WAITING:
+        return  # its peer is gone, or stays behind: it is given no name
     if name[:1] == b"\0" and has_own and not _is_free(name, number_of(held.facts["type"])):
-        yield f"the abstract name {_told(name)!r} of the unix socket {held.name} is another process's here: end that first"
+        yield f"the abstract name {in_words(name)!r} of the unix socket {held.name} is another process's here: end that first"
     if not path or _is_hidden(held):
         return
     yield from _not_had(held, path)
-    if renamed_paths.is_moved(held.facts) and (bound := renamed_paths.place_of(held.facts, _told(name))) != path:
+    if renamed_paths.is_moved(held.facts) and (bound := renamed_paths.place_of(held.facts, in_words(name))) != path:
         yield from _not_had(held, bound)
 
 
@@ -249,7 +253,7 @@ def _is_hidden(held: Resource) -> bool:
 
     One that was so once stays so: it lay in a directory of ours, which does not tell where its name began.
     """
-    told = _told(held.facts["name"])
+    told = in_words(held.facts["name"])
     is_elsewhere = bool(held.facts.get("covered") or _root_of(held)) or f"/{HIDDEN}" in str(held.facts["path"])
     return is_ghost(held) and (not os.path.isabs(told) or is_elsewhere or _is_something_else(told))
 
@@ -301,14 +305,14 @@ class Naming:
         table, name = self._table, one.facts["name"]
         assert isinstance(name, bytes)
         address = packed(name)
-        table.call(f"bind {one.name} to {_told(name)!r}", "bind", made, table.place(address), len(address))
+        table.call(f"bind {one.name} to {in_words(name)!r}", "bind", made, table.place(address), len(address))
 
     def _bind_file(self, one: Resource, made: int) -> None:
         table, path, directory = self._table, str(one.facts["path"]), str(one.facts.get("directory", ""))
         place = table.place_path(path)
         table.attempt("", "unlinkat", AT_FDCWD, place, 0)
         root = _root_of(one)
-        bound = table.place_path(renamed_paths.place_of(one.facts, _told(one.facts["name"])))
+        bound = table.place_path(renamed_paths.place_of(one.facts, in_words(one.facts["name"])))
         is_moved = renamed_paths.is_moved(one.facts)
         if is_moved:
             table.attempt("", "unlinkat", AT_FDCWD, bound, 0)
@@ -331,7 +335,7 @@ class Naming:
 
     def _bind_ghost(self, one: Resource, made: int) -> None:
         """Bind it, keep hold of its file, and remove that; directories that are made for it go again."""
-        table, told = self._table, _told(one.facts["name"])
+        table, told = self._table, in_words(one.facts["name"])
         is_whole = os.path.isabs(told)
         root = tempfile.mkdtemp(prefix=HIDDEN) if _is_hidden(one) else ""
         if root:

@@ -17,11 +17,10 @@ from checkpoint.linux.net.unix_diag import ESTABLISHED, LISTENING
 from checkpoint.linux.trace.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.restore_context import number_of
-from checkpoint.resources.sockets import renamed_paths, sockets
+from checkpoint.resources.sockets import renamed_paths, sockets, unix
 from checkpoint.resources.sockets.peer_credentials import Disguise
 from checkpoint.resources.sockets.sockets import Way
-from checkpoint.resources.sockets.unix import NOT_WAITING
-from checkpoint.resources.sockets.unix_names import Naming, is_abandoned, is_ghost, packed
+from checkpoint.resources.sockets.unix_names import NOT_WAITING, Naming, is_abandoned, is_ghost, packed
 
 CLOSE_ON_EXEC: Final = socket.SOCK_CLOEXEC
 
@@ -58,6 +57,7 @@ class Work:
         """
         self._table = table
         self._held = {_of(one, "socket"): one for one in held}
+        self._awaited = unix.awaited_here(held)
         self._next = first
         self._disguise = disguise
         self._working = working_directory
@@ -77,12 +77,21 @@ class Work:
         for one in sorted(alone, key=lambda one: (is_ghost(one), renamed_paths.is_moved(one.facts)), reverse=True):
             self._alone(one)
         for inode, one in self._held.items():
-            if inode not in self._made and one.facts.get("not_accepted", NOT_WAITING) == NOT_WAITING:
+            if inode not in self._made and not self._waits_here(one):
                 self._others |= self._connect(one)
         for one in self._held.values():
-            for client in _list(one.facts.get("clients", [])):
-                self._wait_at(one, self._held[number_of(client)])
+            for client in map(number_of, _list(one.facts.get("clients", []))):
+                if client in self._held:  # of another process: it stays behind
+                    self._wait_at(one, self._held[client])
         return self._made
+
+    def _waits_here(self, one: Resource) -> bool:
+        """Whether it waits to be accepted by the program itself."""
+        return one.facts.get("not_accepted", NOT_WAITING) != NOT_WAITING and _of(one, "socket") in self._awaited
+
+    def _ends(self, one: Resource) -> bool:
+        """Whether it was connected to another process."""
+        return unix.leads_outside(one, self._held, self._awaited)
 
     def fill(self) -> None:
         """Send what waits in them, connect those for datagrams, shut down what is; descriptors on their way are there by now."""
@@ -101,7 +110,9 @@ class Work:
 
     def notes(self) -> tuple[str, ...]:
         """What is otherwise than it was."""
-        return self._disguise.notes(self._held.values())
+        ended = [one for one in self._held.values() if self._ends(one)]
+        kept = (one for one in self._held.values() if one not in ended)
+        return (*map(unix.note, ended), *self._disguise.notes(kept))
 
     def _away(self, made: int) -> int:
         """Move a descriptor above all that are wanted."""
@@ -127,8 +138,9 @@ class Work:
         """Whether it is no end of a connection: it may be connected to a name for all that."""
         if _of(one, "state") != ESTABLISHED:
             return True
-        has_name = bool(_name_of(one) or one.facts["peer_name"])
-        return _of(one, "type") == socket.SOCK_DGRAM and has_name and not self._is_pair(one)
+        if _of(one, "type") != socket.SOCK_DGRAM or self._is_pair(one):
+            return False
+        return bool(_name_of(one) or (one.facts["peer_name"] and _of(one, "peer") in self._held))
 
     def _alone(self, one: Resource) -> None:
         table = self._table
@@ -166,7 +178,8 @@ class Work:
     def _pair(self, one: Resource) -> tuple[int, int]:
         kind = _of(one, "type") | CLOSE_ON_EXEC
         place = self._table.place(bytes(8))
-        with self._disguise.as_maker(self._table, one):
+        ends = self._ends(one)
+        with self._disguise.as_program(self._table) if ends else self._disguise.as_maker(self._table, one):
             return self._table.obtain_pair(f"make the sockets of {one.name}", "socketpair", socket.AF_UNIX, kind, 0, place)
 
     def _through_listener(self, named: Resource, client: Resource) -> tuple[int, int]:
@@ -239,14 +252,19 @@ class Work:
     def _fill(self, one: Resource) -> None:
         """Send what waits in one of them, each datagram from the name that it came from."""
         messages = _list(one.facts["queue"])
-        if one.facts.get("reset"):  # the end that is closed soon has something unread, as it had
+        is_refused = self._ends(one) and one.facts.get("not_accepted", NOT_WAITING) != NOT_WAITING
+        if one.facts.get("reset") or is_refused:  # the end that is closed soon has something unread, as it had
             number, byte = self._made[_of(one, "socket")], self._table.place(bytes(1))
             self._table.attempt("", "sendto", number, byte, 1, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, 0, 0)
         if not messages:
             return
         told = one.facts["sources"] or []  # versions before said False where none has any
         sources = [source if isinstance(source, bytes) else b"" for source in _list(told)] or [b""] * len(messages)
-        ways = {source: self._from(one, source) if source else self._way_to(one) for source in dict.fromkeys(sources)}
+        has_other_end = _of(one, "socket") in self._others  # which alone reaches it
+        ways = {
+            source: self._from(one, source) if source and not has_other_end else self._way_to(one)
+            for source in dict.fromkeys(sources)
+        }
         sockets.fill(self._table, one, [ways[source] for source in sources])
 
     def _way_to(self, one: Resource) -> Way:

@@ -57,7 +57,7 @@ from checkpoint.snapshot.credentials import Owner
 from failover.cli.keeper_client import Keeper
 from failover.cli.output import render, team_tree
 from failover.cli.verbs.components import exit_like
-from failover.core.types import CARRY, DETACH
+from failover.core.types import CARRY, DETACH, REFUSE
 from failover.errors import FailoverError
 
 CAPTURE_TRIES: Final = 12
@@ -233,9 +233,14 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
         FailoverError: a rule is none.
     """
     shared = tuple(os.path.realpath(path) for path in arguments.shared)
-    detaches = getattr(arguments, "shared_memory", "") == DETACH  # a snapshot says it for its restore
-    connections = arguments.connections == CARRY
-    return Terms(devices=device_rules(arguments), connections=connections, shared=shared, detaches_memory=detaches)
+    connections = arguments.connections
+    return Terms(
+        devices=device_rules(arguments),
+        connections=connections == CARRY,
+        shared=shared,
+        refuses_connections=connections == REFUSE,
+        detaches_memory=getattr(arguments, "shared_memory", "") == DETACH,  # a snapshot says it for its restore
+    )
 
 
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:

@@ -29,7 +29,7 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
+from checkpoint.engine import NOTED, PTRACE, REFUSED, CaptureOrder, ProtectOrder
 from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget
 from checkpoint.engines.ptrace.capture.memory import RunningCopy
 from checkpoint.engines.ptrace.capture.pages import Pages, joined, with_parcel
@@ -135,6 +135,7 @@ class PtraceSession:
         self._owner = order.terms.owner
         self._epoch = 0
         self._closed = False
+        self._changing: frozenset[str] = frozenset()
 
     # Opening and closing
 
@@ -146,7 +147,7 @@ class PtraceSession:
         try:
             if reasons := thread_credentials.refuse(pid, order.terms.owner):
                 raise UnsupportedError(f"cannot protect pid {pid}: {reasons[0]}", reasons)
-            surroundings = probe.surroundings_of(pid, order.streams, order.terms)
+            surroundings = probe.surroundings_of(pid, order.streams, order.terms, may_repeat=order.is_guarded)
             report = probe.probe(pid, surroundings, files_kept=order.names is not None)
             trees = told_by_spokesman(pid, lambda tid: carried_capture.followed(tid, order.terms))
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
@@ -169,6 +170,7 @@ class PtraceSession:
             raise
         session._outputs = outputs
         session.notes += report.notes
+        session._changing = frozenset(found.text for found in report.findings if found.kind in registry.OF_ALL)
         return session
 
     def close(self) -> None:
@@ -511,14 +513,21 @@ class PtraceSession:
         of_others = others.reasons(first) if others else ()
         pids = others.pids if others else ()
         every = (*held.resources, *(others.resources() if others else ()))
-        of_all = registry.reasons_of_all(every)
+        findings = registry.findings_of_all(every, self._surroundings, standing=True)
+        of_all = tuple(found.text for found in findings if found.verdict == REFUSED)
         detaches = self._surroundings.detached is not None
         of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments, detaches=detaches)
         self._require_detached(first, others)
         self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_segments, *of_files))
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
+        lasting = (note for note in self.notes if note not in self._changing)
         outline = replace(
             self._outline(order, parent, frozen, parcel),
+            notes=(
+                *lasting,
+                *(found.text for found in findings if found.verdict == NOTED),
+                *shared_memory.detached(self._detached),
+            ),
             resources=(
                 *self._first.known(held.resources),
                 *self._first.unopened(first),
@@ -582,7 +591,6 @@ class PtraceSession:
             vmas=(*self._first.mappings(first, others.pids if others else frozenset()), *parcel.vmas),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,
-            notes=(*self.notes, *shared_memory.detached(self._detached)),
             members=others.members(first) if others else (),
             zombies=others.zombies(first) if others else (),
         )

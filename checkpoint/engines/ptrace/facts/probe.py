@@ -75,7 +75,8 @@ def _probe(pid: int, surroundings: Surroundings, files_kept: bool, first: int) -
         *_memory_findings(first, opened[first]),
         *_segments_findings(pid, first, is_guarded=bool(surroundings.pipes), detaches=detaches),
         *looked[first].findings,
-        *registry.findings_of_all([held for one in looked.values() for held in one.resources], standing=False),
+        *registry.findings_of_all([held for one in looked.values() for held in one.resources], surroundings, standing=False),
+        *standard_streams.findings(opened[first], surroundings),
         *_others_findings(opened, pid, first, looked, detaches=detaches),
     )
     return Report(pid, _command(first, status), status.resident_size, choose_tracker.best_tracking(), findings)
@@ -222,7 +223,7 @@ def _births_refused(first: int) -> tuple[str, ...]:
     return ()
 
 
-def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) -> Surroundings:
+def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS, *, may_repeat: bool = True) -> Surroundings:
     """What the kinds of resources must know about a process, its guard and its operator's rules.
 
     Raises:
@@ -230,8 +231,9 @@ def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS) 
     """
     if not 0 < pid < procfs.pid_max():
         raise ProbeError(f"cannot examine pid {pid}: that is not the number of a process")
+    pipes = pipes_of(streams.outputs) if streams else {}
     detached: Mapping[tuple[int, int], int] | None = {} if terms.detaches_memory else None
-    return Surroundings(pipes_of(streams.outputs) if streams else {}, terms.devices, terms.connections, detached=detached)
+    return Surroundings(pipes, terms.devices, terms.connections, detached=detached, terms=terms, may_repeat=may_repeat)
 
 
 def _require_permission(pid: int, status: Status) -> None:

@@ -307,20 +307,6 @@ def _targets(pid: int) -> list[str]:
     return found
 
 
-def test_a_unix_socket_that_leads_to_another_process_is_refused(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(tmp_path / "ours"))
-        listener.listen()
-        connects = "import socket, sys, time; s = socket.socket(socket.AF_UNIX); s.connect('ours'); print('ready', flush=True)\n"
-        with ended(start([sys.executable, "-c", connects + "time.sleep(600)"], tmp_path)) as program:
-            program.wait_for_line("ready")
-            with pytest.raises(UnsupportedError, match="another process"):
-                ENGINE.protect(program.pid, ProtectOrder("/test/waiting"))
-            accepted, _ = listener.accept()
-            with accepted, pytest.raises(UnsupportedError, match="another process"):
-                ENGINE.protect(program.pid, ProtectOrder("/test/connected"))
-
-
 def test_a_listener_whose_name_another_process_has_taken_is_refused_by_name(compiled: Compiled, tmp_path: Path) -> None:
     tracee = start_tracee(compiled("sockets", "-O2"), tmp_path, "listener_path")
     with ended(tracee):

@@ -13,8 +13,9 @@ import pytest
 from checkpoint.errors import CaptureError
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.events import pidfd
+from checkpoint.resources.open_file import Surroundings
 from checkpoint.resources.process import shared_with_parent, unshared_threads
-from checkpoint.resources.registry import reasons_of_all
+from checkpoint.resources.registry import findings_of_all
 from checkpoint.resources.sockets import unix_names
 
 
@@ -22,8 +23,8 @@ from checkpoint.resources.sockets import unix_names
 def test_a_pidfd_of_a_thread_that_is_on_its_way_too_is_refused(passed: int, thread: int, is_refused: bool) -> None:
     of_thread: dict[str, Fact] = {"descriptors": [[3, 0], [5, 1]], "flags": 0, "pid": 0, "thread": thread}
     sending = Resource("sockets", "fd 4", {"descriptors": [[4, 0]], "passed": [[], [passed]]})
-    reasons = reasons_of_all([sending, Resource(pidfd.KIND, "fd 3", of_thread)])
-    assert ["fd 3 is a pidfd of the single thread 7 that is on its way" in reason for reason in reasons] == [True] * is_refused
+    found = findings_of_all([sending, Resource(pidfd.KIND, "fd 3", of_thread)], Surroundings(), standing=True)
+    assert ["fd 3 is a pidfd of the single thread 7 that is on its way" in one.text for one in found] == [True] * is_refused
 
 
 @pytest.mark.parametrize(
