@@ -491,6 +491,16 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     reasons: tuple[str, ...] = ()
 
 
+def failed(error: CheckpointError) -> Failed:
+    """What a keeper answers when a request failed.
+
+    The receiver knows only the classes of ``checkpoint.errors``. So the answer names the nearest of those: a `MovedError` is told
+    as the `CaptureError` that it is.
+    """
+    known = next(kind for kind in type(error).__mro__ if kind.__module__ == CheckpointError.__module__)
+    return Failed(known.__name__, str(error), getattr(error, "reasons", ()))
+
+
 Request = (
     Probe
     | Tabulate

@@ -29,7 +29,7 @@ from checkpoint.engine import CaptureOrder, Copy, Engine, ProtectOrder, Restored
 from checkpoint.engines import registry
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, ProcessGoneError, RestoreError, StoreError, let_go
 from checkpoint.keeper import messages
-from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
+from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError, Reply, Request
 from checkpoint.linux.signal_wakeup import waking
 from checkpoint.linux.spawn import namespaces
 from checkpoint.linux.unix_address import address_of
@@ -130,7 +130,7 @@ class Keeper:
         try:
             answer = self._verbs[type(request)](request, descriptors)
         except CheckpointError as error:
-            answer = Failed(type(error).__name__, str(error), getattr(error, "reasons", ())), ()
+            answer = messages.failed(error), ()
             let_go(error)
         if answer is None:
             return

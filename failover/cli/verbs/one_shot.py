@@ -86,11 +86,11 @@ def capture(arguments: argparse.Namespace) -> int:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
         order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=terms_of(arguments))
-        protected, _ = _at_last(lambda: keeper.ask(order, Protected))
+        protected, _ = _at_last(arguments.pid, lambda: keeper.ask(order, Protected))
         held = not arguments.leave_running
         whole = Capture(base=True, generation=1, sequence=1, hold=held)
         with _written_whole(target) as file:
-            captured = _captured(keeper, whole, file, target)
+            captured = _captured(keeper, arguments.pid, whole, file, target)
             notes = _contested(keeper, arguments, file)
         with _ended(arguments.pid) if held else contextlib.nullcontext():
             keeper.release()
@@ -109,7 +109,7 @@ def _contested(keeper: Keeper, arguments: argparse.Namespace, file: int) -> tupl
     return tuple(f"a restore here would be refused now: {reason}" for reason in found.lacks)
 
 
-def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captured:
+def _captured(keeper: Keeper, pid: int, order: Capture, file: int, target: Path) -> Captured:
     """Have a snapshot written straight into a file: of a large program a copy more takes as long as all the rest."""
 
     def ask() -> Captured:
@@ -118,31 +118,46 @@ def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captur
         return keeper.ask(order, Captured, (file,))[0]
 
     try:
-        return _at_last(ask)
+        return _at_last(pid, ask)
     except StoreError as error:
         raise FailoverError(f"cannot write {target}: {error}; the program was not ended") from error
 
 
-def _at_last(ask: Callable[[], A]) -> A:
-    """The answer to what is asked again where the moment was bad: nobody else is there to do so, unlike with an agent.
+def _at_last(pid: int, ask: Callable[[], A]) -> A:
+    """The answer to what is asked again where the moment was bad: no agent is there to ask again.
 
-    What is refused is asked again a few times, too: a child that has not executed its program yet (vfork), bytes on their way.
+    A refusal is asked again, too, until it was given `REFUSED_TRIES` times in the same words: a child that has not executed its
+    program yet (vfork), or bytes on their way, are refused only for a moment.
 
     Raises:
-        CheckpointError: what the last try said, or the first one that no other moment would have helped.
+        CheckpointError: the error of the last try, with the number of tries; or the first error that no later try would change.
     """
-    refused = 0
+    began = time.monotonic()
+    reasons: tuple[str, ...] = ()
+    told = 0
     for left in reversed(range(CAPTURE_TRIES)):
         try:
             return ask()
         except (ProcessGoneError, NothingCommittedError):
             raise
-        except (CaptureError, UnsupportedError) as error:
-            refused += isinstance(error, UnsupportedError)
-            if not left or refused == REFUSED_TRIES:
+        except UnsupportedError as error:
+            reasons, told = error.reasons, told + 1 if error.reasons == reasons else 1
+            if not left or told == REFUSED_TRIES:
                 raise
-            time.sleep(CAPTURE_PAUSE_S)
+        except CaptureError as error:
+            if not left:
+                raise CaptureError(_in_vain(pid, error, time.monotonic() - began)) from error
+        time.sleep(CAPTURE_PAUSE_S)
     raise AssertionError("the last try answers or raises")
+
+
+def _in_vain(pid: int, error: CaptureError, took_s: float) -> str:
+    """Why no try succeeded, and what helps."""
+    why = str(error).removesuffix("; capture it again")
+    load, cores = os.getloadavg()[0], len(os.sched_getaffinity(0))
+    tried = f"failover tried {CAPTURE_TRIES} times in {took_s:.0f} s; the machine has a load of {load:.0f} on {cores} cores"
+    cure = f"kill -STOP {pid}, capture it, and kill -CONT it after the restore; or capture it when the machine has less to do"
+    return f"cannot capture pid {pid}, which runs on: {why}. {tried}. To capture it: {cure}"
 
 
 @contextmanager

@@ -123,6 +123,7 @@ class PtraceSession:
         self._table = PageTable.empty(abi.PAGE_SIZE)
         self._totals_at: dict[Position, Totals] = {}
         self._refused = False
+        self._is_single = True
         self._held = False
         self._longest_us = 0
         self._collects = False
@@ -212,7 +213,7 @@ class PtraceSession:
 
     def capture_standing(self, order: CaptureOrder) -> Snapshot | UnreadBase:
         """See ``checkpoint.engine.Session.capture_standing``: pages of one process alone stay where they are."""
-        return self._captured(order, may_stay=order.base and order.hold and self._carried is None)
+        return self._captured(order, may_stay=order.base and order.hold and self._carried is None and self._is_single)
 
     def _captured(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
         for _ in range(SPOKESMEN_MAX):
@@ -298,8 +299,9 @@ class PtraceSession:
                 return frozen
             except MovedError as moved:
                 let_go(moved)  # its frames hold what was copied
-                may_stay = False
-                if time.monotonic() > deadline:
+                is_last = time.monotonic() > deadline and not may_stay  # one that took it for a single process is never the last
+                self._is_single, may_stay = self._is_single and not may_stay, False
+                if is_last:
                     raise
                 time.sleep(MOVED_PAUSE_S)
 
