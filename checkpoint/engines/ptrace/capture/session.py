@@ -55,7 +55,7 @@ from checkpoint.resources.carried import capture as carried_capture
 from checkpoint.resources.carried.capture import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.resources.ipc import system_v_memory
 from checkpoint.resources.open_file import OpenFile, Surroundings
-from checkpoint.resources.process import refused_threads, thread_credentials
+from checkpoint.resources.process import control_groups, refused_threads, thread_credentials
 from checkpoint.resources.sockets import tcp_handover
 from checkpoint.resources.sockets.tcp_handover import Departing
 from checkpoint.resources.survey import glance, look
@@ -471,11 +471,11 @@ class PtraceSession:
         held = look(first.standing.opened, self._surroundings)
         of_files = self._carried.reasons(frozen.seen) if self._carried else ()
         of_others = others.reasons(first) if others else ()
-        pids = others.pids if others else ()
+        family = others.pids if others else ()
         every = (*held.resources, *(others.resources() if others else ()))
         of_all = registry.reasons_of_all(every)
         of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments)
-        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_segments, *of_files))
+        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, family), *of_others, *of_segments, *of_files))
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         outline = replace(
             self._outline(order, parent, frozen, parcel),
@@ -488,6 +488,8 @@ class PtraceSession:
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
         outline = frozen.departing.added_to(outline)
+        pids = (self.pid, *(others.in_order() if others else ()))
+        outline = control_groups.added_to(outline, pids, is_guarded=self._first.order.is_guarded)
         if self._owner is not None and (beyond := credentials.refusal(credentials.beyond(outline, self._owner), self._owner)):
             self._refuse((beyond,))
         if first.taken.unread is not None:
