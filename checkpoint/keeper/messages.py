@@ -249,7 +249,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes, epoch, contents, stood_still: see `checkpoint.engine.RestoreOptions`.
+        own_eyes, epoch, contents, stood_still, all_connections: see `checkpoint.engine.RestoreOptions`.
         terms: those under which it is restored, and followed from then on.
         follow: protect it again as soon as it runs.
         bound: see `checkpoint.engine.RestoreOptions`; the keeper becomes that user for good, before it looks at the snapshot.
@@ -266,6 +266,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     contents: str = ""
     terms: Terms = NO_TERMS
     stood_still: bool = False
+    all_connections: bool = False
     follow: bool = True
     bound: Owner | None = None
 

@@ -412,6 +412,7 @@ def _options(order: messages.Restore) -> RestoreOptions:
         order.contents,
         terms=order.terms,
         stood_still=order.stood_still,
+        all_connections=order.all_connections,
         bound=order.bound,
     )
 

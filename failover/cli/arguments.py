@@ -263,7 +263,8 @@ def capture(room: argparse.ArgumentParser) -> None:
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
     _shared(room)
     _devices(room)
-    _connections(room, "carry: take its TCP connections with others along (default: reset)", "reset")
+    what = "carry: take its TCP connections with others along, or refuse the capture; not with --leave-running (default: reset)"
+    _connections(room, what, "reset")
     _json(room)
 
 
@@ -278,7 +279,11 @@ def restore(room: argparse.ArgumentParser) -> None:
     )
     _shared(room)
     _devices(room)
-    _connections(room, "reset: do not take up TCP connections that the capture took along (default: carry)", "carry")
+    what = (
+        "carry: take up all TCP connections with others, or refuse the restore; reset: take up none "
+        "(default: take up those that the capture took along, where that is possible)"
+    )
+    _connections(room, what)
     _json(room)
 
 

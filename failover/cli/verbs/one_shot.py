@@ -21,7 +21,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from checkpoint.device_rules import DeviceRule, rule_from
-from checkpoint.engine import Terms
+from checkpoint.engine import GOES_ALONG, Terms
 from checkpoint.errors import (
     CaptureError,
     ChainError,
@@ -57,7 +57,7 @@ from checkpoint.snapshot.credentials import Owner
 from failover.cli.keeper_client import Keeper
 from failover.cli.output import render, team_tree
 from failover.cli.verbs.components import exit_like
-from failover.core.types import CARRY
+from failover.core.types import CARRY, RESET
 from failover.errors import FailoverError
 
 CAPTURE_TRIES: Final = 12
@@ -71,6 +71,11 @@ IDS_TIMEOUT_S: Final = 2.0
 IDS_PAUSE_S: Final = 0.01
 """How long the ids of a program that has just been ended may take to be free, and how often that is looked at."""
 OWN_PIDS: Final = "it runs in a PID namespace of its own, with its old PIDs: here they are taken, or not this user's to choose"
+LEFT_RUNNING: Final = (
+    "cannot take along the TCP connections of pid {pid} and leave it running: only one of the two can have a connection, and the "
+    "program keeps it; leave out --leave-running, or --connections carry"
+)
+SILENT: Final = "its peer hears nothing until the restore, for 15 minutes at most"
 
 ROOT: Final = 0
 
@@ -82,6 +87,8 @@ A = TypeVar("A")
 def capture(arguments: argparse.Namespace) -> int:
     """Write one snapshot of a process to a file, and end the process unless it is to run on."""
     target = Path(arguments.output)
+    if arguments.leave_running and arguments.connections == CARRY:
+        raise FailoverError(LEFT_RUNNING.format(pid=arguments.pid))
     if target.exists() and not arguments.force:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
@@ -91,10 +98,33 @@ def capture(arguments: argparse.Namespace) -> int:
         whole = Capture(base=True, generation=1, sequence=1, hold=held)
         with _written_whole(target) as file:
             captured = _captured(keeper, arguments.pid, whole, file, target)
+            carried = _carried(arguments.pid, file) if arguments.connections == CARRY else ()
             notes = _contested(keeper, arguments, file)
         with _ended(arguments.pid) if held else contextlib.nullcontext():
             keeper.release()
-    return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes + notes)))
+    seen = [note for note in protected.notes + captured.notes if not (carried and note.endswith(GOES_ALONG))]
+    return _tell_capture(arguments, captured, tuple(dict.fromkeys((*seen, *carried, *notes))))
+
+
+def _carried(pid: int, file: int) -> tuple[str, ...]:
+    """Which TCP connections a snapshot has taken along, as notes.
+
+    Raises:
+        FailoverError: one could not be taken along; the program is let go of, and is heard again.
+    """
+    from checkpoint.resources.sockets import tcp
+
+    again = os.open(f"/proc/self/fd/{file}", os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        state = format.read_state(again)
+    finally:
+        os.close(again)
+    every = (*state.resources, *(one for member in state.members for one in member.resources))
+    held = [one for one in every if one.kind == tcp.KIND]
+    if left := [f"{tcp.named(one)} ({why})" for one in held if isinstance(why := one.facts.get(tcp.LEFT), str)]:
+        what = f"cannot take along the TCP connection{'s' if len(left) > 1 else ''} {'; '.join(left)}"
+        raise FailoverError(f"{what}. Pid {pid} runs on, with its connections. To capture it without them: --connections reset")
+    return tuple(f"the TCP connection {tcp.named(one)} goes along; {SILENT}" for one in held if tcp.TAKEN in one.facts)
 
 
 def _contested(keeper: Keeper, arguments: argparse.Namespace, file: int) -> tuple[str, ...]:
@@ -248,7 +278,7 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
         FailoverError: a rule is none.
     """
     shared = tuple(os.path.realpath(path) for path in arguments.shared)
-    return Terms(devices=device_rules(arguments), connections=arguments.connections == CARRY, shared=shared)
+    return Terms(devices=device_rules(arguments), connections=arguments.connections != RESET, shared=shared)
 
 
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
@@ -303,7 +333,14 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
         _born(_owned(birth, state, owner, opened)) as born,
     ):
         order = Restore(
-            born.pid, state.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False, bound=owner
+            born.pid,
+            state.component,
+            elapsed_ns,
+            terms=terms,
+            stood_still=terms.connections,
+            all_connections=arguments.connections == CARRY,
+            follow=False,
+            bound=owner,
         )
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)

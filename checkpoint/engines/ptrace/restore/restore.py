@@ -91,7 +91,7 @@ def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOption
     brought = checks.require(program, options, vessel_pid)
     laid = carried_restore.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
     program, _ = file_numbers.renewed(program, laid.identities)
-    arriving, program = tcp_handover.arriving(program, wanted=options.stood_still)
+    arriving, program = tcp_handover.arriving(program, wanted=options.stood_still, all_of_them=options.all_connections)
     try:
         restored = (
             _run_tree(vessel_pid, program, options, brought, arriving)
