@@ -11,7 +11,8 @@ writes with its own rights. For a component of another user than root, it writes
 lie below the usual place.
 
 Facts: ``descriptors`` (none); ``groups``, for each hierarchy a list of its name (controllers of /proc/PID/cgroup, "" of v2),
-the path, the path below the usual place ("" if it is not below), and whether the group is the program's own.
+the path, the path below the usual place ("" if it is not below), and whether the group is the program's own; ``threads``,
+of a base only: the paths of groups in which only threads of the process are.
 
 Source: cgroups(7); Documentation/admin-guide/cgroup-v2.rst.
 """
@@ -31,6 +32,7 @@ from msgspec.structs import replace
 from checkpoint.capability import Area, by_rule
 from checkpoint.errors import CheckpointError
 from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.model import Fact, Resource, Snapshot
 
 KIND: Final = "control_groups"
@@ -103,17 +105,28 @@ def added_to(state: Snapshot, pids: Sequence[int], *, is_guarded: bool) -> Snaps
     """
     usual = groups_of(procfs.status(pids[0]).ppid if is_guarded else os.getpid())
     told = [tuple(_elsewhere(pid, usual, pids, is_guarded=is_guarded)) for pid in pids]
-    if not any(told):
+    threads = [_of_threads(pid) if state.is_base else () for pid in pids]  # a program of 200 threads has 200 files
+    if not any(told) and not any(threads):
         return state
-    first, *others = (_described(groups) for groups in told)
+    first, *others = map(_described, told, threads)
     members = tuple(
         replace(member, resources=(*member.resources, *more)) for member, more in zip(state.members, others, strict=True)
     )
     return replace(state, resources=(*state.resources, *first), members=members)
 
 
-def _described(groups: Sequence[Fact]) -> tuple[Resource, ...]:
-    return (Resource(KIND, "control groups", {"descriptors": [], "groups": list(groups)}),) if groups else ()
+def _described(groups: Sequence[Fact], threads: Sequence[str]) -> tuple[Resource, ...]:
+    facts: dict[str, Fact] = {"descriptors": [], "groups": list(groups), "threads": list(threads)}
+    return (Resource(KIND, "control groups", facts),) if groups or threads else ()
+
+
+def _of_threads(pid: int) -> tuple[str, ...]:
+    """The groups in which only threads of a process are, but not the process."""
+    ours = set(groups_of(pid).items())
+    with contextlib.suppress(CheckpointError):
+        theirs = {place for tid in thread_ids(pid) if tid != pid for place in groups_of(tid).items()}
+        return tuple(sorted(path for hierarchy, path in theirs - ours if hierarchy in dict(ours)))
+    return ()
 
 
 def _elsewhere(pid: int, usual: Groups, pids: Collection[int], *, is_guarded: bool) -> Iterator[Fact]:
@@ -157,10 +170,10 @@ def put_back(state: Snapshot, pids: Sequence[int], owner: int | None) -> tuple[s
         owner: the user id to whom the groups must belong that are not below the usual place; None: to anybody.
     """
     wanted = [(pid, place) for one, pid in zip(state.processes, pids, strict=True) for place in _places(one.resources)]
+    notes = [note for one, pid in zip(state.processes, pids, strict=True) for note in _thread_notes(one.resources, pid)]
     if not wanted:
-        return ()
+        return tuple(notes)
     usual, mounts = groups_of(pids[0]), _Mounts()
-    notes = []
     for pid, place in sorted(wanted, key=lambda one: one[1].path.count("/")):  # a group before those below it
         if lost := _lost(pid, place, usual.get(place.hierarchy), mounts, owner):
             version = f"v1, {place.hierarchy}" if place.hierarchy else "v2"
@@ -168,6 +181,16 @@ def put_back(state: Snapshot, pids: Sequence[int], owner: int | None) -> tuple[s
             where = f"; it is in {now} now" if now is not None else ""
             notes.append(f"{_name_of(pid)} was in the control group {place.path} ({version}){where}: {lost}")
     return tuple(dict.fromkeys(notes))
+
+
+def _thread_notes(resources: Sequence[Resource], pid: int) -> Iterator[str]:
+    for held in resources:
+        if held.kind == KIND:
+            groups = held.facts["threads"]
+            assert isinstance(groups, list)
+            for group in groups:
+                assert isinstance(group, str)
+                yield f"threads of {_name_of(pid)} were in the control group {group}; they are in that of their process now"
 
 
 def _places(resources: Sequence[Resource]) -> Iterator[_Place]:

@@ -178,6 +178,30 @@ def test_a_group_that_others_had_too_is_not_made_and_that_is_said(hierarchy: Hie
         other.wait()
 
 
+IN_A_THREAD = """
+import sys, threading, time
+def wait():
+    with open(sys.argv[1] + "/tasks", "w") as file:
+        file.write("0")
+    open("first", "w").close()
+    open("child", "w").close()
+    time.sleep(600)
+threading.Thread(target=wait).start()
+"""
+
+
+def test_a_thread_that_was_elsewhere_than_its_process_is_told_of(
+    hierarchy: Hierarchy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not hierarchy.name:
+        pytest.skip("a group of version 2 that takes single threads must be made so (threaded)")
+    monkeypatch.setitem(globals(), "PROGRAM", IN_A_THREAD)
+    with running(tmp_path, hierarchy.group("threads")) as program:
+        program.capture()
+        notes = program.restore()
+        assert f"were in the control group /{hierarchy.top.name}/threads; they are in that of their process now" in notes, notes
+
+
 def test_a_component_of_a_user_enters_only_groups_of_that_user(hierarchy: Hierarchy) -> None:
     group = hierarchy.group("outer")
     process = subprocess.Popen(["sleep", "600"])
