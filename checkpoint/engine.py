@@ -32,6 +32,10 @@ REFUSED: Final = "refused"
 NOTED: Final = "noted"
 
 
+GOES_ALONG: Final = "should the program crash; a handover takes it along"
+"""End of the note about a TCP connection that is taken along where the program is handed over."""
+
+
 class Finding(Struct, frozen=True):
     """One thing that a process holds.
 
@@ -219,6 +223,7 @@ class RestoreOptions(Struct, frozen=True):
         contents: directory of files that were brought along (`checkpoint.store.content_store`), for what this machine lacks or
             has in another version; "": there are none.
         stood_still: nothing of it has run since the capture, so that TCP connections that were taken along can be taken up.
+        all_connections: refuse the restore where a TCP connection with another program cannot be taken up; else it is reset.
         bound: whose rights it gets at most, whatever it asks for (`checkpoint.snapshot.credentials.bounded`); None: what it asks
             for. The vessel is that user's already, so that the kernel keeps to it, too.
     """
@@ -230,6 +235,7 @@ class RestoreOptions(Struct, frozen=True):
     contents: str = ""
     terms: Terms = NO_TERMS
     stood_still: bool = False
+    all_connections: bool = False
     bound: Owner | None = None
 
 

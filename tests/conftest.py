@@ -13,7 +13,6 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
@@ -24,8 +23,7 @@ from checkpoint.linux.memory import choose_tracker
 from checkpoint.linux.memory.tracker import Tracker
 from checkpoint.linux.memory.write_protect import PagemapTracker
 
-if TYPE_CHECKING:
-    from xdist.scheduler import LoadScopeScheduling
+pytest_plugins = ["tests.runner"]
 
 TRACEES = Path(__file__).parent / "tracees"
 
@@ -125,27 +123,6 @@ def _machine(request: pytest.FixtureRequest, record_testsuite_property: Callable
     record_testsuite_property("tracking", tracking_of(request.config))
     record_testsuite_property("page_size", abi.PAGE_SIZE)
     record_testsuite_property("on", time.strftime("%Y-%m-%d"))
-
-
-# --- Side by side ----------------------------------------------------------------------------------------------------
-
-SEGMENTS = ("tests/checkpoint/engines/ptrace/restore/test_memory_kinds.py", "tests/checkpoint/resources/test_refusals.py")
-"""They make System V segments, or look at all that there are on the machine."""
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling:
-    """With ``-n 2`` files run side by side, but never two tests of whole robots: one worker begins with these, in their order."""
-    from xdist.scheduler import LoadScopeScheduling
-
-    class OneStage(LoadScopeScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            file = nodeid.split("::")[0]
-            if file.startswith("tests/e2e/"):
-                return "robots"
-            return "segments" if file in SEGMENTS else file
-
-    return OneStage(config, log)
 
 
 # --- Tracees ---------------------------------------------------------------------------------------------------------

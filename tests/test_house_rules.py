@@ -167,7 +167,7 @@ def test_no_folder_is_crowded() -> None:
 
 def test_whole_robots_are_started_where_no_two_tests_of_them_run_at_once() -> None:
     wrong = [
-        f"{name_of(path)}:{line} imports {module}: a test that starts whole robots lies in tests/e2e (see tests/conftest.py)"
+        f"{name_of(path)}:{line} imports {module}: a test that starts whole robots lies in tests/e2e (see tests/runner.py)"
         for path in sources("tests")
         if not name_of(path).startswith("tests/e2e/")
         for line, module in imports(parsed(path), package_of(path))

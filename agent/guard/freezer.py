@@ -138,11 +138,12 @@ class CgroupFreezer:
                 _send(pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Remove the cgroup, once its last process has been reaped."""
+        """Remove the cgroup, and those that the program made in it, once its last process has been reaped."""
         deadline = time.monotonic() + SETTLE_S
         while True:
             try:
-                self._directory.rmdir()
+                for below, _, _ in os.walk(self._directory, topdown=False):
+                    os.rmdir(below)
             except FileNotFoundError:
                 return
             except OSError:

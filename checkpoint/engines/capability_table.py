@@ -17,6 +17,7 @@ from checkpoint.resources.files import locks, memfd, namespaces, overmounted, pr
 from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.process import (
     audit_login,
+    control_groups,
     job_control,
     mlockall,
     parent_death_signals,
@@ -51,6 +52,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     shared_open_file,
     thread_credentials,
     unshared_threads,
+    control_groups,
     scheduling,
     parent_death_signals,
     seccomp,

@@ -249,7 +249,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         streams: the last five descriptors are the streams, as with `Protect`.
-        own_eyes, epoch, contents, stood_still: see `checkpoint.engine.RestoreOptions`.
+        own_eyes, epoch, contents, stood_still, all_connections: see `checkpoint.engine.RestoreOptions`.
         terms: those under which it is restored, and followed from then on.
         follow: protect it again as soon as it runs.
         bound: see `checkpoint.engine.RestoreOptions`; the keeper becomes that user for good, before it looks at the snapshot.
@@ -266,6 +266,7 @@ class Restore(msgspec.Struct, frozen=True, tag=True):
     contents: str = ""
     terms: Terms = NO_TERMS
     stood_still: bool = False
+    all_connections: bool = False
     follow: bool = True
     bound: Owner | None = None
 
@@ -489,6 +490,16 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
     error: str
     message: str
     reasons: tuple[str, ...] = ()
+
+
+def failed(error: CheckpointError) -> Failed:
+    """What a keeper answers when a request failed.
+
+    The receiver knows only the classes of ``checkpoint.errors``. So the answer names the nearest of those: a `MovedError` is told
+    as the `CaptureError` that it is.
+    """
+    known = next(kind for kind in type(error).__mro__ if kind.__module__ == CheckpointError.__module__)
+    return Failed(known.__name__, str(error), getattr(error, "reasons", ()))
 
 
 Request = (

@@ -40,7 +40,7 @@ from checkpoint.engine import (
 from checkpoint.engines import registry
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, ProcessGoneError, RestoreError, StoreError, let_go
 from checkpoint.keeper import messages
-from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError, Failed, Reply, Request
+from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError, Reply, Request
 from checkpoint.linux.signal_wakeup import waking
 from checkpoint.linux.spawn import namespaces
 from checkpoint.linux.unix_address import address_of
@@ -144,7 +144,7 @@ class Keeper:
         try:
             answer = self._verbs[type(request)](request, descriptors)
         except CheckpointError as error:
-            answer = Failed(type(error).__name__, str(error), getattr(error, "reasons", ())), ()
+            answer = messages.failed(error), ()
             let_go(error)
         if answer is None:
             return
@@ -436,6 +436,7 @@ def _options(order: messages.Restore) -> RestoreOptions:
         order.contents,
         terms=order.terms,
         stood_still=order.stood_still,
+        all_connections=order.all_connections,
         bound=order.bound,
     )
 

@@ -44,6 +44,7 @@ from checkpoint.resources.files import (
 from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.process import (
     audit_login,
+    control_groups,
     job_control,
     mlockall,
     parent_death_signals,
@@ -118,6 +119,7 @@ NOT_OPEN: Final = (
     shared_with_parent.KIND,
     clean_private_pages.KIND,
     unshared_threads.KIND,
+    control_groups.KIND,
 )
 """Kinds of what no descriptor stands for."""
 KINDS: Final = (

@@ -282,7 +282,8 @@ def capture(room: argparse.ArgumentParser) -> None:
     room.add_argument("--force", action="store_true", help="replace FILE if it exists")
     _shared(room)
     _devices(room)
-    _connections(room, f"{RESETS}; carry: take those of TCP along; {REFUSES} (default: reset)", "reset")
+    carries = "carry: take those of TCP along, or refuse the capture; not with --leave-running"
+    _connections(room, f"{RESETS}; {carries}; {REFUSES} (default: reset)", "reset")
     _shared_memory(room, "refuse")
     _json(room)
 
@@ -298,8 +299,11 @@ def restore(room: argparse.ArgumentParser) -> None:
     )
     _shared(room)
     _devices(room)
-    taken_up = "reset: do not take up TCP connections that the capture took along (default: carry)"
-    _connections(room, taken_up, "carry", choices=("reset", "carry"))
+    what = (
+        "carry: take up all TCP connections with others, or refuse the restore; reset: take up none "
+        "(default: take up those that the capture took along, where that is possible)"
+    )
+    _connections(room, what, choices=("reset", "carry"))
     _json(room)
 
 

@@ -33,7 +33,7 @@ from ipaddress import ip_address
 from typing import Final
 
 from checkpoint.capability import Area, by_rule, preserved, refused
-from checkpoint.engine import NOTED, REFUSED, RESET_NOTE, Finding
+from checkpoint.engine import GOES_ALONG, NOTED, REFUSED, RESET_NOTE, Finding
 from checkpoint.linux.net import tcp_repair, time_wait
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
@@ -212,7 +212,7 @@ def findings(held: Sequence[Resource], surroundings: Surroundings, *, standing: 
             yield from (Finding(KIND, one.name, REFUSED, reason) for reason in reasons)
         elif TAKEN not in one.facts and (text := note(one)):
             if MAY_MOVE in one.facts and LEFT not in one.facts:
-                yield Finding(KIND, one.name, NOTED, f"{text} should the program crash; a handover takes it along")
+                yield Finding(KIND, one.name, NOTED, f"{text} {GOES_ALONG}")
             else:
                 yield sockets.ends(KIND, one.name, text, surroundings)
 
@@ -243,14 +243,14 @@ def note(held: Resource) -> str | None:
     """What becomes of a connection whose other end is somebody else's; None of one that had ended, or is asked for anew."""
     if held.facts["state"] in (CLOSED, SYN_SENT) and not _number(held, "unread"):
         return None
-    peer = held.facts["peer"]
-    where = f" with {in_words(peer)}" if isinstance(peer, list) and peer else ""
     why = f" ({reason})" if isinstance(reason := held.facts.get(LEFT), str) else ""
-    return (
-        f"the TCP connection {held.name}{where} is ended{why}"
-        if _reads_the_end(held)
-        else f"the TCP connection {held.name}{where} is reset{why}"
-    )
+    return f"the TCP connection {named(held)} is {'ended' if _reads_the_end(held) else 'reset'}{why}"
+
+
+def named(held: Resource) -> str:
+    """A connection, for a sentence: its descriptor, and with whom it is."""
+    peer = held.facts["peer"]
+    return f"{held.name} with {in_words(peer)}" if isinstance(peer, list) and peer else held.name
 
 
 def notes(held: Sequence[Resource]) -> tuple[str, ...]:

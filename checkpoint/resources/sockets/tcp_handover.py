@@ -19,14 +19,14 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Final
+from typing import Final, NoReturn
 
 import msgspec
 from msgspec import Struct, field
 from msgspec.structs import asdict, replace
 
 from checkpoint.capability import Area, by_rule
-from checkpoint.errors import CheckpointError, RestoreError
+from checkpoint.errors import CheckpointError, MismatchError, RestoreError
 from checkpoint.linux.net import packet_drop, tcp_repair, time_wait
 from checkpoint.linux.net.packet_drop import Connection
 from checkpoint.linux.net.tcp_repair import CannotCarryError, InUseError, Kept
@@ -254,15 +254,21 @@ def _missing(one: _Arrival) -> str:
     )
 
 
-def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
+def arriving(state: Snapshot, *, wanted: bool, all_of_them: bool = False) -> tuple[Arriving, Snapshot]:
     """What of a snapshot's connections can be taken up here, tried by making each of them.
 
     Args:
         wanted: nothing has run since the capture; else none is.
+        all_of_them: refuse if one cannot; what has been silent stays silent, so that another restore may succeed.
 
     Returns:
         Those, which are silent from now on; and the snapshot, with the reason in the place of what cannot be taken up.
+
+    Raises:
+        MismatchError: one cannot, and all were to be.
     """
+    if all_of_them:
+        _require_taken(state)
     lost: dict[int, str] = {}
     arrivals = []
     ended = []
@@ -272,10 +278,13 @@ def arriving(state: Snapshot, *, wanted: bool) -> tuple[Arriving, Snapshot]:
                 ended.append(_connection(held.facts))
             if held.kind == KIND and TAKEN in held.facts:
                 one = _Arrival(process, held, _connection(held.facts), _kept(held))
-                if reason := _hindrance(one) if wanted else "the program resumes from an older state":
+                if reason := _hindrance(one, stays_silent=all_of_them) if wanted else "the program resumes from an older state":
                     lost[number_of(held.facts["socket"])] = reason
                 else:
                     arrivals.append(one)
+
+    if lost and all_of_them:
+        _refuse(state, ((held, lost[number]) for number, held in _by_socket(state).items() if number in lost))
 
     def without(held: Resource) -> Resource:
         if held.kind != KIND or (reason := lost.get(number_of(held.facts["socket"]))) is None:
@@ -292,14 +301,37 @@ def _changed(state: Snapshot, change: Callable[[Resource], Resource]) -> Snapsho
     return replace(state, resources=tuple(map(change, state.resources)), members=members)
 
 
-def _hindrance(one: _Arrival) -> str:
+def _by_socket(state: Snapshot) -> dict[int, Resource]:
+    """The TCP connections of all processes, by the number of their sockets."""
+    held = (one for process in state.processes for one in process.resources if one.kind == KIND)
+    return {number_of(one.facts["socket"]): one for one in held}
+
+
+def _require_taken(state: Snapshot) -> None:
+    """Refuse a snapshot whose capture has left a connection with another program behind."""
+    held = _by_socket(state)
+    own = tcp.pairs(held.values())
+    left = [one for number, one in held.items() if tcp.is_carriable(one.facts) and TAKEN not in one.facts and number not in own]
+    if left:
+        _refuse(state, ((one, str(one.facts.get(LEFT, "its capture did not take it along"))) for one in left))
+
+
+def _refuse(state: Snapshot, lost: Iterable[tuple[Resource, str]]) -> NoReturn:
+    reasons = tuple(f"the TCP connection {tcp.named(one)} cannot be taken up: {why}" for one, why in lost)
+    raise MismatchError(
+        f"cannot restore {state.component} here: {'; '.join(reasons)}. Without them: --connections reset", reasons
+    )
+
+
+def _hindrance(one: _Arrival, *, stays_silent: bool) -> str:
     """Why a connection cannot be taken up here; "" of one that can, and is silent from now on."""
     try:
         packet_drop.impose([one.connection])
         _try(one)
     except (CannotCarryError, OSError) as reason:
         with contextlib.suppress(OSError):
-            packet_drop.lift([one.connection])
+            if not stays_silent:
+                packet_drop.lift([one.connection])
         return _without_right(reason) if isinstance(reason, OSError) else str(reason)
     return ""
 

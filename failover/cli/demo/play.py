@@ -19,6 +19,7 @@ from failover.cli.demo.interruption import Interruption
 from failover.cli.demo.programs import Program
 from failover.cli.demo.robots import RobotMachine, Stage
 from failover.cli.demo.screen import LiveScreen, PlainScreen
+from failover.cli.demo.waiting import Waiting, load_and_cure
 from failover.cli.demo.watch import Watcher, whole_output
 from failover.cli.output import render, team_tree
 from failover.client.control import Control
@@ -85,14 +86,14 @@ def demo(arguments: argparse.Namespace) -> int:
                 break
             except EndedEarlyError as error:
                 if length == LENGTHS[-1]:
-                    raise
+                    raise FailoverError(f"the demo gave up: {error}. {load_and_cure()}") from error
                 screen.say(f"{error}; trying again, with programs that take longer")
     return _conclude(arguments, play, screen)
 
 
 def _performed(screen: PlainScreen, interruption: Interruption, length: int) -> Play:
     directory = Path(tempfile.mkdtemp(prefix="failover-demo-", dir=short_place()))
-    with Stage(directory, robots.means(), interruption=interruption) as stage:
+    with Stage(directory, robots.means(), interruption=interruption, tell=screen.say) as stage:
         play = Play(stage, screen, length)
         try:
             with interruption.allowed():
@@ -131,15 +132,16 @@ class Play:
 
         Raises:
             EndedEarlyError: a program ended before the standby could go on with it.
-            FailoverError: something did not come about; says what, with the agents' last words.
+            FailoverError: something did not come about; says what, how busy the machine is, and where the agents' logs are.
         """
         try:
             self._perform()
         except EndedEarlyError:
             raise
         except FailoverError as error:
-            words = "\n".join(f"  {robot.name} said last: {robot.last_words()}" for robot in self._stage.robots)
-            raise FailoverError(f"{error}\n{words}" if words else str(error)) from error
+            logs = self._stage.keep_logs()
+            where = f" The agents' logs are in {logs}." if logs else ""
+            raise FailoverError(f"the demo gave up: {error}. {load_and_cure()}{where}") from error
 
     def _perform(self) -> None:
         self._stage.start()
@@ -186,6 +188,7 @@ class Play:
         self._await(
             f"{SNAPSHOTS_BEFORE} snapshots of each program to arrive at {self._standby.name}",
             lambda: self._sample() and time.monotonic() > until and all(act.snapshots >= SNAPSHOTS_BEFORE for act in self.acts),
+            how_far=lambda: ", ".join(f"{act.program.title}: {act.snapshots}" for act in self.acts),
         )
 
     def _sample(self) -> bool:
@@ -251,7 +254,11 @@ class Play:
 
     def _await_end(self) -> None:
         self._caption = f"resumed at {self._standby.name}"
-        self._await("the programs to end", self._see_end, DRAW_S, END_S * self._length)
+        self._await("the programs to end", self._see_end, DRAW_S, END_S * self._length, self._written)
+
+    def _written(self) -> str:
+        """How much of its output each program has written."""
+        return ", ".join(f"{act.program.title}: {100 * act.after.size // act.program.expected_size} %" for act in self.acts)
 
     def _see_end(self) -> bool:
         found = {component["name"]: component for component in self._standby.status()["components"]}
@@ -263,8 +270,13 @@ class Play:
         return all(found.get(act.program.name, {}).get("state") == "ended" for act in self.acts)
 
     def _compare(self) -> None:
+        self._await(
+            "the undisturbed runs to end",
+            lambda: all(act.reference.poll() is not None for act in self.acts),
+            DRAW_S,
+            END_S * self._length,
+        )
         for act in self.acts:
-            act.reference.wait()
             expected = act.program.reference.read_bytes()
             output, act.exit_status = whole_output(self._standby.socket, act.program.name)
             act.size = len(output)
@@ -282,11 +294,19 @@ class Play:
                 act.reference.kill()
             act.reference.wait()
 
-    def _await(self, what: str, condition: Callable[[], bool], every_s: float = DRAW_S / 2, limit_s: float = TAKEOVER_S) -> None:
-        deadline = time.monotonic() + limit_s
+    def _await(
+        self,
+        what: str,
+        condition: Callable[[], bool],
+        every_s: float = DRAW_S / 2,
+        limit_s: float = TAKEOVER_S,
+        how_far: Callable[[], str] = lambda: "",
+    ) -> None:
+        waiting = Waiting(what, limit_s, self._screen.say)
         while not condition():
-            if time.monotonic() > deadline:
-                raise FailoverError(f"waited {limit_s:.0f} s in vain for {what}")
+            if waiting.is_over(how_far):
+                far = f" ({words})" if (words := how_far()) else ""
+                raise FailoverError(f"it waited {limit_s:.0f} s for {what}{far}")
             time.sleep(every_s)
 
     def _draw(self, components: dict[str, dict[str, Any]], robot: str) -> None:

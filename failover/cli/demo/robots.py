@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ from msgspec import Struct
 from failover.cli import key_pairs
 from failover.cli.demo.host import descendants
 from failover.cli.demo.interruption import Interruption
+from failover.cli.demo.waiting import Tell, Waiting
 from failover.client.control import Control
 from failover.config import team
 from failover.config.team import Robot, Team
@@ -129,13 +131,16 @@ class RobotMachine(Struct):
             self.process.stdin.write(GO)
             self.process.stdin.close()
 
-    def control(self) -> Control:
+    def control(self, tell: Tell = lambda _: None) -> Control:
         """A connection to its agent, as soon as it answers.
 
+        Args:
+            tell: gets a line every few seconds in which it does not answer.
+
         Raises:
-            FailoverError: it ended, or does not answer in time; with the last lines of its log.
+            FailoverError: it ended, with the last lines of its log, or does not answer in time.
         """
-        deadline = time.monotonic() + START_S
+        waiting = Waiting(f"the agent of {self.name} to answer", START_S, tell)
         while True:
             try:
                 link = Control.open(self.socket)
@@ -144,10 +149,8 @@ class RobotMachine(Struct):
             except (NoAgentError, LostAgentError) as error:
                 if self.process.poll() is not None:
                     raise FailoverError(f"the agent of {self.name} ended at once: {self.last_words()}") from error
-                if time.monotonic() > deadline:
-                    raise FailoverError(
-                        f"the agent of {self.name} did not answer in {START_S:.0f} s: {self.last_words()}"
-                    ) from error
+                if waiting.is_over():
+                    raise FailoverError(f"the agent of {self.name} did not answer in {START_S:.0f} s") from error
                 time.sleep(POLL_S)
 
     def status(self) -> dict[str, Any]:
@@ -223,9 +226,11 @@ class Stage:
         *,
         beat_ms: int = BEAT_MS,
         lease_ms: int = LEASE_MS,
+        tell: Tell = lambda _: None,
     ) -> None:
         """
         Args:
+            tell: gets a line every few seconds in which an agent does not answer.
             settings: lines of TOML added to each robot's configuration.
             interruption: held while a robot is begun, so that no robot goes unnoted.
             cables: as `CABLES`; beats go over all of them, snapshots over the first.
@@ -235,6 +240,7 @@ class Stage:
         self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\n{patience}"
         self.directory = directory
         self._settings = settings
+        self._tell = tell
         self.means = allowed
         self.interruption = interruption or Interruption()
         self.robots: list[RobotMachine] = []
@@ -258,7 +264,17 @@ class Stage:
         for robot in self.robots:
             robot.switch_on()
         for robot in self.robots:
-            robot.control().close()
+            robot.control(self._tell).close()
+
+    def keep_logs(self) -> Path | None:
+        """Copy the agents' logs to a directory that outlives this stage; None where there are none, or no room."""
+        with contextlib.suppress(OSError):
+            if logs := [robot for robot in self.robots if robot.log.exists()]:
+                place = Path(tempfile.mkdtemp(prefix="failover-demo-logs-"))
+                for robot in logs:
+                    shutil.copyfile(robot.log, place / f"{robot.name}.log")
+                return place
+        return None
 
     def _write_team(self) -> None:
         formats = [address for _, address in self._cables] if self.means.own_network else ["127.0.0.1"]

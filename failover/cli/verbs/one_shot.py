@@ -21,7 +21,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from checkpoint.device_rules import DeviceRule, rule_from
-from checkpoint.engine import Terms
+from checkpoint.engine import GOES_ALONG, Terms
 from checkpoint.errors import (
     CaptureError,
     ChainError,
@@ -57,7 +57,7 @@ from checkpoint.snapshot.credentials import Owner
 from failover.cli.keeper_client import Keeper
 from failover.cli.output import render, team_tree
 from failover.cli.verbs.components import exit_like
-from failover.core.types import CARRY, DETACH, REFUSE
+from failover.core.types import CARRY, DETACH, REFUSE, RESET
 from failover.errors import FailoverError
 
 CAPTURE_TRIES: Final = 12
@@ -71,6 +71,11 @@ IDS_TIMEOUT_S: Final = 2.0
 IDS_PAUSE_S: Final = 0.01
 """How long the ids of a program that has just been ended may take to be free, and how often that is looked at."""
 OWN_PIDS: Final = "it runs in a PID namespace of its own, with its old PIDs: here they are taken, or not this user's to choose"
+LEFT_RUNNING: Final = (
+    "cannot take along the TCP connections of pid {pid} and leave it running: only one of the two can have a connection, and the "
+    "program keeps it; leave out --leave-running, or --connections carry"
+)
+SILENT: Final = "its peer hears nothing until the restore, for 15 minutes at most"
 
 ROOT: Final = 0
 
@@ -82,19 +87,44 @@ A = TypeVar("A")
 def capture(arguments: argparse.Namespace) -> int:
     """Write one snapshot of a process to a file, and end the process unless it is to run on."""
     target = Path(arguments.output)
+    if arguments.leave_running and arguments.connections == CARRY:
+        raise FailoverError(LEFT_RUNNING.format(pid=arguments.pid))
     if target.exists() and not arguments.force:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
         order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=terms_of(arguments))
-        protected, _ = _at_last(lambda: keeper.ask(order, Protected))
+        protected, _ = _at_last(arguments.pid, lambda: keeper.ask(order, Protected))
         held = not arguments.leave_running
         whole = Capture(base=True, generation=1, sequence=1, hold=held)
         with _written_whole(target) as file:
-            captured = _captured(keeper, whole, file, target)
+            captured = _captured(keeper, arguments.pid, whole, file, target)
+            carried = _carried(arguments.pid, file) if arguments.connections == CARRY else ()
             notes = _contested(keeper, arguments, file)
         with _ended(arguments.pid) if held else contextlib.nullcontext():
             keeper.release()
-    return _tell_capture(arguments, captured, tuple(dict.fromkeys(protected.notes + captured.notes + notes)))
+    seen = [note for note in protected.notes + captured.notes if not (carried and note.endswith(GOES_ALONG))]
+    return _tell_capture(arguments, captured, tuple(dict.fromkeys((*seen, *carried, *notes))))
+
+
+def _carried(pid: int, file: int) -> tuple[str, ...]:
+    """Which TCP connections a snapshot has taken along, as notes.
+
+    Raises:
+        FailoverError: one could not be taken along; the program is let go of, and is heard again.
+    """
+    from checkpoint.resources.sockets import tcp
+
+    again = os.open(f"/proc/self/fd/{file}", os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        state = format.read_state(again)
+    finally:
+        os.close(again)
+    every = (*state.resources, *(one for member in state.members for one in member.resources))
+    held = [one for one in every if one.kind == tcp.KIND]
+    if left := [f"{tcp.named(one)} ({why})" for one in held if isinstance(why := one.facts.get(tcp.LEFT), str)]:
+        what = f"cannot take along the TCP connection{'s' if len(left) > 1 else ''} {'; '.join(left)}"
+        raise FailoverError(f"{what}. Pid {pid} runs on, with its connections. To capture it without them: --connections reset")
+    return tuple(f"the TCP connection {tcp.named(one)} goes along; {SILENT}" for one in held if tcp.TAKEN in one.facts)
 
 
 def _contested(keeper: Keeper, arguments: argparse.Namespace, file: int) -> tuple[str, ...]:
@@ -109,7 +139,7 @@ def _contested(keeper: Keeper, arguments: argparse.Namespace, file: int) -> tupl
     return tuple(f"a restore here would be refused now: {reason}" for reason in found.lacks)
 
 
-def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captured:
+def _captured(keeper: Keeper, pid: int, order: Capture, file: int, target: Path) -> Captured:
     """Have a snapshot written straight into a file: of a large program a copy more takes as long as all the rest."""
 
     def ask() -> Captured:
@@ -118,31 +148,46 @@ def _captured(keeper: Keeper, order: Capture, file: int, target: Path) -> Captur
         return keeper.ask(order, Captured, (file,))[0]
 
     try:
-        return _at_last(ask)
+        return _at_last(pid, ask)
     except StoreError as error:
         raise FailoverError(f"cannot write {target}: {error}; the program was not ended") from error
 
 
-def _at_last(ask: Callable[[], A]) -> A:
-    """The answer to what is asked again where the moment was bad: nobody else is there to do so, unlike with an agent.
+def _at_last(pid: int, ask: Callable[[], A]) -> A:
+    """The answer to what is asked again where the moment was bad: no agent is there to ask again.
 
-    What is refused is asked again a few times, too: a child that has not executed its program yet (vfork), bytes on their way.
+    A refusal is asked again, too, until it was given `REFUSED_TRIES` times in the same words: a child that has not executed its
+    program yet (vfork), or bytes on their way, are refused only for a moment.
 
     Raises:
-        CheckpointError: what the last try said, or the first one that no other moment would have helped.
+        CheckpointError: the error of the last try, with the number of tries; or the first error that no later try would change.
     """
-    refused = 0
+    began = time.monotonic()
+    reasons: tuple[str, ...] = ()
+    told = 0
     for left in reversed(range(CAPTURE_TRIES)):
         try:
             return ask()
         except (ProcessGoneError, NothingCommittedError):
             raise
-        except (CaptureError, UnsupportedError) as error:
-            refused += isinstance(error, UnsupportedError)
-            if not left or refused == REFUSED_TRIES:
+        except UnsupportedError as error:
+            reasons, told = error.reasons, told + 1 if error.reasons == reasons else 1
+            if not left or told == REFUSED_TRIES:
                 raise
-            time.sleep(CAPTURE_PAUSE_S)
+        except CaptureError as error:
+            if not left:
+                raise CaptureError(_in_vain(pid, error, time.monotonic() - began)) from error
+        time.sleep(CAPTURE_PAUSE_S)
     raise AssertionError("the last try answers or raises")
+
+
+def _in_vain(pid: int, error: CaptureError, took_s: float) -> str:
+    """Why no try succeeded, and what helps."""
+    why = str(error).removesuffix("; capture it again")
+    load, cores = os.getloadavg()[0], len(os.sched_getaffinity(0))
+    tried = f"failover tried {CAPTURE_TRIES} times in {took_s:.0f} s; the machine has a load of {load:.0f} on {cores} cores"
+    cure = f"kill -STOP {pid}, capture it, and kill -CONT it after the restore; or capture it when the machine has less to do"
+    return f"cannot capture pid {pid}, which runs on: {why}. {tried}. To capture it: {cure}"
 
 
 @contextmanager
@@ -236,7 +281,7 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
     connections = arguments.connections
     return Terms(
         devices=device_rules(arguments),
-        connections=connections == CARRY,
+        connections=connections not in (RESET, REFUSE),
         shared=shared,
         refuses_connections=connections == REFUSE,
         detaches_memory=getattr(arguments, "shared_memory", "") == DETACH,  # a snapshot says it for its restore
@@ -295,7 +340,14 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
         _born(_owned(birth, state, owner, opened)) as born,
     ):
         order = Restore(
-            born.pid, state.component, elapsed_ns, terms=terms, stood_still=terms.connections, follow=False, bound=owner
+            born.pid,
+            state.component,
+            elapsed_ns,
+            terms=terms,
+            stood_still=terms.connections,
+            all_connections=arguments.connections == CARRY,
+            follow=False,
+            bound=owner,
         )
         restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)

@@ -56,7 +56,7 @@ from checkpoint.resources.carried import capture as carried_capture
 from checkpoint.resources.carried.capture import NO_PARCEL, CarriedTrees, Parcel, Seen
 from checkpoint.resources.ipc import shared_memory, system_v_memory
 from checkpoint.resources.open_file import OpenFile, Surroundings
-from checkpoint.resources.process import refused_threads, thread_credentials
+from checkpoint.resources.process import control_groups, refused_threads, thread_credentials
 from checkpoint.resources.sockets import tcp_handover
 from checkpoint.resources.sockets.tcp_handover import Departing
 from checkpoint.resources.survey import glance, look
@@ -126,6 +126,7 @@ class PtraceSession:
         self._table = PageTable.empty(abi.PAGE_SIZE)
         self._totals_at: dict[Position, Totals] = {}
         self._refused = False
+        self._is_single = True
         self._held = False
         self._longest_us = 0
         self._collects = False
@@ -217,7 +218,7 @@ class PtraceSession:
 
     def capture_standing(self, order: CaptureOrder) -> Snapshot | UnreadBase:
         """See ``checkpoint.engine.Session.capture_standing``: pages of one process alone stay where they are."""
-        return self._captured(order, may_stay=order.base and order.hold and self._carried is None)
+        return self._captured(order, may_stay=order.base and order.hold and self._carried is None and self._is_single)
 
     def _captured(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
         for _ in range(SPOKESMEN_MAX):
@@ -304,8 +305,9 @@ class PtraceSession:
                 return frozen
             except MovedError as moved:
                 let_go(moved)  # its frames hold what was copied
-                may_stay = False
-                if time.monotonic() > deadline:
+                is_last = time.monotonic() > deadline and not may_stay  # one that took it for a single process is never the last
+                self._is_single, may_stay = self._is_single and not may_stay, False
+                if is_last:
                     raise
                 time.sleep(MOVED_PAUSE_S)
 
@@ -511,14 +513,14 @@ class PtraceSession:
         held = look(first.standing.opened, self._surroundings)
         of_files = self._carried.reasons(frozen.seen) if self._carried else ()
         of_others = others.reasons(first) if others else ()
-        pids = others.pids if others else ()
+        family = others.pids if others else ()
         every = (*held.resources, *(others.resources() if others else ()))
         findings = registry.findings_of_all(every, self._surroundings, standing=True)
         of_all = tuple(found.text for found in findings if found.verdict == REFUSED)
         detaches = self._surroundings.detached is not None
         of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments, detaches=detaches)
         self._require_detached(first, others)
-        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, pids), *of_others, *of_segments, *of_files))
+        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, family), *of_others, *of_segments, *of_files))
         parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
         lasting = (note for note in self.notes if note not in self._changing)
         outline = replace(
@@ -538,6 +540,8 @@ class PtraceSession:
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
         outline = frozen.departing.added_to(outline)
+        pids = (self.pid, *(others.in_order() if others else ()))
+        outline = control_groups.added_to(outline, pids, is_guarded=self._first.order.is_guarded)
         if self._owner is not None and (beyond := credentials.refusal(credentials.beyond(outline, self._owner), self._owner)):
             self._refuse((beyond,))
         if first.taken.unread is not None:

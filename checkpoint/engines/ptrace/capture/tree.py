@@ -135,6 +135,13 @@ class SeenOthers(Struct):
         statuses = [first.standing.status, *(seen.status for seen in self.processes)]
         return {status.pids[0]: status.pids[-1] for status in statuses}
 
+    def _by_slot(self) -> list[SeenProcess]:
+        return sorted(self.processes, key=lambda seen: seen.captured.slot)
+
+    def in_order(self) -> tuple[int, ...]:
+        """Their pids as we see them, in the order of `members`."""
+        return tuple(seen.captured.pid for seen in self._by_slot())
+
     def members(self, first: Look) -> tuple[Member, ...]:
         """All of them."""
         inner = self._inner(first)
@@ -148,7 +155,7 @@ class SeenOthers(Struct):
                 vmas=seen.vmas,
                 resources=(*seen.captured.known(seen.held.resources), *seen.unopened, *_going_on(seen, continued)),
             )
-            for seen in sorted(self.processes, key=lambda seen: seen.captured.slot)
+            for seen in self._by_slot()
         )
 
     def zombies(self, first: Look) -> tuple[Zombie, ...]:

@@ -5,6 +5,7 @@
     checks           this machine has what the snapshot needs (`restore.checks`); nothing is touched before
     carried files    laid down at their paths (`checkpoint.resources.carried.restore`)
     processes        the vessel becomes the program: one process (`restore.process`) or several, its children (`restore.tree`)
+    control groups   each process is put back where it was (`checkpoint.resources.process.control_groups`)
     connections      made again while they stay silent (`checkpoint.resources.sockets.tcp_handover`)
 
 Until `Restored.resume` the program stands still and dies with its tracer (PTRACE_O_EXITKILL): an unfinished restore leaves
@@ -29,6 +30,7 @@ from checkpoint.linux.trace.tracee import Tracee
 from checkpoint.model import Position, Snapshot
 from checkpoint.resources.carried import file_numbers
 from checkpoint.resources.carried import restore as carried_restore
+from checkpoint.resources.process import control_groups
 from checkpoint.resources.sockets import tcp_handover
 from checkpoint.resources.sockets.tcp_handover import Arriving
 from checkpoint.snapshot import carried_files, credentials
@@ -60,6 +62,12 @@ class RestoredProgram(Struct):
         """See ``checkpoint.engine.Restored.connections``."""
         return self.arriving.established
 
+    def put_back(self, state: Snapshot, options: RestoreOptions) -> None:
+        """Have its processes where they were in control groups; what cannot be is noted."""
+        pids = [self.pid, *(threads.pid for threads in self.others)]
+        owner = options.terms.owner
+        self.notes += control_groups.put_back(state, pids, owner.uid if owner is not None else None)
+
     def resume(self) -> None:
         """Let it go on, without us: all of its threads at once. Should we die halfway, it dies, too, or all of it goes on."""
         self.arriving.let_go()
@@ -88,7 +96,7 @@ def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOption
     brought = checks.require(program, options, vessel_pid)
     laid = carried_restore.lay_down_for(state, vessel_pid, own_eyes=options.own_eyes)
     program, _ = file_numbers.renewed(program, laid.identities)
-    arriving, program = tcp_handover.arriving(program, wanted=options.stood_still)
+    arriving, program = tcp_handover.arriving(program, wanted=options.stood_still, all_of_them=options.all_connections)
     try:
         restored = (
             _run_tree(vessel_pid, program, options, brought, arriving)
@@ -98,6 +106,7 @@ def restore(vessel_pid: int, base: Snapshot | StoredBase, options: RestoreOption
         restored.arriving = arriving
         restored.notes += arriving.notes
         restored.notes += laid.notes
+        restored.put_back(program, options)
         return restored
     except (RestoreError, FormatError, ChainError):
         raise

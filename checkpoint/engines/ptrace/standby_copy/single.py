@@ -257,7 +257,9 @@ class ReadyCopy(ProcessRestore):
         self.become_program()
         arriving.connect([self._tracee.pid])
         notes = (*self.notes, *arriving.notes)
-        return RestoredProgram(self.held(), self.position, tuple(notes), arriving=arriving)
+        restored = RestoredProgram(self.held(), self.position, tuple(notes), arriving=arriving)
+        restored.put_back(state, options)
+        return restored
 
     def _prepared(self, state: Snapshot, options: RestoreOptions, brought: Brought, descriptors: set[int]) -> LaterTables:
         """Everything that comes after the pages, of which nothing is done yet.

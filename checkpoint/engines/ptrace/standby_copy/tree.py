@@ -234,7 +234,9 @@ class FamilyCopy(TreeRestore):
         arriving.connect(self.pids())
         first, *others = self.held()
         notes = (*self.notes(), *arriving.notes)
-        return RestoredProgram(first, self.position, notes, tuple(others), arriving)
+        restored = RestoredProgram(first, self.position, notes, tuple(others), arriving)
+        restored.put_back(state, options)
+        return restored
 
     def _open_files_made(self) -> Estate:
         """Have the first one make the open files that several of them share; objects move above all that these need."""

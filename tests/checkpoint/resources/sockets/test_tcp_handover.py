@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """A keeper that dies while a program stands still for it."""
 ADDRESSES = {4: ("10.77.0.9/24", "10.77.0.1/24"), 6: ("fd77::9/64", "fd77::1/64")}
 """Of the program, which moves, and of its peer."""
+LOOPBACK = {4: "127.0.0.1", 6: "::1"}
 OWN = {4: ("10.77.0.2/24", "10.77.0.3/24"), 6: ("fd77::2/64", "fd77::3/64")}
 """Of the two machines."""
 
@@ -90,9 +92,13 @@ class Machines:
     def take_address(self, machine: str) -> None:
         self.ip(machine, "addr", "del", ADDRESSES[self.version][0], "dev", "eth0")
 
-    def start(self, machine: str, part: str, *how: str) -> subprocess.Popen[bytes]:
-        """Start a talker there; what it says is in a file of its name."""
-        own, host = (address.partition("/")[0] for address in ADDRESSES[self.version])
+    def start(self, machine: str, part: str, *how: str, between: Sequence[str] = ()) -> subprocess.Popen[bytes]:
+        """Start a talker there; what it says is in a file of its name.
+
+        Args:
+            between: other addresses than `ADDRESSES`.
+        """
+        own, host = (address.partition("/")[0] for address in between or ADDRESSES[self.version])
         with (self.directory / part).open("ab") as output:
             return subprocess.Popen(
                 [*self.inside(machine), PYTHON, str(TALKERS), part, host, PORT, own, *how],
@@ -106,8 +112,8 @@ class Machines:
     def said(self, part: str) -> list[str]:
         return (self.directory / part).read_text().splitlines()
 
-    def failover(self, machine: str, *words: str) -> subprocess.CompletedProcess[str]:
-        command = [*self.inside(machine), *COMMAND, *words]
+    def failover(self, machine: str, *words: str, before: Sequence[str] = ()) -> subprocess.CompletedProcess[str]:
+        command = [*self.inside(machine), *before, *COMMAND, *words]
         ran = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
         assert "Traceback" not in ran.stderr + ran.stdout
         return ran
@@ -147,6 +153,17 @@ def laid(made: Machines) -> Iterator[Machines]:
             subprocess.run(["ip", "netns", "del", made.name(machine)], capture_output=True, check=False)
 
 
+@contextlib.contextmanager
+def laid_alone(made: Machines) -> Iterator[Machines]:
+    """One machine without a wire, for the body."""
+    run("ip", "netns", "add", made.name("one"))
+    try:
+        made.ip("one", "link", "set", "lo", "up")
+        yield made
+    finally:
+        subprocess.run(["ip", "netns", "del", made.name("one")], capture_output=True, check=False)
+
+
 def conversation(machines: Machines, ending: str = "", *how: str) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
     """A program and its peer, which have filled their connection in both directions, but for the one that ends."""
     called = machines.start("peer", "called", *(["ends"] if ending == "called" else []))
@@ -162,6 +179,16 @@ def captured(machines: Machines, pid: int, *words: str) -> Path:
     ran = machines.failover("one", "capture", str(pid), "-o", str(file), "--force", *words)
     assert ran.returncode == 0, ran.stderr
     return file
+
+
+def refused_capture(machines: Machines, pid: int, *words: str, before: Sequence[str] = ()) -> str:
+    """Why a program's connections cannot be taken along; no snapshot is left."""
+    file = machines.directory / "refused"
+    command = ["capture", str(pid), "-o", str(file), "--connections", "carry", *words]
+    ran = machines.failover("one", *command, before=before)
+    assert ran.returncode == 1
+    assert not list(machines.directory.glob("*refused*"))
+    return ran.stderr
 
 
 def restored(machines: Machines, machine: str, file: Path, *words: str) -> tuple[int, str]:
@@ -247,12 +274,78 @@ def test_it_may_come_back_to_the_same_machine_again_and_again(machines_4: Machin
     expect_unbroken(machines_4, pid, called)
 
 
-def test_a_program_that_runs_on_keeps_its_connection_and_its_snapshot_has_none(machines_4: Machines) -> None:
+def test_a_program_that_is_left_running_keeps_its_connection_and_no_snapshot_may_have_it(machines_4: Machines) -> None:
     caller, called = conversation(machines_4)
-    file = captured(machines_4, caller.pid, "--connections", "carry", "--leave-running")
+    refused = refused_capture(machines_4, caller.pid, "--leave-running")
+    assert "only one of the two can have a connection, and the program keeps it; leave out --leave-running" in refused
+    file = captured(machines_4, caller.pid, "--leave-running")
     assert not any(TAKEN in held.facts for held in decoded(file).resources)
     expect_unbroken(machines_4, caller.pid, called)
     caller.wait()
+
+
+def test_without_the_right_the_capture_is_refused_and_the_program_talks_on(machines_4: Machines) -> None:
+    """As an ordinary user, who has no CAP_NET_ADMIN."""
+    caller, called = conversation(machines_4)
+    refused = refused_capture(machines_4, caller.pid, before=["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"])
+    assert "cannot take along the TCP connection fd 3 with 10.77.0.1 port 7000 (" in refused
+    assert "it takes CAP_NET_ADMIN" in refused
+    assert f"Pid {caller.pid} runs on, with its connections. To capture it without them: --connections reset" in refused
+    expect_unbroken(machines_4, caller.pid, called)
+    caller.wait()
+
+
+def test_a_capture_says_which_connections_go_along(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    file = machines_4.directory / "snapshot"
+    ran = machines_4.failover("one", "capture", str(caller.pid), "-o", str(file), "--connections", "carry")
+    assert ran.returncode == 0, ran.stderr
+    caller.wait()
+    assert "the TCP connection fd 3 with 10.77.0.1 port 7000 goes along; its peer hears nothing until the restore" in ran.stderr
+    assert "is reset" not in ran.stderr
+    pid, _ = restored(machines_4, "one", file, "--connections", "carry")
+    expect_unbroken(machines_4, pid, called)
+
+
+def test_a_restore_that_is_to_take_up_all_is_refused_where_it_cannot_and_may_be_tried_again(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    file = captured(machines_4, caller.pid, "--connections", "carry")
+    caller.wait()
+    machines_4.ip("two", "link", "set", "eth0", "down")
+    ran = machines_4.failover("two", "restore", str(file), "--connections", "carry")
+    assert ran.returncode == 1
+    assert "cannot be taken up: no route leads to 10.77.0.1 from here: Network is unreachable. Without them:" in ran.stderr
+    pid, _ = restored(machines_4, "one", file, "--connections", "carry")
+    expect_unbroken(machines_4, pid, called)
+
+
+def test_a_restore_that_is_to_take_up_all_is_refused_where_the_capture_left_one(machines_4: Machines) -> None:
+    caller, called = conversation(machines_4)
+    file = captured(machines_4, caller.pid)
+    caller.wait()
+    ran = machines_4.failover("one", "restore", str(file), "--connections", "carry")
+    assert ran.returncode == 1
+    assert "the TCP connection fd 3 with 10.77.0.1 port 7000 cannot be taken up: its capture did not take it along" in ran.stderr
+    called.kill()
+    called.wait()
+
+
+@pytest.mark.parametrize("version", [4, 6])
+@pytest.mark.parametrize("part", ["caller", "called"])
+def test_either_end_of_a_connection_within_one_machine_goes_along(version: int, part: str, tmp_path: Path) -> None:
+    """Over the loopback: the peer is another program of the same machine."""
+    with laid_alone(Machines(tmp_path, version)) as machine:
+        host = LOOPBACK[version]
+        talkers = {"called": machine.start("one", "called", between=(host, host))}
+        until(lambda: machine.said("called") == ["listens"], "the peer to listen")
+        talkers["caller"] = machine.start("one", "caller", between=(host, host))
+        until(lambda: all(machine.said(one)[-1:] == ["ready"] for one in talkers), "both ends to be full")
+        file = captured(machine, talkers[part].pid, "--connections", "carry")
+        talkers.pop(part).wait()
+        (other,) = talkers.values()
+        pid, notes = restored(machine, "one", file, "--connections", "carry")
+        assert "TCP" not in notes, notes
+        expect_unbroken(machine, pid, other)
 
 
 def test_a_program_that_was_to_be_ended_and_was_not_goes_on_talking(machines_4: Machines) -> None:
@@ -270,9 +363,10 @@ def test_one_that_fell_silent_with_its_keeper_is_heard_again_by_the_next(machine
     script = HOLD.format(pid=caller.pid)
     keeper = subprocess.run([*machines_4.inside("one"), sys.executable, "-c", script], check=False, cwd=ROOT)
     assert keeper.returncode == -signal.SIGKILL
-    captured(machines_4, caller.pid, "--connections", "carry", "--leave-running")
-    expect_unbroken(machines_4, caller.pid, called)
+    file = captured(machines_4, caller.pid, "--connections", "carry")
     caller.wait()
+    pid, _ = restored(machines_4, "one", file)
+    expect_unbroken(machines_4, pid, called)
 
 
 def test_where_no_way_leads_to_the_peer_it_is_reset_and_that_is_said(machines_4: Machines) -> None:
@@ -308,11 +402,11 @@ def test_one_that_is_reset_where_it_was_silent_is_reset_at_its_peer_too(machines
     assert machines_4.said("called")[-1] in ("Connection reset by peer (104)", "Broken pipe (32)")
 
 
-def test_one_that_is_on_its_way_in_a_message_is_reset_and_that_is_said(machines_4: Machines) -> None:
+def test_one_that_is_on_its_way_in_a_message_is_not_taken_along(machines_4: Machines) -> None:
     caller, called = conversation(machines_4, "", "posts")
-    file = captured(machines_4, caller.pid, "--connections", "carry")
+    assert "(it was on its way in a unix socket; once received, it is taken along)" in refused_capture(machines_4, caller.pid)
+    file = captured(machines_4, caller.pid)
     caller.wait()
-    pid, notes = restored(machines_4, "one", file)
-    assert "is reset (it was on its way in a unix socket; once received, it is taken along)" in notes, notes
+    pid, _ = restored(machines_4, "one", file)
     finish(machines_4, pid, called)
     assert machines_4.said("caller")[-1] == "Connection reset by peer (104)"

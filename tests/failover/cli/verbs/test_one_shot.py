@@ -210,11 +210,39 @@ def test_what_fails_is_asked_again_a_few_times(error: CheckpointError, tries: in
             raise error
         return "captured"
 
-    assert one_shot._at_last(lambda: ask(tries)) == "captured"
+    assert one_shot._at_last(4711, lambda: ask(tries)) == "captured"
     asked.clear()
     with pytest.raises(type(error)):
-        one_shot._at_last(lambda: ask(tries + 1))
+        one_shot._at_last(4711, lambda: ask(tries + 1))
     assert len(asked) == tries
+
+
+def test_a_refusal_is_believed_when_it_comes_again_in_the_same_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a program that forks constantly each refusal is of another child."""
+    monkeypatch.setattr(one_shot, "CAPTURE_PAUSE_S", 0.0)
+    asked = []
+
+    def ask() -> str:
+        asked.append(1)
+        if len(asked) < one_shot.CAPTURE_TRIES:
+            raise UnsupportedError("cannot capture", (f"its process {len(asked)} shares its memory",))
+        return "captured"
+
+    assert one_shot._at_last(4711, ask) == "captured"
+
+
+def test_a_capture_that_never_works_says_what_was_tried_and_what_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_shot, "CAPTURE_PAUSE_S", 0.0)
+
+    def ask() -> None:
+        raise CaptureError("process 12 takes long to end; capture it again")
+
+    with pytest.raises(CaptureError) as told:
+        one_shot._at_last(4711, ask)
+    said = str(told.value)
+    assert said.startswith("cannot capture pid 4711, which runs on: process 12 takes long to end. failover tried 12 times in ")
+    assert "capture it again" not in said
+    assert "kill -STOP 4711" in said
 
 
 def test_a_program_that_has_gone_is_not_asked_for_again() -> None:
@@ -225,8 +253,60 @@ def test_a_program_that_has_gone_is_not_asked_for_again() -> None:
         raise ProcessGoneError("it ended")
 
     with pytest.raises(ProcessGoneError):
-        one_shot._at_last(ask)
+        one_shot._at_last(4711, ask)
     assert len(asked) == 1
+
+
+IMPATIENT = """
+import sys
+from checkpoint.engines.ptrace.capture import session
+session.MOVED_S = -1.0
+from failover.__main__ import main
+sys.exit(main())
+"""
+"""The command, whose keeper gives up after one try, as after a try that takes two seconds on a busy machine."""
+FORKS = {
+    "a shell": ["sh", "-c", "n=0; while :; do n=$((n + 1)); /bin/true; echo $n; done"],
+    "forks": [
+        PYTHON,
+        "-c",
+        "import os\nn = 0\nwhile True:\n    if not os.fork(): os._exit(0)\n    os.wait(); n += 1; print(n, flush=True)",
+    ],
+    "starts programs": [
+        PYTHON,
+        "-c",
+        "import subprocess\nn = 0\nwhile True:\n    subprocess.run(['sleep', '0.02']); n += 1; print(n, flush=True)",
+    ],
+}
+
+
+@pytest.mark.parametrize("argv", FORKS.values(), ids=FORKS)
+def test_a_program_that_forks_all_the_time_is_captured_by_one_command(argv: list[str], tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    with output.open("ab") as file:
+        process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True)
+    pid = process.pid
+    try:
+        for _ in range(2):
+            seen = lines(output)
+            wait_for("it to count", lambda seen=seen: lines(output) > seen + 3)  # type: ignore[misc]
+            command = [sys.executable, "-c", IMPATIENT, "capture", str(pid), "-o", str(tmp_path / "snapshot"), "--force"]
+            captured = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+            assert captured.returncode == 0, captured.stderr
+            process.wait()
+            wait_for("it to be gone", lambda pid=pid: has_ended(pid))  # type: ignore[misc]
+            restored = failover("restore", str(tmp_path / "snapshot"))
+            assert restored.returncode == 0, restored.stderr
+            pid = int(restored.stdout)
+        seen = lines(output)
+        wait_for("it to count on", lambda: lines(output) > seen + 3)
+    finally:
+        for one in (*everybody_below(pid), pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(one, signal.SIGKILL)
+        process.wait()
+    counted = [int(line) for line in output.read_text().split()]
+    assert counted == list(range(1, len(counted) + 1))
 
 
 def test_who_was_captured_is_dead_when_the_command_returns(tmp_path: Path) -> None:

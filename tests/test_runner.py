@@ -1,0 +1,95 @@
+"""A test that hangs, kills its worker or is reported slowly fails alone, and the run ends as usual (`tests.runner`)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+CONFTEST = """
+import time
+import pytest
+
+pytest_plugins = ["tests.runner"]
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    report = yield
+    if "told_slowly" in item.name and call.when == "call":
+        time.sleep(4)
+    if "internal" in item.name and call.when == "call":
+        raise RuntimeError("a hook is wrong")
+    return report
+"""
+
+KILLS = """
+import os, signal
+
+def test_before(): pass
+def test_kills_its_worker(): os.kill(os.getpid(), signal.SIGKILL)
+def test_after(): pass
+"""
+
+FILES = {
+    "test_kills.py": KILLS,
+    "test_kills_too.py": KILLS,
+    "test_hangs.py": """
+import signal, time
+import pytest
+
+@pytest.mark.timeout(2)
+def test_hangs(): time.sleep(1000)
+
+@pytest.mark.timeout(2)
+def test_hangs_for_good():
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+    time.sleep(1000)
+
+def test_after(): pass
+""",
+    "test_reports.py": """
+import pytest
+
+@pytest.mark.timeout(2)
+def test_is_told_slowly(): pass
+
+def test_internal(): pass
+def test_after(): pass
+""",
+    "test_well.py": "def test_is_well(): pass",
+}
+FAILED = [
+    "test_hangs.py::test_hangs",
+    "test_hangs.py::test_hangs_for_good",
+    "test_kills.py::test_kills_its_worker",
+    "test_kills_too.py::test_kills_its_worker",
+    "test_reports.py::test_internal",
+]
+PASSED = 8
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_run_ends_as_usual_whatever_its_tests_do(tmp_path: Path) -> None:
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    (tmp_path / "conftest.py").write_text(CONFTEST)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "2", "-q", "-rf"]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    ran = subprocess.run(
+        command, cwd=tmp_path, env=environment | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    said = ran.stdout + ran.stderr
+    assert ran.returncode == pytest.ExitCode.TESTS_FAILED, said
+    assert "INTERNALERROR" not in said
+    failed = sorted(line.split()[1] for line in ran.stdout.splitlines() if line.startswith("FAILED "))
+    assert failed == FAILED, said
+    assert f"{len(FAILED)} failed, {PASSED} passed" in ran.stdout, said
+    assert "in test_hangs_for_good" in said, "the stacks of a test that nothing but its worker's end could end"
+    assert "a hook is wrong" in said
