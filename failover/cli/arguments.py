@@ -338,9 +338,10 @@ CREATE_STORY: Final = """
     """
 
 ENROL_STORY: Final = """
-    Add a robot to the team file and make its key pair. The team file then goes to every robot, the secret key (keys/ROBOT.secret)
-    to that robot alone; remove it here afterwards. Or make the pair on the robot (failover-agent keypair), so that the secret
-    never travels, and enrol its public half. Agents read the team file when they start.
+    Add a robot to the team file and make its key pair. The team file then goes to every robot. The secret key (keys/ROBOT.secret)
+    belongs to that robot alone: enrolled on another machine, copy it to the robot and remove it here. Or make the pair on the
+    robot (failover-agent keypair), so that the secret never travels, and enrol its public half. Agents read the team file when
+    they start.
 
       failover team enrol robot1 192.168.7.11
       failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -159,6 +160,30 @@ def test_keys_are_asked_for_unless_the_operator_says_insecure(directory: Path) -
     team.write_secret_key(directory / "team", "robot1", "x" * 40)
     with pytest.raises(ConfigError, match=r"robot1, robot2 .* have no public key"):
         configuration.load(path)
+
+
+@pytest.mark.parametrize(
+    ("secret", "said"),
+    [
+        (new_keys()[1], "does not belong to the public key of robot1 in "),
+        ("#" * 40, "is not a CURVE key"),
+    ],
+    ids=["another robot's", "no key"],
+)
+def test_a_secret_key_that_does_not_fit_the_team_fails_the_check(
+    directory: Path, secret: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (public, right), (other, _) = new_keys(), new_keys()
+    members = {"robot1": replace(ROBOT, public_key=public), "robot2": replace(ROBOT, public_key=other)}
+    team.write(directory / "team", Team("lab", members))
+    path = directory / "agent.toml"
+    path.write_text(f'robot = "robot1"\nteam_directory = "{directory / "team"}"\n')
+    key = team.write_secret_key(directory / "team", "robot1", secret)
+    assert agent_main(["check", "--config", str(path)]) == 1
+    refusal = capsys.readouterr().err
+    assert refusal.startswith(f"failover-agent: {key}") and said in refusal
+    key.write_text(right + "\n")
+    assert agent_main(["check", "--config", str(path)]) == 0
 
 
 def test_a_secret_key_that_others_can_read_is_refused(directory: Path) -> None:

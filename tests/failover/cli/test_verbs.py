@@ -403,6 +403,35 @@ def test_servers_and_witnesses_are_enrolled_and_stay_what_they_are(tmp_path: Pat
     assert {name: one["role"] for name, one in shown.items()} == {"hall": "server", "gate": "witness"}
 
 
+def enrolled(place: Path, name: str, address: str) -> str:
+    """What is said to somebody who enrols a robot, with a key that is made here."""
+    ran = failover("team", "enrol", name, address, "--directory", str(place))
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_a_robot_that_is_enrolled_on_itself_is_told_to_keep_its_key(tmp_path: Path) -> None:
+    place = tmp_path / "team"
+    failover("team", "create", "lab", "--directory", str(place))
+    (tmp_path / "agent.toml").write_text('robot = "r1"\n')
+    by_name, by_address = enrolled(place, "r1", "192.0.2.11"), enrolled(place, "r2", "127.0.0.1:7420")
+    for said, key in ((by_name, "r1.secret"), (by_address, "r2.secret")):
+        assert "its secret key stays here" in said and str(place / "keys" / key) in said and "remove" not in said
+    for name, address in (("r3", "192.0.2.13"), ("r4", "robot4.example")):
+        said = enrolled(place, name, address)
+        assert f"if this machine is not {name}, copy {place / 'keys' / name}.secret to {name} alone, then remove it here" in said
+
+
+def test_nothing_advises_to_delete_a_key_that_is_there(tmp_path: Path) -> None:
+    place = ["--directory", str(tmp_path)]
+    failover("team", "create", "lab", *place)
+    enrolled(tmp_path, "r1", "127.0.0.1")
+    (tmp_path / "team.toml").unlink()
+    failover("team", "create", "lab", *place)
+    ran = failover("team", "enrol", "r1", "127.0.0.1", *place)
+    assert ran.returncode == 1 and "r1.secret exists" in ran.stderr and "emove it" not in ran.stderr
+
+
 def test_without_a_team_file_the_way_to_one_is_named(tmp_path: Path) -> None:
     ran = failover("team", "show", "--directory", str(tmp_path))
     assert ran.returncode == 1
