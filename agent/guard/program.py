@@ -35,7 +35,7 @@ from agent.guard.task_socket import TaskEnd, name_told_to
 from agent.system.clock import now_ns
 from agent.system.syscalls import queue_signal
 from checkpoint.engine import PTRACE
-from checkpoint.errors import ProbeError
+from checkpoint.errors import ProbeError, in_words
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.file_overlay import BroughtFile
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_program, spawn_vessel
@@ -335,7 +335,7 @@ class Ward(Struct):
                 )
             queue_signal(self.born.pid, number, value)
         except (OSError, ProbeError) as error:
-            raise WardError(f"the guard cannot send it {signal.Signals(number).name}: {error}") from error
+            raise WardError(f"the guard cannot send it {signal.Signals(number).name}: {in_words(error)}") from error
 
     def abandon(self) -> None:
         """Agent or keeper are gone before it was the component: nothing of it stays."""

@@ -19,7 +19,7 @@ import msgspec
 
 from checkpoint.capability import Capability
 from checkpoint.engine import NO_TERMS, PTRACE, Report, Terms
-from checkpoint.errors import UNDECODABLE, CheckpointError
+from checkpoint.errors import UNDECODABLE, CheckpointError, in_words
 from checkpoint.model import Position
 from checkpoint.snapshot.credentials import Owner
 from checkpoint.store.digest_cache import KnownDigest
@@ -116,7 +116,9 @@ class Channel(Generic[M]):
             return self._decoder.decode(packet[1:]), descriptors
         except (*UNDECODABLE, OSError) as error:
             close_all(descriptors)
-            raise ChannelError(f"the other end of the local socket sent something that is no message: {error}") from error
+            raise ChannelError(
+                f"the other end of the local socket sent something that is no message: {in_words(error)}"
+            ) from error
 
     def _receive_packet(self) -> tuple[bytes, tuple[int, ...]]:
         room = socket.CMSG_SPACE((DESCRIPTOR_LIMIT + 1) * array.array("i").itemsize)

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import CheckpointError, in_words
 from checkpoint.runtime import early_interrupt
 from failover.cli import keeper_prestart
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
@@ -80,9 +80,9 @@ def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:
     if getattr(arguments, "json", False):
         import json
 
-        print(json.dumps({"error": kind, "message": str(error), "reasons": list(reasons)}))
+        print(json.dumps({"error": kind, "message": in_words(error), "reasons": list(reasons)}))
     else:
-        sentence = str(error)
+        sentence = in_words(error)
         if len(reasons) > 1:  # they follow, one a line
             sentence = sentence.removesuffix("; ".join(reasons)).rstrip(": ")
         print(f"failover: {sentence}", file=sys.stderr)

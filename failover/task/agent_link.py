@@ -21,7 +21,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from checkpoint.errors import TaskPacketError
+from checkpoint.errors import TaskPacketError, in_words
 from checkpoint.keeper.messages import close_all
 from checkpoint.segment.layout import PENDING, Committed, Outputs
 from checkpoint.segment.reader import SegmentReader
@@ -189,7 +189,7 @@ class Guarded:
         except BlockingIOError:  # a signal handler has taken it
             return
         except (TaskError, OSError) as error:
-            raise NotCommittedError(str(error)) from error
+            raise NotCommittedError(in_words(error)) from error
         close_all(descriptors)
         if isinstance(message, Safe):
             self.durable = max(self.durable, message.commit)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from checkpoint.engine import CaptureOrder
 from checkpoint.engines.cooperative.session import CooperativeSession
-from checkpoint.errors import CheckpointError, SegmentBusyError, StoreError
+from checkpoint.errors import CheckpointError, SegmentBusyError, StoreError, in_words
 from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
@@ -249,7 +249,7 @@ class Recorder:
         return True
 
     def _failed(self, error: Exception) -> bool:
-        if str(error) != self.trouble:
-            log.warning("a commit was not written; the program continues: %s", error)
-        self.trouble = str(error)
+        if (trouble := in_words(error)) != self.trouble:
+            log.warning("a commit was not written; the program continues: %s", trouble)
+        self.trouble = trouble
         return False

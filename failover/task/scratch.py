@@ -8,6 +8,7 @@ import os
 import weakref
 from typing import Final
 
+from checkpoint.errors import in_words
 from checkpoint.program.scratch_name import NAME
 from failover.errors import RequestError
 
@@ -41,7 +42,7 @@ def scratch(size: int) -> memoryview:
     try:
         address = _mapped(whole)
     except (OSError, OverflowError, ctypes.ArgumentError) as error:
-        raise RequestError(f"cannot give {size} bytes of scratch memory: {error}") from error
+        raise RequestError(f"cannot give {size} bytes of scratch memory: {in_words(error)}") from error
     held = (ctypes.c_ubyte * whole).from_address(address)
     weakref.finalize(held, _libc.munmap, address, whole).atexit = False  # threads and exit handlers may use it to the end
     return memoryview(held).cast("B")[:size]

@@ -16,7 +16,7 @@ from agent.guard.output_logs import STREAMS, logs_of
 from agent.worker.components.paths import Places, complete_logs, log_directory
 from agent.worker.replication.transfer import Refusal
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
+from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError, in_words
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.snapshot import carried_files, format, untrusted
@@ -124,7 +124,7 @@ class Deposit:
             except (CheckpointError, OSError) as error:
                 log.warning("a snapshot of %s from %s was not kept: %s", offer.component, peer, error)
                 needs_base = isinstance(error, ChainError)
-                self._tell(StoreFailed(offer.component, offer.epoch, peer, str(error), needs_base))
+                self._tell(StoreFailed(offer.component, offer.epoch, peer, in_words(error), needs_base))
                 return
             except untrusted.NOT_UNDERSTOOD as error:  # the sender is known, and still its word is its own
                 why = untrusted.sentence(f"keep a snapshot of {offer.component} from {peer}", error)

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from checkpoint.arch import number_of
-from checkpoint.errors import CheckpointError
+from checkpoint.errors import CheckpointError, in_words
 from checkpoint.linux import abi, batch_syscalls
 from checkpoint.linux.memory.pagemap import PageScanner
 from checkpoint.linux.memory.tracker import NONE
@@ -95,7 +95,7 @@ class LiveMemory:
         try:
             written = self._scanner.written(self._ranges)
         except CheckpointError as error:
-            self._give_up(str(error))
+            self._give_up(in_words(error))
             return
         if not len(written):
             return
@@ -156,7 +156,7 @@ class LiveMemory:
             scanner = PageScanner(os.getpid(), batch_syscalls.one_by_one)
             scanner.is_protected(0, abi.PAGE_SIZE)
         except (OSError, CheckpointError) as error:
-            self._give_up(str(error))
+            self._give_up(in_words(error))
             return
         self._scanner = scanner
 

@@ -24,7 +24,7 @@ from typing import Final
 from msgspec import Struct
 
 from checkpoint.capability import Area, preserved, refused
-from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
+from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, in_words
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptor import Descriptor
@@ -120,7 +120,7 @@ class ThreadTables:
             except ProcessGoneError:
                 continue
             except (ProbeError, OSError) as error:
-                raise CaptureError(f"cannot look at what thread {tid} of pid {self._pid} has open: {error}") from error
+                raise CaptureError(f"cannot look at what thread {tid} of pid {self._pid} has open: {in_words(error)}") from error
             self._told[tid] = _Told(fact, tuple(reasons))
 
     def describe(self) -> tuple[Resource, ...]:

@@ -26,7 +26,7 @@ from msgspec import Struct, field
 from msgspec.structs import asdict, replace
 
 from checkpoint.capability import Area, by_rule
-from checkpoint.errors import CheckpointError, RestoreError
+from checkpoint.errors import CheckpointError, RestoreError, in_words
 from checkpoint.linux.net import packet_drop, tcp_repair, time_wait
 from checkpoint.linux.net.packet_drop import Connection
 from checkpoint.linux.net.tcp_repair import CannotCarryError, InUseError, Kept
@@ -217,7 +217,7 @@ class Arriving:
                 tcp_repair.connect(made, one.kept, *_ends(one.resource))
                 tcp_repair.fill(made, one.kept)
             except (CannotCarryError, OSError) as error:
-                raise RestoreError(f"cannot take up the TCP connection {one.resource.name}: {error}") from error
+                raise RestoreError(f"cannot take up the TCP connection {one.resource.name}: {in_words(error)}") from error
 
     def let_go(self) -> None:
         """They go on, a moment before their program does.
