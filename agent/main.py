@@ -131,7 +131,9 @@ def command_line() -> argparse.ArgumentParser:
     """What can be typed."""
     import argparse
 
-    parser = argparse.ArgumentParser(
+    from failover.cli.arguments import Parser
+
+    parser = Parser(
         prog="failover-agent",
         description=DESCRIPTION.strip(),
         epilog=EPILOG.strip(),

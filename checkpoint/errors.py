@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from typing import Final
 
 UNDECODABLE: Final = (ValueError, RecursionError)
 """What msgspec raises for bytes that are no message: its own errors and those of text that is not UTF-8 are `ValueError`s."""
-
-
-def in_words(error: BaseException) -> str:
-    """An error as people read it: what the kernel says without its number, and a file's name as text, also where it was bytes."""
-    if not isinstance(error, OSError) or not error.strerror:
-        return str(error)
-    named = [
-        name if isinstance(name, int) else os.fsdecode(name) for name in (error.filename, error.filename2) if name is not None
-    ]
-    return error.strerror + (f" ({', '.join(map(str, named))})" if named else "")
 
 
 class CheckpointError(Exception):

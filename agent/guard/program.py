@@ -35,11 +35,12 @@ from agent.guard.task_socket import TaskEnd, name_told_to
 from agent.system.clock import now_ns
 from agent.system.syscalls import queue_signal
 from checkpoint.engine import PTRACE
-from checkpoint.errors import ProbeError, in_words
+from checkpoint.errors import ProbeError
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.file_overlay import BroughtFile
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_program, spawn_vessel
 from checkpoint.segment.task_messages import VARIABLE
+from checkpoint.sentences import in_words
 
 DRAIN_S: Final = 2.0
 """How long the end of a program waits for its last output to be written; a full disk must not hide the end."""

@@ -59,9 +59,10 @@ from agent.guard.program import Ward, WardError
 from agent.guard.task_socket import TaskEnd
 from agent.system import syscalls
 from agent.system.clock import now_ns
-from checkpoint.errors import CheckpointError, in_words
+from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelError, close_all
 from checkpoint.linux.unix_address import address_of
+from checkpoint.sentences import in_words
 
 FIRST_CALL_S: Final = 30.0
 SEND_TIMEOUT_S: Final = 1.0

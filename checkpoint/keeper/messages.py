@@ -19,8 +19,9 @@ import msgspec
 
 from checkpoint.capability import Capability
 from checkpoint.engine import NO_TERMS, PTRACE, Report, Terms
-from checkpoint.errors import UNDECODABLE, CheckpointError, in_words
+from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
+from checkpoint.sentences import in_words
 from checkpoint.snapshot.credentials import Owner
 from checkpoint.store.digest_cache import KnownDigest
 

@@ -12,7 +12,8 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from checkpoint.errors import CheckpointError, FormatError, in_words
+from checkpoint.errors import CheckpointError, FormatError
+from checkpoint.sentences import in_words
 
 NOT_UNDERSTOOD: Final = (
     ArithmeticError,

@@ -10,8 +10,9 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from checkpoint.errors import CheckpointError, in_words
+from checkpoint.errors import CheckpointError
 from checkpoint.runtime import early_interrupt
+from checkpoint.sentences import in_words
 from failover.cli import keeper_prestart
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
 

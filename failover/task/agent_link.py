@@ -21,7 +21,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from checkpoint.errors import TaskPacketError, in_words
+from checkpoint.errors import TaskPacketError
 from checkpoint.keeper.messages import close_all
 from checkpoint.segment.layout import PENDING, Committed, Outputs
 from checkpoint.segment.reader import SegmentReader
@@ -38,6 +38,7 @@ from checkpoint.segment.task_messages import (
     encode,
     from_guard,
 )
+from checkpoint.sentences import in_words
 from failover.errors import NotCommittedError, TaskError
 from failover.task.output import OwnOutput
 

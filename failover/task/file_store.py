@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Final
 
 from checkpoint.engine import CaptureOrder
 from checkpoint.engines.cooperative.session import CooperativeSession
-from checkpoint.errors import CheckpointError, SegmentBusyError, StoreError, in_words
+from checkpoint.errors import CheckpointError, SegmentBusyError, StoreError
 from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
+from checkpoint.sentences import in_words
 from checkpoint.snapshot import format
 from checkpoint.store.disk import Disk
 from checkpoint.store.store import open_store

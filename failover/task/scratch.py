@@ -8,8 +8,8 @@ import os
 import weakref
 from typing import Final
 
-from checkpoint.errors import in_words
 from checkpoint.program.scratch_name import NAME
+from checkpoint.sentences import in_words
 from failover.errors import RequestError
 
 MAP_FAILED: Final = ctypes.c_void_p(-1).value

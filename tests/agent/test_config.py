@@ -92,14 +92,29 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
     ("lines", "line", "said"),
     [
         (("baet_ms = 10",), 4, "did you mean 'beat_ms'"),
-        (('[components."/lab/a".devices]', '"/dev/x" = "open"'), 4, "Invalid enum value 'open'"),
+        (
+            ('[components."/lab/a".devices]', '"/dev/x" = "open"'),
+            5,
+            "'open' is none of reopen, hook, optional; did you mean 'reopen'?",
+        ),
+        (
+            ('[components."/lab/a"]', 'devices."/dev/x" = "hok"'),
+            5,
+            "'hok' is none of reopen, hook, optional; did you mean 'hook'?",
+        ),
+        (('[components."/lab/a"]', 'devices = { "/dev/x" = "hok" }'), 5, '"/lab/a".devices."/dev/x": \'hok\' is none of'),
+        (('[components."/lab/a"]', 'hooks.after_resume = "x"'), 5, '"/lab/a".hooks.after_resume: Expected `array`'),
         (('[components."/lab/a".devices]', '"ttyUSB0" = "reopen"'), 4, "'ttyUSB0' is not the absolute path of a device"),
-        (('[components."/lab/a"]', 'devices."/dev/x" = { reopen = "/dev/y", optoinal = true }'), 4, "did you mean 'optional'"),
+        (('[components."/lab/a"]', 'devices."/dev/x" = { reopen = "/dev/y", optoinal = true }'), 5, "did you mean 'optional'"),
         (('[components."/lab/a".hooks]', "limit_s = 0"), 4, "limit_s of its hooks is 0"),
         (('[components."/lab/a".hooks]', 'after_resmue = ["x"]'), 5, "did you mean 'after_resume'"),
         (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
-        (('when_alone = "panic"',), 4, "Invalid enum value 'panic'"),
-        (('rule = "dice"',), 4, "Invalid enum value 'dice'"),
+        (('when_alone = "panic"',), 4, "when_alone: 'panic' is none of run, freeze"),
+        (('rule = "majorty"',), 4, "rule: 'majorty' is none of auto, pair, majority; did you mean 'majority'?"),
+        (("# fine", "snapshots_over = 3"), 5, "snapshots_over: 3 is none of wired, any"),
+        (('log_level = "warn"',), 4, "'warn' is none of debug, info, warning, error; did you mean 'warning'?"),
+        (('portable = "x86-64-v9"',), 4, "; did you mean 'x86-64-v"),
+        (('rule = "dice"',), 4, "rule: 'dice' is none of auto, pair, majority"),
         (("keep_chains = 2",), 4, "unknown key 'keep_chains'"),
         (("# fine", "beat_ms = 0"), 5, "must be at least 1"),
         (("beat_ms = 100_000",), 4, "at most 10000"),
@@ -115,7 +130,11 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (('[components."/lab/a"]', 'prefer = "robot7"'), 4, "the team knows robot1, robot2"),
         (("patience_s = 0",), 4, "must be at least 1"),
         (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
-        (('[components."/lab/a"]', 'on_loss = "give up"'), 5, "Invalid enum value 'give up'"),
+        (
+            ('[components."/lab/a"]', 'on_loss = "give up"'),
+            5,
+            "components.\"/lab/a\".on_loss: 'give up' is none of takeover, hold",
+        ),
         (('[components."/lab/a"]', 'command = "/opt/a"'), 5, "Expected `array`"),
         (('[components."/lab/a"]', 'command = [""]'), 4, "the first one names the program"),
         (('[components."/lab/a"]', 'command = ["/opt/a", "b\\u0000c"]'), 4, "a zero byte"),
@@ -143,6 +162,15 @@ def test_a_mistake_is_named_with_file_line_and_cure(directory: Path, lines: tupl
 def test_values_that_contradict_each_other_are_refused(directory: Path, lines: tuple[str, ...], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         configuration.load(written(directory, *lines))
+
+
+def test_a_role_that_there_is_not_is_refused_with_those_there_are(directory: Path) -> None:
+    path = directory / "team" / "team.toml"
+    path.write_text(path.read_text().replace('role = "robot"', 'role = "sever"', 1))
+    with pytest.raises(ConfigError) as caught:
+        configuration.load(written(directory))
+    said = f"{path}:5: robots.robot1.role: 'sever' is none of robot, server, witness; did you mean 'server'?"
+    assert str(caught.value) == said
 
 
 def test_a_robot_outside_the_team_is_told_who_is_in_it(directory: Path) -> None:

@@ -36,8 +36,8 @@ from msgspec import Struct
 
 from agent.hook_kinds import Kind
 from agent.system.systemd_units import in_a_unit
-from checkpoint.errors import in_words
 from checkpoint.linux.spawn.inherited_limits import Inheritance
+from checkpoint.sentences import in_words
 
 STARTED: Final = "started"
 CAPTURED: Final = "captured"

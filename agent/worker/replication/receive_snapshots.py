@@ -16,9 +16,10 @@ from agent.guard.output_logs import STREAMS, logs_of
 from agent.worker.components.paths import Places, complete_logs, log_directory
 from agent.worker.replication.transfer import Refusal
 from checkpoint.engine import COOPERATIVE
-from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError, in_words
+from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import OutputPiece, Position, Snapshot
+from checkpoint.sentences import in_words
 from checkpoint.snapshot import carried_files, format, untrusted
 from checkpoint.store.store import Store
 from failover.core.acts import Accept, Admit, Discard, Show

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from checkpoint.arch import number_of
-from checkpoint.errors import CheckpointError, in_words
+from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi, batch_syscalls
 from checkpoint.linux.memory.pagemap import PageScanner
 from checkpoint.linux.memory.tracker import NONE
@@ -24,6 +24,7 @@ from checkpoint.linux.memory.write_protect import enable_write_protection
 from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Words
 from checkpoint.runtime.lazy_numpy import NDArray
+from checkpoint.sentences import in_words
 
 SEGMENT_PAGE: Final = 4096
 """Only kernels with pages of this size tell in the segment's pages."""

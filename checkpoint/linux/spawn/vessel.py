@@ -38,7 +38,7 @@ from typing import Final, NoReturn
 from msgspec import Struct
 
 from checkpoint.arch import stubs
-from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError, in_words
+from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError
 from checkpoint.linux.child_reaper import bury
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.tasks import thread_ids
@@ -46,6 +46,7 @@ from checkpoint.linux.spawn import namespaces, not_executed
 from checkpoint.linux.spawn.file_overlay import BroughtFile, User, show
 from checkpoint.linux.spawn.inherited_limits import Inheritance, take_on
 from checkpoint.model import Clocks
+from checkpoint.sentences import in_words
 
 _MFD_CLOEXEC_EXEC: Final = 0x1 | 0x10
 _MFD_CLOEXEC: Final = 0x1

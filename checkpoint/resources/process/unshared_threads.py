@@ -24,7 +24,7 @@ from typing import Final
 from msgspec import Struct
 
 from checkpoint.capability import Area, preserved, refused
-from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, in_words
+from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptor import Descriptor
@@ -33,6 +33,7 @@ from checkpoint.linux.procfs.tasks import thread_count, thread_ids
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.restore_context import number_of
+from checkpoint.sentences import in_words
 
 KIND: Final = "thread_tables"
 

@@ -26,7 +26,7 @@ from msgspec import Struct, field
 from msgspec.structs import asdict, replace
 
 from checkpoint.capability import Area, by_rule
-from checkpoint.errors import CheckpointError, RestoreError, in_words
+from checkpoint.errors import CheckpointError, RestoreError
 from checkpoint.linux.net import packet_drop, tcp_repair, time_wait
 from checkpoint.linux.net.packet_drop import Connection
 from checkpoint.linux.net.tcp_repair import CannotCarryError, InUseError, Kept
@@ -37,6 +37,7 @@ from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import inet_addresses, tcp
 from checkpoint.resources.sockets.tcp import KIND, LEFT, TAKEN
+from checkpoint.sentences import in_words
 
 CAPABILITIES: Final = (
     by_rule(

@@ -333,6 +333,30 @@ def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> Non
     assert failover(*words).returncode == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("stauts", "did you mean 'status'?"),
+        ("run --engine ptrce -- x", "'ptrce' is none of auto, ptrace, cooperative; did you mean 'ptrace'?"),
+        ("run --output=comitted -- x", "'comitted' is none of immediate, committed; did you mean 'committed'?"),
+        ("run --portable=x86-64-v9 -- x", "is none of no, x86-64-v1"),
+        (
+            "run --device /dev/x=repen -- x",
+            "'repen'; say reopen, hook, optional, or the path of a device; did you mean 'reopen'?",
+        ),
+        ("protect 1 --connections cary", "'cary' is none of reset, carry; did you mean 'carry'?"),
+        ("stop x --signal TREM", "did you mean 'TERM'?"),
+        ("team shwo", "'shwo' is none of create, enrol, show; did you mean 'show'?"),
+        ("team enrol x 192.0.2.1 --role servr", "'servr' is none of robot, server, witness; did you mean 'server'?"),
+        ("completion zhs", "'zhs' is none of bash, zsh, tcsh; did you mean 'zsh'?"),
+        ("logs x --stream 3", "3 is none of 1, 2"),
+    ],
+)
+def test_a_word_that_is_none_of_its_choices_is_answered_with_all_of_them(words: str, said: str) -> None:
+    ran = failover(*words.split())
+    assert (ran.returncode, said in ran.stderr) == (2, True), ran.stderr
+
+
 @pytest.mark.parametrize("verb", [verb.name for verb in parser.VERBS])
 def test_every_verb_explains_itself(verb: str) -> None:
     ran = failover(verb, "--help")

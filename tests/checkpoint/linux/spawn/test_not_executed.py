@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.errors import in_words
 from checkpoint.linux.spawn import vessel
 from checkpoint.linux.spawn.vessel import Birth
+from checkpoint.sentences import in_words
 
 
 @pytest.fixture
