@@ -212,6 +212,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         names: see `checkpoint.engine.ProtectOrder`, which is told them if ``robot`` is one: its agent keeps files by content.
+        verb: what the user asked for, as a refusal says it.
     """
 
     pid: int
@@ -221,6 +222,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     engine: str = PTRACE
     terms: Terms = NO_TERMS
     names: dict[str, str] = {}
+    verb: str = "protect"
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):

@@ -105,7 +105,7 @@ def _looking_into() -> list[Offer]:
 def _captured_once(pid: int) -> tuple[str, ...]:
     """What the keeper has to say about a process that it captures once and lets go."""
     with Keeper.spawn() as keeper:
-        protected, _ = keeper.ask(Protect(pid, "/check"), Protected)
+        protected, _ = keeper.ask(Protect(pid, "/check", verb="capture"), Protected)
         captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1), Captured)
         os.close(content)
         keeper.ask(Release(), Released)

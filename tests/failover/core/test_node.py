@@ -323,3 +323,11 @@ def test_a_robot_finds_out_that_others_remember_a_life_that_its_ballot_does_not(
     node = Node(PAIR, 4, Ballot(), 0)
     node.step(Tick(), 0)
     assert node.outlived_by(Beat("robot2", 1, 1, 0, 0, 0, (echo,), ())) == remembered
+
+
+@pytest.mark.parametrize(("launch", "verb"), [(SPEC.launch, "run"), (Launch(pid=41), "protect")], ids=["run", "protect"])
+def test_a_start_is_refused_in_the_words_of_the_order(launch: Launch, verb: str) -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    node.step(Run(1, SPEC), 0)
+    (refusal,) = only(node.step(Run(2, replace(SPEC, launch=launch)), MS), acts.Answer)
+    assert not refusal.ok and refusal.sentence.startswith(f"cannot {verb} {SPEC.name}: ")
