@@ -145,8 +145,10 @@ def test_a_standby_that_falls_silent_leaves_its_primary_unprotected_and_said_so(
     robots.until(lambda: len(robots.output(first, "count")) > before, "the program to run on")
 
 
-def test_a_heart_without_real_time_priority_says_so_from_the_start(tmp_path: Path) -> None:
+def test_an_agent_that_is_to_run_without_real_time_priority_is_nothing_to_worry_about(tmp_path: Path) -> None:
     with robots.two_robots(tmp_path, "realtime = false\n") as (first, _):
         shown = first.status()
         assert not shown["realtime"]
-        assert "beats run at normal priority, as the configuration says" in shown["notes"]
+        assert shown["notes"] == [], "it is as the operator wants it"
+        checked = robots.failover(first, "check").stdout
+        assert "the agent does not ask for it: agent.toml says realtime = false" in " ".join(checked.split())

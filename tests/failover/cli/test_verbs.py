@@ -158,6 +158,25 @@ def test_watching_shows_every_picture_until_interrupted(agent: Start) -> None:
     assert stand_in.asked[0].arguments["watch"] is True
 
 
+CHECKED = {
+    "refused": (
+        {"realtime": False, "notes": ["beats run at normal priority: the system refused SCHED_FIFO (not permitted); give it"]},
+        ("lesser", "the agent says: beats run at normal priority: the system refused SCHED_FIFO"),
+    ),
+    "not asked for": ({"realtime": False}, ("lesser", "agent.toml says realtime = false")),
+    "had": ({}, ("good", "the agent's main loop has it, and its memory is locked")),
+}
+
+
+@pytest.mark.parametrize(("answer", "said"), CHECKED.values(), ids=CHECKED)
+def test_check_says_what_the_agent_was_given_and_not_what_this_shell_may_have(
+    agent: Start, answer: dict[str, Any], said: tuple[str, str]
+) -> None:
+    ran = failover("check", "--json", socket=agent(answering(STATUS | {"components": []} | answer)).path)
+    found = [offer for offer in json.loads(ran.stdout)["offers"] if offer["what"] in ("real-time priority", "locked memory")]
+    assert [offer["verdict"] for offer in found] == [said[0]] and said[1] in found[0]["text"]
+
+
 # --- Run -------------------------------------------------------------------------------------------------------------
 
 
