@@ -384,7 +384,7 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     if isinstance(event, Restored) and event.age_ns >= 0:
         component.lost_ns = event.age_ns if event.lost_ns < 0 else event.lost_ns
         component.resumed_ns = turn.now_ns - component.lost_ns
-        lost = f"; it lost at most {component.lost_ns / NS_PER_S:.1f} s of its work"
+        lost = f"; it lost {component.lost_ns / NS_PER_S:.1f} s of its work"
     component.move(Cause.RUNS)
     component.resumption = Resumption.RESTARTED  # of what comes next, if that is here
     component.due_ns = turn.now_ns

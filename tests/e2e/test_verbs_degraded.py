@@ -79,7 +79,7 @@ def test_a_takeover_from_an_old_checkpoint_says_what_was_lost(pair: Pair, flag: 
     robots.until(lambda: is_old(pair), "the checkpoint to grow old")
     first.cut_power()
     robots.until_taken_over(second)
-    robots.until_status(second, 1, "it resumed at robot2 from its last checkpoint and lost at most ", " s of its work")
+    robots.until_status(second, 1, "it resumed at robot2 from its last checkpoint and lost ", " s of its work")
     told = robots.failover(second, "why", "count").stdout
     assert "s of its work" in told, told
     counted = robots.numbers(second)

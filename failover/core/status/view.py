@@ -166,7 +166,7 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"{' and '.join(ending)} cannot stand by yet: that robot still ends its own copy")
     if component.holding and component.lost_ns >= STALE_NS:
         lost_s = component.lost_ns / NS_PER_S
-        notes.append(f"it resumed at {turn.me} from its last checkpoint and lost at most {lost_s:.1f} s of its work")
+        notes.append(f"it resumed at {turn.me} from its last checkpoint and lost {lost_s:.1f} s of its work")
     if staying := failback.note(component):
         notes.append(staying)
     if component.unstored and component.state is State.STANDBY:
