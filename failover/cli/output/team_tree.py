@@ -272,8 +272,8 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
         notes = [str(line) for line in seen.get("notes") or ()]
         reasons = [str(line) for line in seen.get("reasons") or ()]
         said = notes + lines
-        fresh = [line for line in notes if not _is_said(line, lines)]
-        lines += [f"{robot}: {line}" if robot and robot not in line else line for line in fresh]
+        for line in notes:
+            _add(f"{robot}: {line}" if robot and robot not in line else line, line, lines)
         lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
     seen = sight(component)
     if is_unknown(seen) and component.get("elsewhere") is not None:
@@ -284,10 +284,17 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _is_said(line: str, lines: Sequence[str]) -> bool:
-    """Whether others give its cause already: it stands behind a colon, before what follows from it."""
-    cause = line.partition(": ")[2].partition("; ")[0]
-    return line in lines or (len(cause) >= CAUSE_LENGTH_MIN and any(cause in other for other in lines))
+def _add(told: str, line: str, lines: list[str]) -> None:
+    """Add a line. Where another one gives its cause, which stands behind a colon, that one says what else follows from it."""
+    what, _, rest = line.partition(": ")
+    cause = rest.partition("; ")[0]
+    for index, other in enumerate(lines):
+        if line == other:
+            return
+        if len(cause) >= CAUSE_LENGTH_MIN and cause in other:
+            lines[index] = other if what in other else f"{other} ({what})"
+            return
+    lines.append(told)
 
 
 CAUSE_LENGTH_MIN: Final = 12

@@ -90,7 +90,8 @@ def test_one_cause_is_told_once_with_the_components_that_it_concerns() -> None:
         full = "a snapshot was not stored at robot2: No space left on device"
         component["elsewhere"] = {"robot2": component | {"role": "standby", "notes": [full]}}
     assert team_tree.remarks(status) == (
-        "/lab/a, /lab/b and /lab/c: snapshots do not arrive: No space left on device; the last checkpoint is 0.5–2.5 s old",
+        "/lab/a, /lab/b and /lab/c: snapshots do not arrive: No space left on device; the last checkpoint is 0.5–2.5 s old "
+        "(a snapshot was not stored at robot2)",
         "/lab/a, /lab/b and /lab/c: the guard of it ended",
         "/lab/a, /lab/b and /lab/c: pid 40, 41 and 42 did not run for 1 s",
     )
