@@ -15,6 +15,7 @@ from agent.hook_kinds import KINDS, check_told
 from checkpoint.arch import EVERY_LEVEL
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import contradiction
+from checkpoint.sentences import near
 from checkpoint.snapshot.carried_files import is_carriable
 from failover.config import strict_toml
 from failover.config import team as team_directory
@@ -255,7 +256,8 @@ def _check_quantity(key: str, read: Callable[[str], int], text: str) -> None:
 
 def _check_level(portable: bool | str) -> None:
     if portable not in ("", True, False, *EVERY_LEVEL):
-        raise ValueError(f"portable is {portable!r}; choose true, false or one of {', '.join(EVERY_LEVEL)}")
+        meant = near(str(portable), EVERY_LEVEL)
+        raise ValueError(f"portable is {portable!r}; choose true, false or one of {', '.join(EVERY_LEVEL)}{meant}")
 
 
 @dataclass(frozen=True, slots=True)

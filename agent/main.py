@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from agent import config as configuration
-from agent.errors import AgentError
+from agent.errors import AgentError, ConfigError, LaneError
 from agent.system import syscalls
 from agent.system.log_setup import set_up_log
 from agent.system.sd_notify import notifier
 from checkpoint.runtime import slim_imports
+from failover.config import team as team_directory
 from failover.errors import FailoverError
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
         if command == "mend":
             return _mend(settings, arguments)
         if command == "check":
+            _check_pair(settings)
             peers = ", ".join(settings.peers) or "none"
             print(f"{config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
             return 0
@@ -80,6 +82,30 @@ def _mend(settings: configuration.Settings, arguments: list[str]) -> int:
     return mend(settings, wanted.component, wanted.epoch, agreed=wanted.yes)
 
 
+def _check_pair(settings: configuration.Settings) -> None:
+    """Refuse a secret key by which no other robot would know this one. An agent runs all the same, and says so in its status.
+
+    Raises:
+        ConfigError: it is no key, or does not belong to this robot's public key in the team file.
+    """
+    if settings.config.insecure:
+        return
+    from agent.worker.network.replication_link import public_key_of
+
+    robot, directory = settings.config.robot, Path(settings.config.team_directory)
+    key = team_directory.secret_key_path(directory, robot)
+    try:
+        public = public_key_of(settings.secret_key)
+    except LaneError as error:
+        raise ConfigError(f"{key}: {error}") from error
+    if public != (enrolled := settings.me.public_key):
+        raise ConfigError(
+            f"{key} does not belong to the public key of {robot} in {directory / team_directory.TEAM_FILE}: its public half is "
+            f"{public[:8]}…, the team has {enrolled[:8]}…, so no other robot would accept this one; bring the right key or the "
+            f"newest team.toml here, or make a new pair by failover team enrol {robot} HOST --replace"
+        )
+
+
 def _run(settings: configuration.Settings) -> int:
     from agent.main_loop.loop import beat
 
@@ -105,7 +131,9 @@ def command_line() -> argparse.ArgumentParser:
     """What can be typed."""
     import argparse
 
-    parser = argparse.ArgumentParser(
+    from failover.cli.arguments import Parser
+
+    parser = Parser(
         prog="failover-agent",
         description=DESCRIPTION.strip(),
         epilog=EPILOG.strip(),

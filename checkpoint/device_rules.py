@@ -10,9 +10,12 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from checkpoint.model import Resource
+from checkpoint.sentences import near
 
 RULES_MAX: Final = 256
 """Rules of one component: each is looked at for each device that it has open."""
+RULES: Final = ("reopen", "hook", "optional")
+"""As an operator says them."""
 KIND: Final = "attached_devices"
 """Of resources that are kept by these rules."""
 
@@ -62,8 +65,9 @@ def rule_from(path: str, said: str) -> DeviceRule:
     """
     if said.startswith("/"):
         return checked(DeviceRule(path, there=said))
-    if said not in ("reopen", "hook", "optional"):
-        raise ValueError(f"the rule for {path} is {said!r}; say reopen, hook, optional, or the path of a device")
+    if said not in RULES:
+        meant = near(said, RULES)
+        raise ValueError(f"the rule for {path} is {said!r}; say {', '.join(RULES)}, or the path of a device{meant}")
     return checked(DeviceRule(path, "hook" if said == "hook" else "reopen", optional=said == "optional"))
 
 

@@ -170,12 +170,14 @@ class ProtectOrder(Struct, frozen=True):
         streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
         names: of somebody who keeps the program's files by content (`checkpoint.store.content_store`): the paths by which the
             program knows those that it has from there; snapshots name them so. None: nobody keeps them.
+        verb: what the user asked for, as a refusal says it.
     """
 
     component: str
     streams: Streams | None = None
     terms: Terms = NO_TERMS
     names: Mapping[str, str] | None = None
+    verb: str = "protect"
 
     @property
     def is_guarded(self) -> bool:

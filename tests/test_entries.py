@@ -100,3 +100,23 @@ def test_whoever_ignores_the_ends_of_children_can_start_commands(words: list[str
         check=False,
     )
     assert (ran.returncode, "Traceback" in ran.stderr, "child" in ran.stderr) == (status, False, False), ran.stderr
+
+
+RUN = Path(__file__).parents[1] / "run"
+
+
+@pytest.mark.parametrize("words", [["--help"], ["-h"], ["help"], ["setup", "--help"], ["table", "-h"]], ids=" ".join)
+def test_run_explains_itself_when_it_is_asked(words: list[str]) -> None:
+    ran = subprocess.run([RUN, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert all(f"./run {verb}" in ran.stdout for verb in ("demo", "test", "setup", "table"))
+
+
+@pytest.mark.parametrize(
+    ("words", "mistake"),
+    [([], "no command is given"), (["deom"], "there is no command deom"), (["setup", "--quick"], "setup takes no options")],
+)
+def test_run_names_a_mistake_and_does_nothing(words: list[str], mistake: str) -> None:
+    ran = subprocess.run([RUN, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr.startswith(f"run: {mistake}") and "./run test" in ran.stderr

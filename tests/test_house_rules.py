@@ -234,6 +234,7 @@ DATACLASSES = {
     "failover/config/team.py": "read from TOML by its fields",
     "failover/state/record_libraries.py": "programs have some",
     "failover/config/strict_toml.py": "reads TOML into them",
+    "failover/config/choices.py": "what is read from TOML is made of them",
     "agent/config.py": "read from TOML by its fields",
     "agent/worker/components/supervisor.py": "fields that its beginning fills in",
 }

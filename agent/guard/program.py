@@ -40,6 +40,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.file_overlay import BroughtFile
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_program, spawn_vessel
 from checkpoint.segment.task_messages import VARIABLE
+from checkpoint.sentences import in_words
 
 DRAIN_S: Final = 2.0
 """How long the end of a program waits for its last output to be written; a full disk must not hide the end."""
@@ -335,7 +336,7 @@ class Ward(Struct):
                 )
             queue_signal(self.born.pid, number, value)
         except (OSError, ProbeError) as error:
-            raise WardError(f"the guard cannot send it {signal.Signals(number).name}: {error}") from error
+            raise WardError(f"the guard cannot send it {signal.Signals(number).name}: {in_words(error)}") from error
 
     def abandon(self) -> None:
         """Agent or keeper are gone before it was the component: nothing of it stays."""

@@ -62,6 +62,7 @@ from agent.system.clock import now_ns
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelError, close_all
 from checkpoint.linux.unix_address import address_of
+from checkpoint.sentences import in_words
 
 FIRST_CALL_S: Final = 30.0
 SEND_TIMEOUT_S: Final = 1.0
@@ -428,10 +429,7 @@ def _drain(end: socket.socket) -> bytes:
 
 def _sentence(request: msgspec.Struct, error: Exception) -> str:
     """What was tried and why not."""
-    if not isinstance(error, OSError):
-        return str(error)
-    where = f" ({error.filename})" if error.filename else ""
-    return f"cannot {_attempt(request)}: {error.strerror or error}{where}"
+    return f"cannot {_attempt(request)}: {in_words(error)}" if isinstance(error, OSError) else str(error)
 
 
 def _attempt(request: msgspec.Struct) -> str:

@@ -166,8 +166,6 @@ class Heart:
         syscalls.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
             self._notes = clock.become_realtime()
-        else:
-            self._notes = ("beats run at normal priority, as the configuration says",)
         self._start_lanes()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds

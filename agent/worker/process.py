@@ -20,6 +20,7 @@ from agent.core_config import retention
 from agent.errors import TROUBLE, GuardLostError, LaneError
 from agent.main_loop.messages import Inventory, ToLanes, Told
 from agent.system.crash import end_lanes_on_mistake
+from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
 from agent.worker.components import launch, prerequisites
 from agent.worker.components.context import Surroundings
@@ -88,6 +89,7 @@ class Lanes(Switchboard):
         self._starter = starter()
         self._nursery = Nursery(sockets, self._starter)
         contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
+        self._alive = LastAlive.found(state / "last_alive")
         self.places = Places(
             sockets, state / "logs", self._nursery, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
@@ -103,7 +105,7 @@ class Lanes(Switchboard):
         hooks, here = Hooks(self._starter), self.settings.component
         self._deposit = Deposit(store, self.places, self.tell, self._accepted, runs=self.settings.me.role == "robot", here=here)
         settled = self._deposit.settled
-        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks)
+        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks, self._alive)
         self._sources = Sources(store, self._from_program)
         self._bringing = Bringing(self._shipper, self._lane.say, self._sources.open, self._note_bringing)
         self._dispatch = Dispatch(
@@ -116,6 +118,7 @@ class Lanes(Switchboard):
         self._new_here = asyncio.Event()
         self._task(self._tidy_contents())
         self._task(self._give_back())
+        self._task(self._give_signs())
         if self.settings.me.role == "robot":
             self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
@@ -125,6 +128,13 @@ class Lanes(Switchboard):
         if found:
             self._nursery.begin()
         return Inventory(_held(store), found)
+
+    async def _give_signs(self) -> None:
+        """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""
+        while True:
+            if any(one.component is not None or one.figures.spec is not None for one in self.charges.values()):
+                await asyncio.to_thread(self._alive.sign)
+            await asyncio.sleep(SIGN_S)
 
     async def stop_work(self) -> None:
         """Give up what is under way; guards and programs live on."""

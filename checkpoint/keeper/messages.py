@@ -21,6 +21,7 @@ from checkpoint.capability import Capability
 from checkpoint.engine import NO_TERMS, PTRACE, Report, Terms
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.model import Position
+from checkpoint.sentences import in_words
 from checkpoint.snapshot.credentials import Owner
 from checkpoint.store.digest_cache import KnownDigest
 
@@ -116,7 +117,9 @@ class Channel(Generic[M]):
             return self._decoder.decode(packet[1:]), descriptors
         except (*UNDECODABLE, OSError) as error:
             close_all(descriptors)
-            raise ChannelError(f"the other end of the local socket sent something that is no message: {error}") from error
+            raise ChannelError(
+                f"the other end of the local socket sent something that is no message: {in_words(error)}"
+            ) from error
 
     def _receive_packet(self) -> tuple[bytes, tuple[int, ...]]:
         room = socket.CMSG_SPACE((DESCRIPTOR_LIMIT + 1) * array.array("i").itemsize)
@@ -209,6 +212,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         names: see `checkpoint.engine.ProtectOrder`, which is told them if ``robot`` is one: its agent keeps files by content.
+        verb: what the user asked for, as a refusal says it.
     """
 
     pid: int
@@ -218,6 +222,7 @@ class Protect(msgspec.Struct, frozen=True, tag=True):
     engine: str = PTRACE
     terms: Terms = NO_TERMS
     names: dict[str, str] = {}
+    verb: str = "protect"
 
 
 class Capture(msgspec.Struct, frozen=True, tag=True):

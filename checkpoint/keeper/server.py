@@ -165,12 +165,12 @@ class Keeper:
     def _protect(self, request: messages.Protect, descriptors: Descriptors) -> Answer:
         if self._is_busy:
             messages.close_all(descriptors)
-            raise CaptureError(f"cannot protect pid {request.pid}: this keeper follows another one already; start another")
+            raise CaptureError(f"cannot {request.verb} pid {request.pid}: this keeper follows another one already; start another")
         self._robot = request.robot
         streams = streams_of(descriptors) if request.streams else None
         chosen = self._tracer if request.engine == self._tracer.name else registry.engine_named(request.engine)
         names = request.names if request.robot else None
-        self._session = chosen.protect(request.pid, ProtectOrder(request.component, streams, request.terms, names))
+        self._session = chosen.protect(request.pid, ProtectOrder(request.component, streams, request.terms, names, request.verb))
         return messages.Protected(self._session.notes), ()
 
     def _capture(self, request: messages.Capture, descriptors: Descriptors) -> Answer:

@@ -286,20 +286,18 @@ def is_shared_anonymous(line: MapsLine) -> bool:
 _VDSO: Final = "[vdso]"
 
 
-def require_traceable(pid: int, status: Status) -> None:
-    """Raise `ProbeError` where no tracer can or should go."""
+def require_traceable(pid: int, status: Status, verb: str) -> None:
+    """Raise `ProbeError` where no tracer can or should go; ``verb``: what the user asked for."""
     if status.tgid != pid:
-        raise ProbeError(f"cannot protect {pid}: it is a thread of process {status.tgid}; name that one")
+        raise ProbeError(f"cannot {verb} {pid}: it is a thread of process {status.tgid}; name that one")
     if procfs.stat(pid).flags & procfs.PF_KTHREAD:
-        raise ProbeError(f"cannot protect pid {pid} ({status.name}): it is a kernel thread; choose a program")
+        raise ProbeError(f"cannot {verb} pid {pid} ({status.name}): it is a kernel thread; choose a program")
     if status.has_ended:
-        raise ProbeError(f"cannot protect pid {pid} ({status.name}): it has ended and is a zombie, waiting for its parent")
+        raise ProbeError(f"cannot {verb} pid {pid} ({status.name}): it has ended and is a zombie, waiting for its parent")
     if pid == os.getpid():
-        raise ProbeError(f"cannot protect pid {pid}: a process cannot trace itself; run failover from another one")
+        raise ProbeError(f"cannot {verb} pid {pid}: a process cannot trace itself; run failover from another one")
     if status.tracer not in (0, os.getpid()):
-        raise ProbeError(
-            f"cannot protect pid {pid} ({status.name}): pid {status.tracer} is its tracer already; end that debugger"
-        )
+        raise ProbeError(f"cannot {verb} pid {pid} ({status.name}): pid {status.tracer} is its tracer already; end that debugger")
 
 
 def refuse_process(

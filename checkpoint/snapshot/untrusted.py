@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from checkpoint.errors import CheckpointError, FormatError
+from checkpoint.sentences import in_words
 
 NOT_UNDERSTOOD: Final = (
     ArithmeticError,
@@ -52,7 +53,8 @@ def facts(what: str) -> Iterator[None]:
 def sentence(what: str, error: Exception) -> str:
     """That something cannot be done, and why: what the kernel does not do may be this machine's fault, too."""
     if isinstance(error, OSError):
-        return f"cannot {what}: {error}; if this machine lacks nothing for that, take a new snapshot: this one asks too much"
+        cure = "if this machine lacks nothing for that, take a new snapshot: this one asks too much"
+        return f"cannot {what}: {in_words(error)}; {cure}"
     return (
         f"cannot {what}: its snapshot says something that this version does not understand ({type(error).__name__}: {error}); "
         "use the version that captured it, or take a new snapshot"

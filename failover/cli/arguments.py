@@ -11,10 +11,21 @@ from collections.abc import Sequence
 from textwrap import dedent
 from typing import Any, Final
 
+from checkpoint.device_rules import rule_from
 from checkpoint.program import cpu_baseline
+from checkpoint.sentences import near
+from failover.config.choices import none_of
 from failover.config.quantities import span_ms
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
+
+
+class Parser(argparse.ArgumentParser):
+    """One that names the choices for a value that is none of them, and the one that was probably meant."""
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        if action.choices is not None and value not in action.choices:
+            raise argparse.ArgumentError(action, none_of(value, action.choices))
 
 
 # --- Arguments that several verbs share ------------------------------------------------------------------------------
@@ -177,6 +188,10 @@ def device(text: str) -> tuple[str, str]:
     path, is_there, rule = text.rpartition("=")
     if not is_there or not path.startswith("/"):
         raise argparse.ArgumentTypeError(f"{text!r}: name the device and its rule: /dev/ttyUSB0=reopen")
+    try:
+        rule_from(path, rule)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
     return path, rule
 
 
@@ -260,7 +275,8 @@ def signal_number(text: str) -> int:
     try:
         return signal.Signals(int(text)) if text.isdecimal() else signal.Signals["SIG" + text.upper().removeprefix("SIG")]
     except (ValueError, KeyError):
-        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM") from None
+        meant = near(text.upper(), (one.name.removeprefix("SIG") for one in signal.Signals))
+        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM{meant}") from None
 
 
 # --- One shot: no agent needed ---------------------------------------------------------------------------------------
@@ -363,9 +379,10 @@ CREATE_STORY: Final = """
     """
 
 ENROL_STORY: Final = """
-    Add a robot to the team file and make its key pair. The team file then goes to every robot, the secret key (keys/ROBOT.secret)
-    to that robot alone; remove it here afterwards. Or make the pair on the robot (failover-agent keypair), so that the secret
-    never travels, and enrol its public half. Agents read the team file when they start.
+    Add a robot to the team file and make its key pair. The team file then goes to every robot. The secret key (keys/ROBOT.secret)
+    belongs to that robot alone: enrolled on another machine, copy it to the robot and remove it here. Or make the pair on the
+    robot (failover-agent keypair), so that the secret never travels, and enrol its public half. Agents read the team file when
+    they start.
 
       failover team enrol robot1 192.168.7.11
       failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from checkpoint.errors import CheckpointError
 from checkpoint.runtime import early_interrupt
+from checkpoint.sentences import in_words
 from failover.cli import keeper_prestart
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
 
@@ -80,9 +81,9 @@ def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:
     if getattr(arguments, "json", False):
         import json
 
-        print(json.dumps({"error": kind, "message": str(error), "reasons": list(reasons)}))
+        print(json.dumps({"error": kind, "message": in_words(error), "reasons": list(reasons)}))
     else:
-        sentence = str(error)
+        sentence = in_words(error)
         if len(reasons) > 1:  # they follow, one a line
             sentence = sentence.removesuffix("; ".join(reasons)).rstrip(": ")
         print(f"failover: {sentence}", file=sys.stderr)

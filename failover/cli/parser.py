@@ -56,7 +56,7 @@ class Verb(Struct, frozen=True):
 
 def build(verb: str = "") -> argparse.ArgumentParser:
     """The whole parser; of one verb's words the part that can read them, which takes a tenth of the time."""
-    parser = argparse.ArgumentParser(
+    parser = arguments.Parser(
         prog="failover",
         description=DESCRIPTION.strip(),
         epilog=f"{PLACES.strip()}\n\n{arguments.EXIT_STATUSES} failover run and restore --wait: the program's own.",

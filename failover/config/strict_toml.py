@@ -13,6 +13,8 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
+from checkpoint.sentences import near
+from failover.config.choices import misfit
 from failover.errors import FileMistakeError
 
 T = TypeVar("T")
@@ -21,8 +23,9 @@ SIZE_LIMIT: Final = 1 << 20
 
 _WORD = re.compile(r"^\w+")
 _MSGSPEC_PATH = re.compile(r" - at `\$(?P<path>[^`]*)`$")
-_KEY = re.compile(r"""^\s*(?:"(?P<quoted>[^"]+)"|'(?P<literal>[^']+)'|(?P<bare>[\w\-.]+))\s*=""")
+_KEY = re.compile(r"""^\s*(?P<path>(?:"[^"]*+"|'[^']*+'|[\w\-]++|\s*+\.\s*+)++)\s*=""")
 _TABLE = re.compile(r"^\s*\[\[?(?P<path>[^\]]+)\]\]?")
+_BARE = re.compile(r"[\w-]+")
 _PART = re.compile(r"""\s*(?:"([^"]*)"|'([^']*)'|([\w-]+))\s*(?:\.|$)""")
 
 
@@ -43,6 +46,9 @@ def read(path: Path, kind: type[T]) -> T:
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
+        keys, said = misfit(table, kind) or ((), "")
+        if keys:
+            raise FileMistakeError(f"{path}:{line_of(text, keys)}: {_spelled(keys)}: {said}") from error
         raise FileMistakeError(_wrong_value(path, text, str(error))) from error
 
 
@@ -93,11 +99,13 @@ def _nested(hint: Any) -> Any:
 
 
 def _unknown_key(path: Path, text: str, keys: tuple[str, ...], valid: list[str]) -> str:
-    import difflib  # for a mistake only
+    cure = near(keys[-1], valid) or "; valid here: " + ", ".join(valid)
+    return f"{path}:{line_of(text, keys)}: unknown key {keys[-1]!r}{cure}"
 
-    near = difflib.get_close_matches(keys[-1], valid, 1, 0.5)
-    cure = f"did you mean {near[0]!r}?" if near else "valid here: " + ", ".join(valid)
-    return f"{path}:{line_of(text, keys)}: unknown key {keys[-1]!r}; {cure}"
+
+def _spelled(keys: tuple[str, ...]) -> str:
+    """Keys as a file has them."""
+    return ".".join(key if _BARE.fullmatch(key) else f'"{key}"' for key in keys)
 
 
 def _wrong_value(path: Path, text: str, message: str) -> str:
@@ -127,9 +135,10 @@ def line_of(text: str, keys: tuple[str, ...]) -> int:
         key = _KEY.match(line)
         if key is None:
             continue
-        name = key["quoted"] or key["literal"] or key["bare"]
-        if name == keys[-1] and _fits(table, keys[:-1]):
+        path = (*table, *_split(key["path"]))
+        if path[-1] == keys[-1] and _fits(path[:-1], keys[:-1]):
             return number
+        best = number if path == keys[: len(path)] else best
     return best
 
 

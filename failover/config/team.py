@@ -158,7 +158,9 @@ def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError as error:
-        raise TeamFileError(f"{path} exists; a robot keeps its key. Remove it if {robot} shall have a new one") from error
+        raise TeamFileError(
+            f"{path} exists, and a robot keeps its key: move the file away first if {robot} shall have a new one"
+        ) from error
     except OSError as error:
         raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
     with open(descriptor, "w") as file:
@@ -178,8 +180,8 @@ def read_secret_key(directory: Path, robot: str) -> str:
         secret = path.read_text().strip()
     except OSError as error:
         raise TeamFileError(
-            f"cannot read this robot's key {path}: {error.strerror}; failover team enrol {robot} makes one, or run without keys "
-            "by insecure = true"
+            f"cannot read this robot's key {path}: {error.strerror}; copy it here from where {robot} was enrolled, or make a new "
+            f"one by failover team enrol {robot} HOST --replace, or run without keys by insecure = true"
         ) from error
     if mode & 0o077:
         raise TeamFileError(f"{path} is open to others (mode {mode & 0o777:o}); run: chmod 600 {path}")

@@ -49,7 +49,7 @@ def _why_not_by(component: Component, command: Command) -> str:
 
 
 def _run(component: Component, turn: Turn, command: Run) -> None:
-    refusal = _why_not_run(component, turn)
+    refusal = _why_not_run(component, turn, "protect" if command.spec.launch.pid else "run")
     if refusal:
         turn.order(acts.Answer(command.request, False, refusal))
         return
@@ -61,28 +61,29 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
     claim(component, turn, None, "an operator asked for it")
 
 
-def _why_not_run(component: Component, turn: Turn) -> str:
+def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
     name = component.name
     if not turn.config.runs(turn.me):
-        return f"cannot run {name}: {turn.me} runs nothing; ask at a robot"
+        return f"cannot {verb} {name}: {turn.me} runs nothing; ask at a robot"
     if spent := exhaustion(component, turn.me):
-        return f"cannot run {name}: {spent}"
+        return f"cannot {verb} {name}: {spent}"
     heard, voters = 1 + len(turn.team.living(turn.now_ns)), len(turn.config.peers) + 1
     if turn.config.by_majority and (heard < turn.config.quorum or not majority.is_free(component, turn)):
         if heard >= turn.config.quorum and not turn.team.rested(turn.now_ns):
-            return f"cannot run {name}: {turn.me} has just started and may be bound by its earlier votes; ask again in a moment"
-        return (
-            f"cannot run {name}: of {voters} that vote {turn.me} hears {heard} and needs {turn.config.quorum}; start the others"
-        )
+            return (
+                f"cannot {verb} {name}: {turn.me} has just started and may be bound by its earlier votes; ask again in a moment"
+            )
+        votes = f"of {voters} that vote {turn.me} hears {heard} and needs {turn.config.quorum}"
+        return f"cannot {verb} {name}: {votes}; start the others"
     if component.holding or component.state is State.STOPPING:
         how = "it runs here" if component.state is State.PRIMARY else f"here it is {component.state}"
-        return f"cannot run {name}: {how}; failover stop or release it first, or choose another name"
+        return f"cannot {verb} {name}: {how}; failover stop or release it first, or choose another name"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
         if entry is not None and not vacant(component, turn) and component.state not in ENDED:
-            return f"cannot run {name}: {peer.robot} has it, epoch {entry.epoch}; choose another name, or stop it there"
+            return f"cannot {verb} {name}: {peer.robot} has it, epoch {entry.epoch}; choose another name, or stop it there"
     if component.held and component.state not in ENDED:
-        return f"cannot run {name}: a checkpoint of it waits here; failover handover {name} resumes it, release forgets it"
+        return f"cannot {verb} {name}: a checkpoint of it waits here; failover handover {name} resumes it, release forgets it"
     return ""
 
 

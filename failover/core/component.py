@@ -145,8 +145,8 @@ class Component(Struct):
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
         freeze_us: how long it stood still for the last snapshot; ``still_us``: the shorter of the last two times.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
-        resumed_ns: when the state was captured that this primacy began with, -1 for a fresh start; ``resumed_age_ns``: how old
-            it was then.
+        resumed_ns: how old the state is that this primacy began with, as an instant, -1 for a fresh start; time in which the
+            program did not run is left out. lost_ns: how much of its work was lost then, at most.
         awaited: why there is nothing to capture, where that is as it should be.
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
         elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
@@ -220,7 +220,7 @@ class Component(Struct):
     unfit: tuple[str, ...] = ()
     stored_ns: int = -1
     resumed_ns: int = -1
-    resumed_age_ns: int = -1
+    lost_ns: int = -1
     unprotected: bool = False
     lease_ns: int = 0
     told_ns: int = 0

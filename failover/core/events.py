@@ -154,12 +154,18 @@ class StoreFailed(Struct, frozen=True):
 
 
 class Restored(Struct, frozen=True):
-    """The act Restore is done: the program runs from ``position``, which was captured ``age_ns`` ago (-1: not known)."""
+    """The act Restore is done: the program runs from ``position``, which was captured ``age_ns`` ago (-1: not known).
+
+    Attributes:
+        lost_ns: for how long it worked on after that, at most: without the time in which it stood still, or its robot was off.
+            -1: not known, so that all of the age may be lost.
+    """
 
     component: str
     epoch: int
     position: Position
     age_ns: int = -1
+    lost_ns: int = -1
 
 
 class ActFailed(Struct, frozen=True):

@@ -379,15 +379,17 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     expected = component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING)
     if not expected or event.epoch != component.epoch:
         return
+    lost = ""
     how = "it runs" if isinstance(event, Started) else f"it resumes from checkpoint {event.position.sequence}"
     if isinstance(event, Restored) and event.age_ns >= 0:
-        component.resumed_ns, component.resumed_age_ns = turn.now_ns - event.age_ns, event.age_ns
-        how += f", {event.age_ns / NS_PER_S:.1f} s old,"
+        component.lost_ns = event.age_ns if event.lost_ns < 0 else event.lost_ns
+        component.resumed_ns = turn.now_ns - component.lost_ns
+        lost = f"; it lost {component.lost_ns / NS_PER_S:.1f} s of its work"
     component.move(Cause.RUNS)
     component.resumption = Resumption.RESTARTED  # of what comes next, if that is here
     component.due_ns = turn.now_ns
     component.return_ns = turn.now_ns + failback.PAUSE * turn.config.retry_ms * MS
-    turn.say(component, f"{how} at {turn.me}, epoch {component.epoch}")
+    turn.say(component, f"{how} at {turn.me}, epoch {component.epoch}{lost}")
     if component.request:
         turn.order(acts.Answer(component.request, True, f"{component.name} runs at {turn.me}"))
         component.request = 0

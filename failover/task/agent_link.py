@@ -38,6 +38,7 @@ from checkpoint.segment.task_messages import (
     encode,
     from_guard,
 )
+from checkpoint.sentences import in_words
 from failover.errors import NotCommittedError, TaskError
 from failover.task.output import OwnOutput
 
@@ -189,7 +190,7 @@ class Guarded:
         except BlockingIOError:  # a signal handler has taken it
             return
         except (TaskError, OSError) as error:
-            raise NotCommittedError(str(error)) from error
+            raise NotCommittedError(in_words(error)) from error
         close_all(descriptors)
         if isinstance(message, Safe):
             self.durable = max(self.durable, message.commit)

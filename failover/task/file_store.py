@@ -19,6 +19,7 @@ from checkpoint.engines.cooperative.session import CooperativeSession
 from checkpoint.errors import CheckpointError, SegmentBusyError, StoreError
 from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
+from checkpoint.sentences import in_words
 from checkpoint.snapshot import format
 from checkpoint.store.disk import Disk
 from checkpoint.store.store import open_store
@@ -249,7 +250,7 @@ class Recorder:
         return True
 
     def _failed(self, error: Exception) -> bool:
-        if str(error) != self.trouble:
-            log.warning("a commit was not written; the program continues: %s", error)
-        self.trouble = str(error)
+        if (trouble := in_words(error)) != self.trouble:
+            log.warning("a commit was not written; the program continues: %s", trouble)
+        self.trouble = trouble
         return False

@@ -9,6 +9,7 @@ import weakref
 from typing import Final
 
 from checkpoint.program.scratch_name import NAME
+from checkpoint.sentences import in_words
 from failover.errors import RequestError
 
 MAP_FAILED: Final = ctypes.c_void_p(-1).value
@@ -41,7 +42,7 @@ def scratch(size: int) -> memoryview:
     try:
         address = _mapped(whole)
     except (OSError, OverflowError, ctypes.ArgumentError) as error:
-        raise RequestError(f"cannot give {size} bytes of scratch memory: {error}") from error
+        raise RequestError(f"cannot give {size} bytes of scratch memory: {in_words(error)}") from error
     held = (ctypes.c_ubyte * whole).from_address(address)
     weakref.finalize(held, _libc.munmap, address, whole).atexit = False  # threads and exit handlers may use it to the end
     return memoryview(held).cast("B")[:size]

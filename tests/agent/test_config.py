@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -91,14 +92,29 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
     ("lines", "line", "said"),
     [
         (("baet_ms = 10",), 4, "did you mean 'beat_ms'"),
-        (('[components."/lab/a".devices]', '"/dev/x" = "open"'), 4, "Invalid enum value 'open'"),
+        (
+            ('[components."/lab/a".devices]', '"/dev/x" = "open"'),
+            5,
+            "'open' is none of reopen, hook, optional; did you mean 'reopen'?",
+        ),
+        (
+            ('[components."/lab/a"]', 'devices."/dev/x" = "hok"'),
+            5,
+            "'hok' is none of reopen, hook, optional; did you mean 'hook'?",
+        ),
+        (('[components."/lab/a"]', 'devices = { "/dev/x" = "hok" }'), 5, '"/lab/a".devices."/dev/x": \'hok\' is none of'),
+        (('[components."/lab/a"]', 'hooks.after_resume = "x"'), 5, '"/lab/a".hooks.after_resume: Expected `array`'),
         (('[components."/lab/a".devices]', '"ttyUSB0" = "reopen"'), 4, "'ttyUSB0' is not the absolute path of a device"),
-        (('[components."/lab/a"]', 'devices."/dev/x" = { reopen = "/dev/y", optoinal = true }'), 4, "did you mean 'optional'"),
+        (('[components."/lab/a"]', 'devices."/dev/x" = { reopen = "/dev/y", optoinal = true }'), 5, "did you mean 'optional'"),
         (('[components."/lab/a".hooks]', "limit_s = 0"), 4, "limit_s of its hooks is 0"),
         (('[components."/lab/a".hooks]', 'after_resmue = ["x"]'), 5, "did you mean 'after_resume'"),
         (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
-        (('when_alone = "panic"',), 4, "Invalid enum value 'panic'"),
-        (('rule = "dice"',), 4, "Invalid enum value 'dice'"),
+        (('when_alone = "panic"',), 4, "when_alone: 'panic' is none of run, freeze"),
+        (('rule = "majorty"',), 4, "rule: 'majorty' is none of auto, pair, majority; did you mean 'majority'?"),
+        (("# fine", "snapshots_over = 3"), 5, "snapshots_over: 3 is none of wired, any"),
+        (('log_level = "warn"',), 4, "'warn' is none of debug, info, warning, error; did you mean 'warning'?"),
+        (('portable = "x86-64-v9"',), 4, "; did you mean 'x86-64-v"),
+        (('rule = "dice"',), 4, "rule: 'dice' is none of auto, pair, majority"),
         (("keep_chains = 2",), 4, "unknown key 'keep_chains'"),
         (("# fine", "beat_ms = 0"), 5, "must be at least 1"),
         (("beat_ms = 100_000",), 4, "at most 10000"),
@@ -114,7 +130,11 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (('[components."/lab/a"]', 'prefer = "robot7"'), 4, "the team knows robot1, robot2"),
         (("patience_s = 0",), 4, "must be at least 1"),
         (('[components."/lab/a"]', 'on_lost = "hold"'), 5, "did you mean 'on_loss'"),
-        (('[components."/lab/a"]', 'on_loss = "give up"'), 5, "Invalid enum value 'give up'"),
+        (
+            ('[components."/lab/a"]', 'on_loss = "give up"'),
+            5,
+            "components.\"/lab/a\".on_loss: 'give up' is none of takeover, hold",
+        ),
         (('[components."/lab/a"]', 'command = "/opt/a"'), 5, "Expected `array`"),
         (('[components."/lab/a"]', 'command = [""]'), 4, "the first one names the program"),
         (('[components."/lab/a"]', 'command = ["/opt/a", "b\\u0000c"]'), 4, "a zero byte"),
@@ -144,6 +164,15 @@ def test_values_that_contradict_each_other_are_refused(directory: Path, lines: t
         configuration.load(written(directory, *lines))
 
 
+def test_a_role_that_there_is_not_is_refused_with_those_there_are(directory: Path) -> None:
+    path = directory / "team" / "team.toml"
+    path.write_text(path.read_text().replace('role = "robot"', 'role = "sever"', 1))
+    with pytest.raises(ConfigError) as caught:
+        configuration.load(written(directory))
+    said = f"{path}:5: robots.robot1.role: 'sever' is none of robot, server, witness; did you mean 'server'?"
+    assert str(caught.value) == said
+
+
 def test_a_robot_outside_the_team_is_told_who_is_in_it(directory: Path) -> None:
     path = directory / "agent.toml"
     path.write_text(f'robot = "robot9"\nteam_directory = "{directory / "team"}"\n')
@@ -159,6 +188,30 @@ def test_keys_are_asked_for_unless_the_operator_says_insecure(directory: Path) -
     team.write_secret_key(directory / "team", "robot1", "x" * 40)
     with pytest.raises(ConfigError, match=r"robot1, robot2 .* have no public key"):
         configuration.load(path)
+
+
+@pytest.mark.parametrize(
+    ("secret", "said"),
+    [
+        (new_keys()[1], "does not belong to the public key of robot1 in "),
+        ("#" * 40, "is not a CURVE key"),
+    ],
+    ids=["another robot's", "no key"],
+)
+def test_a_secret_key_that_does_not_fit_the_team_fails_the_check(
+    directory: Path, secret: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (public, right), (other, _) = new_keys(), new_keys()
+    members = {"robot1": replace(ROBOT, public_key=public), "robot2": replace(ROBOT, public_key=other)}
+    team.write(directory / "team", Team("lab", members))
+    path = directory / "agent.toml"
+    path.write_text(f'robot = "robot1"\nteam_directory = "{directory / "team"}"\n')
+    key = team.write_secret_key(directory / "team", "robot1", secret)
+    assert agent_main(["check", "--config", str(path)]) == 1
+    refusal = capsys.readouterr().err
+    assert refusal.startswith(f"failover-agent: {key}") and said in refusal
+    key.write_text(right + "\n")
+    assert agent_main(["check", "--config", str(path)]) == 0
 
 
 def test_a_secret_key_that_others_can_read_is_refused(directory: Path) -> None:

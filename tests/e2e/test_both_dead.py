@@ -7,7 +7,9 @@ FAILOVER_RETURNS=all plays the returns that CI leaves out as well.
 from __future__ import annotations
 
 import os
+import re
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -81,6 +83,25 @@ def test_both_are_dead_and_the_one_that_comes_back_with_its_disk_goes_on_with_bo
         robot = stage.switch_on("robot1")
         for name in PROGRAMS:
             expect_to_go_on(robot, name, kept[name])
+
+
+OFF_S = 8.0
+
+
+def test_the_time_in_which_a_robot_was_off_is_no_lost_work(tmp_path: Path) -> None:
+    with teams.acting(tmp_path, {"robot1": "robot", "robot2": "robot"}, HOLD) as stage:
+        begin(stage, tmp_path)
+        first = stage.members["robot1"]
+        robots.until(lambda: (robots.component(first, "count").get("lag_ms") or 1e9) < 1_000, "a young checkpoint")
+        stage.cut_power("robot1")
+        cut = time.monotonic()
+        robots.until(lambda: time.monotonic() > cut + OFF_S, "the robot to be off for a while")
+        first = stage.switch_on("robot1")
+        expect_to_go_on(first, "count", 0)
+        told = robots.failover(first, "why", "count").stdout
+        lost = [float(seconds) for seconds in re.findall(r"it lost ([\d.]+) s of its work", told)]
+        assert lost and lost[-1] < OFF_S, told
+        assert not [note for note in robots.component(first, "count")["notes"] if " s old" in note and "resumed" in note]
 
 
 @pytest.mark.parametrize("settings", ["", HOLD], ids=["takeover", "hold"])

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Struct, field
 
 from agent.config import ComponentConfig
+from agent.system.last_alive import LastAlive
 from agent.worker.components.hooks import Hooks
 from agent.worker.components.launch import Program
 from agent.worker.components.paths import Places
@@ -30,6 +31,7 @@ class Surroundings(Struct):
             output in the logs.
         here: what this robot's operator wants for a component.
         hooks: runs his commands.
+        last_alive: tells for how long this robot was off; None: that is not known.
     """
 
     places: Places
@@ -40,6 +42,7 @@ class Surroundings(Struct):
     settled: Callable[..., Coroutine[Any, Any, None]]
     here: Callable[[str], ComponentConfig]
     hooks: Hooks = field(default_factory=Hooks)
+    last_alive: LastAlive | None = None
 
 
 def program_of(launch: Launch) -> Program:

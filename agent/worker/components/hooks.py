@@ -37,6 +37,7 @@ from msgspec import Struct
 from agent.hook_kinds import Kind
 from agent.system.systemd_units import in_a_unit
 from checkpoint.linux.spawn.inherited_limits import Inheritance
+from checkpoint.sentences import in_words
 
 STARTED: Final = "started"
 CAPTURED: Final = "captured"
@@ -137,7 +138,7 @@ class Hooks(Struct, frozen=True):
         try:
             running = await self._begun(name, hook, occasion.environment(kind))
         except (OSError, ValueError) as error:  # a command that came from another robot may hold a zero byte
-            return self._told(kind, hook, occasion, f"cannot be started: {error}")
+            return self._told(kind, hook, occasion, f"cannot be started: {in_words(error)}")
         try:
             said = await running.last_said(hook.limit_s + (SYSTEMD_S if self.starter else 0))
         except TimeoutError:

@@ -352,7 +352,7 @@ class Charge:
                 raise
 
     async def _restore(self, act: acts.Restore) -> None:
-        began_ns, laps = clock.now_ns(), clock.Laps()
+        began_ns, laps, is_first = clock.now_ns(), clock.Laps(), self.component is None
         silent_ns = await self.around.silence_ns(self.name) if act.why is Resumption.TAKEN_OVER else 0
         await self._stop()
         await self.around.settled(self.name, act.position)
@@ -361,6 +361,8 @@ class Charge:
         laps.lap(f"opening {len(descriptors)} snapshots")
         try:
             outage_ns, read_ns = clock.age_ns(descriptors[-1]), clock.now_ns()
+            off_ns = silent_ns if silent_ns > 0 else self._off_ns(outage_ns) if is_first else 0
+            idle_ns = off_ns + read_ns - began_ns
             occasion = await self._occasions.before_resume(act, descriptors[-1], outage_ns)
             laps.lap("preparing")
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
@@ -378,11 +380,16 @@ class Charge:
         sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}{protecting}"
         log.info("%s: %s", self.name, sentence)
         self.started.set()
-        self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns))
+        lost_ns = 0 if act.why is Resumption.HANDED_OVER else max(0, age_ns - idle_ns)
+        self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns, lost_ns))
         self._notice(sentence)
         self._watch_the_end()
         if occasion is not None:
             self._task(self._occasions.after_resume(act.spec, occasion, component.pid))
+
+    def _off_ns(self, age_ns: int) -> int:
+        """For how long nothing ran here since a checkpoint that is so old, because this robot was off."""
+        return self.around.last_alive.off_ns(age_ns) if self.around.last_alive is not None else 0
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
         """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""

@@ -8,6 +8,7 @@ import msgspec
 
 from agent.errors import RefusedError
 from checkpoint.arch import EVERY_LEVEL
+from failover.config.choices import misfit
 
 SIGNAL_MAX: Final = 64
 """The last real-time signal. Source: signal(7)."""
@@ -48,7 +49,8 @@ def arguments_of(kind: type[T], verb: str, arguments: dict[str, Any]) -> T:
     try:
         return msgspec.convert(arguments, kind)
     except msgspec.ValidationError as error:
-        raise RefusedError(f"{verb}: its arguments are not right: {error}") from error
+        at, said = misfit(arguments, kind) or ((), str(error))
+        raise RefusedError(f"{verb}: its arguments are not right: {'.'.join(at)}{': ' if at else ''}{said}") from error
 
 
 class RunArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -18,7 +18,8 @@ from msgspec import Struct
 WATCHDOGS: Final = Path("/sys/class/watchdog")
 ACTIVE: Final = "active"
 
-GUARDED: Final = "a guard freezes its program when the lease is over, even if the agent has ended"
+GUARDED: Final = "guards freeze programs when the lease is over"
+MORE: Final = "docs/fencing.md"
 
 
 class Watchdog(Struct, frozen=True):
@@ -50,18 +51,14 @@ def watchdog(directory: Path = WATCHDOGS) -> Watchdog | None:
 def sentence(found: Watchdog | None) -> str:
     """For ``failover status``."""
     if found is None:
-        return (
-            f"{GUARDED}; if all of this robot stood still at once and continued later, nothing here would stop its "
-            "programs: no hardware watchdog is active; switch such a robot off from outside, or let actuators check the epoch "
-            "(failover.Gateway)"
-        )
+        return f"{GUARDED}; if all of this robot hangs, nothing does: no hardware watchdog is active ({MORE})"
     if not found.is_told:
         return (
-            f"{GUARDED}; if all of this robot stood still at once, only its watchdog ({found.identity}) would help, and this "
-            "kernel does not tell whether a program feeds it; systemctl show --property=RuntimeWatchdogUSec does"
+            f"{GUARDED}; if all of this robot hangs, only its watchdog ({found.identity}) would help, and this kernel does not "
+            f"tell whether a program feeds it ({MORE})"
         )
     after = f"after {found.timeout_s} s" if found.timeout_s else "after its timeout"
-    return f"{GUARDED}; if all of this robot stood still at once, its watchdog ({found.identity}) would reset it {after}"
+    return f"{GUARDED}; if all of this robot hangs, its watchdog ({found.identity}) would reset it {after}"
 
 
 def _fact(place: Path, name: str) -> str:

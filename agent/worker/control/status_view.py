@@ -79,7 +79,7 @@ def team_view(
         "version": version(),
         "life": life.boot,
         "insecure": settings.config.insecure,
-        "realtime": not life.notes,
+        "realtime": settings.config.realtime and not life.notes,
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
         "memory": asdict(memory) if memory is not None else None,
@@ -233,7 +233,6 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
             *view.notes,
             *told_lacks(view, charge, settings.config.robot),
             *(f"NOT PROTECTED, a restore of it is refused: {reason}" for reason in _contested(view, figures)),
-            *_copy_notes(view, figures, settings.config.robot),
             *_own_notes(view, figures),
             *_over_budget(view, figures, settings),
             *_hung_up_devices(view, figures, settings),
@@ -249,17 +248,6 @@ def _ready_copy(view: ComponentView, figures: Figures | None) -> dict[str, Any] 
     copy = figures.copy
     position = {"generation": copy.position.generation, "sequence": copy.position.sequence} if copy.position else None
     return {"ready": copy.ready, "wanted": copy.wanted, "size": copy.size, "position": position, "why": copy.why}
-
-
-def _copy_notes(view: ComponentView, figures: Figures | None, robot: str) -> tuple[str, ...]:
-    """The same as sentences."""
-    shown = _ready_copy(view, figures)
-    if shown is None or not (shown["ready"] or shown["why"]) or not shown["wanted"]:
-        return ()
-    if not shown["ready"]:
-        return (f"ready copy at {robot}: no, because {shown['why']}; a takeover restores it from its chain",)
-    size, position = shown["size"] / 1e6, shown["position"]
-    return (f"ready copy at {robot}: {size:.1f} MB of memory, at checkpoint {position['generation']}.{position['sequence']}",)
 
 
 def _kept(kept: Kept | None) -> dict[str, Any] | None:

@@ -216,14 +216,14 @@ class Verbs(Questions):
         """Move a component."""
         wanted = arguments_of(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
-        await self._check_fit(name, "hand over", wanted.to or (await self._view(name))["standby"])
+        await self._check_fit(name, "hand {} over to {}", wanted.to or (await self._view(name))["standby"])
         return await self._moved(by, name, lambda number: events.Handover(number, name, wanted.to))
 
     async def failback(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
         name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
         view = await self._view(name)
-        await self._check_fit(name, "fail back", view["prefer"] or view["home"])
+        await self._check_fit(name, "fail {} back to {}", view["prefer"] or view["home"])
         return await self._moved(by, name, lambda number: events.Failback(number, name))
 
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
@@ -231,7 +231,7 @@ class Verbs(Questions):
         name = arguments_of(NameArguments, "lacks", arguments).name
         return {"lacks": list(await self._lanes.lacking(name) if name in await self._names() else ())}
 
-    async def _check_fit(self, name: str, verb: str, robot: str) -> None:
+    async def _check_fit(self, name: str, order: str, robot: str) -> None:
         """Ask the robot that a component is to move to whether it could go on there.
 
         Where it cannot tell the core decides alone.
@@ -242,7 +242,7 @@ class Verbs(Questions):
         if robot not in await self._reachable():
             return
         if reasons := await prerequisites.asked_of(self._lanes.errands, robot, name):
-            sentence = f"cannot {verb} {name} to {robot}, which could not resume it: {'; '.join(reasons)}"
+            sentence = f"cannot {order.format(name, robot)}, which could not resume it: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 
     async def _moved(self, by: int, name: str, make: Callable[[int], events.Command]) -> dict[str, Any]:
@@ -279,7 +279,7 @@ class Verbs(Questions):
         """Say where a component should run."""
         wanted = arguments_of(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)
-        await self._check_fit(name, "prefer", wanted.robot)
+        await self._check_fit(name, "let {} prefer {}", wanted.robot)
         await self._command(by, lambda number: events.Prefer(number, name, wanted.robot))
         return {"name": name, "robot": wanted.robot}
 
@@ -396,7 +396,8 @@ class Verbs(Questions):
             begun.cancel()
             charge.guest = None
         if end.done() and end.result().failed:
-            raise RefusedError(f"cannot start {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
+            verb = "protect" if launch.pid else "start"
+            raise RefusedError(f"cannot {verb} {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
         if not charge.started.is_set():
             raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; see failover why {name}")
         return charge

@@ -19,6 +19,7 @@ from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import ChainError, CheckpointError, FormatError, StoreError
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import OutputPiece, Position, Snapshot
+from checkpoint.sentences import in_words
 from checkpoint.snapshot import carried_files, format, untrusted
 from checkpoint.store.store import Store
 from failover.core.acts import Accept, Admit, Discard, Show
@@ -124,7 +125,7 @@ class Deposit:
             except (CheckpointError, OSError) as error:
                 log.warning("a snapshot of %s from %s was not kept: %s", offer.component, peer, error)
                 needs_base = isinstance(error, ChainError)
-                self._tell(StoreFailed(offer.component, offer.epoch, peer, str(error), needs_base))
+                self._tell(StoreFailed(offer.component, offer.epoch, peer, in_words(error), needs_base))
                 return
             except untrusted.NOT_UNDERSTOOD as error:  # the sender is known, and still its word is its own
                 why = untrusted.sentence(f"keep a snapshot of {offer.component} from {peer}", error)

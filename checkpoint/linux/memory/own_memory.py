@@ -24,6 +24,7 @@ from checkpoint.linux.memory.write_protect import enable_write_protection
 from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Words
 from checkpoint.runtime.lazy_numpy import NDArray
+from checkpoint.sentences import in_words
 
 SEGMENT_PAGE: Final = 4096
 """Only kernels with pages of this size tell in the segment's pages."""
@@ -95,7 +96,7 @@ class LiveMemory:
         try:
             written = self._scanner.written(self._ranges)
         except CheckpointError as error:
-            self._give_up(str(error))
+            self._give_up(in_words(error))
             return
         if not len(written):
             return
@@ -156,7 +157,7 @@ class LiveMemory:
             scanner = PageScanner(os.getpid(), batch_syscalls.one_by_one)
             scanner.is_protected(0, abi.PAGE_SIZE)
         except (OSError, CheckpointError) as error:
-            self._give_up(str(error))
+            self._give_up(in_words(error))
             return
         self._scanner = scanner
 

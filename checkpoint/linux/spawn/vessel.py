@@ -42,10 +42,11 @@ from checkpoint.errors import ProbeError, ProcessGoneError, RestoreError
 from checkpoint.linux.child_reaper import bury
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.tasks import thread_ids
-from checkpoint.linux.spawn import namespaces
+from checkpoint.linux.spawn import namespaces, not_executed
 from checkpoint.linux.spawn.file_overlay import BroughtFile, User, show
 from checkpoint.linux.spawn.inherited_limits import Inheritance, take_on
 from checkpoint.model import Clocks
+from checkpoint.sentences import in_words
 
 _MFD_CLOEXEC_EXEC: Final = 0x1 | 0x10
 _MFD_CLOEXEC: Final = 0x1
@@ -113,7 +114,7 @@ def spawn_vessel(birth: Birth) -> Born:
     try:
         return _give_birth(birth, lambda: _become_vessel(), keep_right=True)
     except OSError as error:
-        raise RestoreError(f"cannot start a process to restore into: {error}") from error
+        raise RestoreError(f"cannot start a process to restore into: {in_words(error)}") from error
 
 
 def spawn_program(argv: Sequence[str], env: Mapping[str, str], cwd: str | os.PathLike[str], umask: int, birth: Birth) -> Born:
@@ -126,7 +127,10 @@ def spawn_program(argv: Sequence[str], env: Mapping[str, str], cwd: str | os.Pat
     def become_program() -> NoReturn:
         os.chdir(cwd)
         os.umask(umask)
-        os.execvpe(argv[0], list(argv), dict(env))
+        try:
+            os.execvpe(argv[0], list(argv), dict(env))
+        except OSError as error:
+            raise not_executed.explained(error, argv[0], env.get("PATH", os.defpath)) from error
 
     return _give_birth(birth, become_program, keep_right=False)
 
@@ -154,7 +158,7 @@ class _Lines(Struct, frozen=True):
 
     def fail(self, error: OSError) -> None:
         """Report what went wrong in the way that the caller raises it again."""
-        named = [str(error.filename)] if error.filename is not None else []
+        named = [os.fsdecode(error.filename)] if isinstance(error.filename, str | bytes) else []
         self.say(error=[error.errno or errno.EIO, error.strerror or str(error), *named])
 
 
@@ -287,7 +291,7 @@ def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_
     try:
         namespaces.mount_proc()
     except OSError as error:
-        notes.append(f"/proc shows the machine's processes, not only the program's: {error}")
+        notes.append(f"/proc shows the machine's processes, not only the program's: {in_words(error)}")
     if own_terminals:
         with contextlib.suppress(OSError):  # then they get numbers among the machine's, and a restore says when one differs
             namespaces.mount_terminals()

@@ -33,6 +33,7 @@ from checkpoint.linux.procfs.tasks import thread_count, thread_ids
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.restore_context import number_of
+from checkpoint.sentences import in_words
 
 KIND: Final = "thread_tables"
 
@@ -120,7 +121,7 @@ class ThreadTables:
             except ProcessGoneError:
                 continue
             except (ProbeError, OSError) as error:
-                raise CaptureError(f"cannot look at what thread {tid} of pid {self._pid} has open: {error}") from error
+                raise CaptureError(f"cannot look at what thread {tid} of pid {self._pid} has open: {in_words(error)}") from error
             self._told[tid] = _Told(fact, tuple(reasons))
 
     def describe(self) -> tuple[Resource, ...]:

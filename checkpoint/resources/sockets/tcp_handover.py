@@ -37,6 +37,7 @@ from checkpoint.resources.open_file import OpenFile
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import inet_addresses, tcp
 from checkpoint.resources.sockets.tcp import KIND, LEFT, TAKEN
+from checkpoint.sentences import in_words
 
 CAPABILITIES: Final = (
     by_rule(
@@ -226,7 +227,7 @@ class Arriving:
                 tcp_repair.connect(made, one.kept, *_ends(one.resource))
                 tcp_repair.fill(made, one.kept)
             except (CannotCarryError, OSError) as error:
-                raise RestoreError(f"cannot take up the TCP connection {one.resource.name}: {error}") from error
+                raise RestoreError(f"cannot take up the TCP connection {one.resource.name}: {in_words(error)}") from error
 
     def let_go(self) -> None:
         """They go on, a moment before their program does.

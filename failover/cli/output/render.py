@@ -6,6 +6,7 @@ import codecs
 import json
 import re
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -15,7 +16,6 @@ from failover.cli.output import team_tree
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
 COLOURS: Final = {"good": "green", "warning": "yellow", "bad": "bold red", "quiet": "dim"}
 
@@ -25,9 +25,9 @@ PICTURE_WIDTH: Final = 108
 GAP: Final = "  "
 """Between two columns of a plain table."""
 
-
-NARROW: Final = 80
-"""Columns of a terminal below which a table's cells would be torn apart; the tree is told line by line then."""
+BORDER: Final = 1
+PADDING: Final = 2
+"""Columns that a framed table takes besides its cells: one on each side of every cell, and its lines."""
 
 ASCII: Final = str.maketrans({"└": "`", "├": "|", "─": "-", "–": "-", "…": "~"})
 """For a terminal or a file that is not in UTF-8."""
@@ -60,14 +60,26 @@ def plain_table(columns: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """Columns aligned by spaces; a column that is empty throughout is left out."""
     cells = [tuple(columns), *(tuple(line) for line in lines)]
     kept = [index for index in range(len(columns)) if any(line[index] for line in cells[1:])]
-    widths = {index: max(len(line[index]) for line in cells) for index in kept}
-    return "\n".join(GAP.join(line[index].ljust(widths[index]) for index in kept).rstrip() for line in cells)
+    widths = {index: max(width_of(line[index]) for line in cells) for index in kept}
+    return "\n".join(GAP.join(_padded(line[index], widths[index]) for index in kept).rstrip() for line in cells)
+
+
+def width_of(text: str) -> int:
+    """Columns that a text takes on a terminal: East Asian characters take two, combining ones none."""
+    if text.isascii():
+        return len(text)
+    return sum(0 if unicodedata.combining(one) else 2 if unicodedata.east_asian_width(one) in "WF" else 1 for one in text)
+
+
+def _padded(text: str, width: int) -> str:
+    return text + " " * (width - width_of(text))
 
 
 def table(columns: Sequence[str], lines: Sequence[Sequence[str]], title: str = "") -> None:
     """Print a table: framed on a terminal, aligned elsewhere."""
     if is_terminal():
-        _console().print(_rich_table(columns, [(line, "") for line in lines], title))
+        console = _console()
+        console.print(_drawn(console.width, columns, [(line, "") for line in lines], title))
         return
     if title:
         print(title)
@@ -88,6 +100,7 @@ def plain_tree(status: dict[str, Any]) -> str:
     lines += team_tree.promises(status)
     lines += team_tree.kept(status)
     lines += team_tree.memory(status)
+    lines += team_tree.ready_copies(status)
     if status.get("fencing"):
         lines.append(f"fencing: {status['fencing']}")
     return "\n".join([*lines, *(f"note: {line}" for line in team_tree.remarks(status))])
@@ -139,7 +152,7 @@ class LiveBoard:
 
         bar = Table.grid(padding=(0, 1))
         bar.add_row(ProgressBar(total=1.0, completed=min(share, 1.0), width=40), f"{min(share, 1.0):4.0%}", caption)
-        self._live.update(Group(_rich_table(columns, [(line, "") for line in lines]), bar), refresh=True)
+        self._live.update(Group(_drawn(self._live.console.width, columns, [(line, "") for line in lines]), bar), refresh=True)
 
 
 def save_picture(path: str, command: str, lines: Sequence[str], columns: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
@@ -153,7 +166,7 @@ def save_picture(path: str, command: str, lines: Sequence[str], columns: Sequenc
     console.print(Text(f"$ {command}", style="bold"))
     for line in lines:
         console.print(Text(line))
-    console.print(_rich_table(columns, [(line, "") for line in cells]))
+    console.print(_drawn(console.width, columns, [(line, "") for line in cells]))
     picture_text = re.sub(r"@font-face \{.*?\}\s*", "", console.export_svg(title=command), flags=re.DOTALL)  # no fonts from afar
     Path(path).write_text(picture_text)
 
@@ -169,33 +182,53 @@ def _rich_tree(status: dict[str, Any]) -> Any:
     from rich.text import Text
 
     lines = [(tuple(map(spoken, row.cells)), COLOURS[row.mood]) for row in team_tree.rows(status)]
-    if _console().width < NARROW:
-        parts: list[Any] = [Text(line, style=style) for cells, style in lines for line in _stacked(cells)]
-    else:
-        parts = [_rich_table(team_tree.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
+    parts = [_drawn(_console().width, team_tree.COLUMNS, lines, f"team {status.get('team') or ''}".strip())]
     parts += [Text(spoken(line), style="bold") for line in team_tree.promises(status)]
     parts += [Text(spoken(line)) for line in team_tree.kept(status)]
-    parts += [Text(spoken(line), style="dim") for line in team_tree.memory(status)]
+    parts += [Text(spoken(line), style="dim") for line in (*team_tree.memory(status), *team_tree.ready_copies(status))]
     if status.get("fencing"):
         parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
     return Group(*parts, *(Text(spoken(line), style="yellow") for line in team_tree.remarks(status)))
 
 
-def _stacked(cells: Sequence[str]) -> list[str]:
-    """One row of the tree for a narrow terminal: its name, and below it what is known, with the columns' names."""
-    told = [f"{column} {cell}" for column, cell in zip(team_tree.COLUMNS[1:], cells[1:], strict=True) if cell.strip(" -–")]
-    return [cells[0], *([f"     {', '.join(told)}"] if told else [])]
-
-
-def _rich_table(columns: Sequence[str], lines: Sequence[tuple[Sequence[str], str]], title: str = "") -> Table:
+def _drawn(width: int, columns: Sequence[str], lines: Sequence[tuple[Sequence[str], str]], title: str = "") -> Any:
+    """A framed table whose cells break between words only; row below row where not even the words fit. Nothing is cut off."""
     from rich import box
+    from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
     kept = [index for index in range(len(columns)) if any(line[index] for line, _ in lines)]
+    cells = [[columns[index], *(line[index] for line, _ in lines)] for index in kept]
+    widths = _widths(cells, width - BORDER - (BORDER + PADDING) * len(kept))
+    if widths is None:
+        told = [Text(told, style=style) for line, style in lines for told in _stacked(columns, line)]
+        return Group(*([Text(title, style="italic")] if title else []), *told)
     drawn = Table(title=title or None, title_justify="left", box=box.ROUNDED, border_style="dim", header_style="bold")
-    for index in kept:
-        drawn.add_column(columns[index], no_wrap=index == 0)
+    for index, column_width in zip(kept, widths, strict=True):
+        drawn.add_column(columns[index], width=column_width, overflow="fold")
     for line, style in lines:
         drawn.add_row(*(Text(line[index], style=style) for index in kept))
     return drawn
+
+
+def _widths(cells: Sequence[Sequence[str]], room: int) -> list[int] | None:
+    """Of each column, so that all fit: the widest give way first, down to their longest word; the first column, a name, never.
+
+    None where that is not enough.
+    """
+    widths = [max(map(width_of, column)) for column in cells]
+    least = [max((width_of(word) for cell in column for word in cell.split()), default=0) for column in cells]
+    least[:1] = widths[:1]
+    while sum(widths) > room:
+        able = [index for index, wide in enumerate(widths) if wide > least[index]]
+        if not able:
+            return None
+        widths[max(able, key=widths.__getitem__)] -= 1
+    return widths
+
+
+def _stacked(columns: Sequence[str], cells: Sequence[str]) -> list[str]:
+    """One row for a narrow terminal: its name, and below it what is known, with the columns' names."""
+    told = [f"{column} {cell}".strip() for column, cell in zip(columns[1:], cells[1:], strict=True) if cell.strip(" -–")]
+    return [cells[0], *([f"     {', '.join(told)}"] if told else [])]

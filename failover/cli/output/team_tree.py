@@ -5,6 +5,7 @@ Pure: the agent's answer in (see `failover.client.control.STATUS`), rows of text
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
@@ -197,12 +198,31 @@ def memory(status: Mapping[str, Any]) -> tuple[str, ...]:
     return (f"memory: agent {size(found['agent'])}, keepers {size(found['keepers'])}; of both {remembered}",)
 
 
+def ready_copies(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """The ready copies at the robot that answered: their memory and their checkpoints, or why there is none."""
+    told = [f"{one['name']} {_copy(one['ready_copy'])}" for one in status["components"] if _is_told(one.get("ready_copy"))]
+    return (f"ready copy at {status['robot']}: {'; '.join(told)}",) if told else ()
+
+
+def _is_told(copy: Mapping[str, Any] | None) -> bool:
+    return copy is not None and bool(copy["wanted"] and (copy["ready"] or copy["why"]))
+
+
+def _copy(copy: Mapping[str, Any]) -> str:
+    if not copy["ready"]:
+        return f"none, because {copy['why']}: a takeover restores it from its chain"
+    return f"{size(copy['size'])} of memory, at checkpoint {copy['position']['generation']}.{copy['position']['sequence']}"
+
+
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What stands below the tree: reasons, promises that do not hold, and notes, each a sentence said once."""
-    found: list[str] = []
+    """What stands below the tree: what is wrong, each cause once, with the components that it concerns."""
+    alike: dict[str, list[tuple[str, str]]] = {}
     for component in status["components"]:
         if sight(component).get("state") != "released":
-            found += _remarks_on(component)
+            name = str(component["name"])
+            for line in _remarks_on(component):
+                alike.setdefault(_FIGURE.sub("#", line.replace(name, "it")), []).append((name, line))
+    found = [_of_all(told) for told in alike.values()]
     found += [f"{peer['name']}: {line}" for peer in status["peers"] for line in peer.get("notes") or ()]
     forged = {reason: count for reason, count in (status.get("beats") or {}).get("refused", {}).items() if reason not in PASSING}
     if forged:
@@ -212,8 +232,38 @@ def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(found) + tuple(status.get("notes") or ())
 
 
+_FIGURE: Final = re.compile(r"(?<=\bpid )\d+|\d+(?:\.\d+)?(?= (?:ms|s|min|bytes|KB|MB|GB)\b)")
+"""A figure with its unit, or a PID: where sentences differ in these alone, they say the same."""
+
+
+def _of_all(told: Sequence[tuple[str, str]]) -> str:
+    """What is said of several components, by name, as one sentence."""
+    if len(told) == 1:
+        return ": ".join(told[0])
+    return f"{listed([name for name, _ in told])}: {_in_one([line.replace(name, 'it') for name, line in told])}"
+
+
+def _in_one(lines: Sequence[str]) -> str:
+    """Sentences that differ in figures alone, as one: each PID, and of other figures the least and the most."""
+    figures = [sorted(set(told), key=float) for told in zip(*map(_FIGURE.findall, lines), strict=True)]
+    told = iter(figures)
+
+    def in_one(found: re.Match[str]) -> str:
+        these = next(told)
+        if found.string[: found.start()].endswith("pid "):
+            return listed(these)
+        return these[0] if len(these) == 1 else f"{these[0]}–{these[-1]}"
+
+    return _FIGURE.sub(in_one, lines[0])
+
+
+def listed(names: Sequence[str]) -> str:
+    """a, b and c."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+
+
 def _remarks_on(component: Mapping[str, Any]) -> list[str]:
-    """Of one component, from every robot that was asked; a reason that a note contains is not said again."""
+    """Of one component, from every robot that was asked; a cause that another line gives is not given again."""
     sights = {"": component, **(component.get("elsewhere") or {})}
     if component.get("state") in ("ended", "failed"):
         sights = {"": sight(component)}
@@ -222,7 +272,8 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
         notes = [str(line) for line in seen.get("notes") or ()]
         reasons = [str(line) for line in seen.get("reasons") or ()]
         said = notes + lines
-        lines += [f"{robot}: {line}" if robot else line for line in notes if line not in lines]
+        for line in notes:
+            _add(f"{robot}: {line}" if robot and robot not in line else line, line, lines)
         lines += [line for line in reasons[:REASONS_SHOWN] if not any(line in other for other in said)]
     seen = sight(component)
     if is_unknown(seen) and component.get("elsewhere") is not None:
@@ -230,7 +281,24 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
     wanting = seen.get("state") == "degraded" or is_unprotected(seen)
     if seen.get("promise") and not seen.get("promise_differs") and wanting and not is_lacking(seen):
         lines.append(str(seen["promise"]))
-    return [f"{component['name']}: {line}" for line in lines]
+    return lines
+
+
+def _add(told: str, line: str, lines: list[str]) -> None:
+    """Add a line. Where another one gives its cause, which stands behind a colon, that one says what else follows from it."""
+    what, _, rest = line.partition(": ")
+    cause = rest.partition("; ")[0]
+    for index, other in enumerate(lines):
+        if line == other:
+            return
+        if len(cause) >= CAUSE_LENGTH_MIN and cause in other:
+            lines[index] = other if what in other else f"{other} ({what})"
+            return
+    lines.append(told)
+
+
+CAUSE_LENGTH_MIN: Final = 12
+"""Characters; fewer may stand in another sentence by chance."""
 
 
 def _unknown(seen: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from msgspec import Struct
 
@@ -29,6 +29,10 @@ STAND_IN = ("sleep", "60")
 """An ordinary program, to be looked into and ended."""
 
 
+LOCKED_OR_FIRST: Final = ("beats run at ", "the main loop's memory ")
+"""How an agent's notes begin that say what it was refused of real-time priority and locked memory (`agent.system.clock`)."""
+
+
 class Offer(Struct, frozen=True):
     """One thing looked at: ``missing`` means that nothing works without it, ``lesser`` that something works less well."""
 
@@ -39,16 +43,16 @@ class Offer(Struct, frozen=True):
 
 def check_machine(arguments: argparse.Namespace) -> int:
     """Show what this machine offers; 1 when something is missing that nothing works without."""
+    status = _status(arguments)
     offers = [
         _architecture(),
         *_looking_into(),
         _isolation(),
         _chosen_pids(),
-        _real_time(),
-        _memory_lock(),
+        *([_real_time(), _memory_lock()] if status is None else _of_agent(status)),
         _watchdog(),
         _network(),
-        *_standing_by(arguments),
+        *([] if status is None else _standing_by(status)),
     ]
     able = all(offer.verdict != "missing" for offer in offers)
     if arguments.json:
@@ -59,13 +63,27 @@ def check_machine(arguments: argparse.Namespace) -> int:
     return 0 if able else 1
 
 
-def _standing_by(arguments: argparse.Namespace) -> list[Offer]:
-    """What this robot lacks of what the components need that it stands by for; nothing where no agent answers."""
+def _status(arguments: argparse.Namespace) -> Mapping[str, Any] | None:
+    """What the agent says of itself; None where none answers."""
     try:
         with connect(arguments) as agent:
-            status = agent.ask("status")
+            return agent.ask("status")
     except FailoverError:
-        return []
+        return None
+
+
+def _of_agent(status: Mapping[str, Any]) -> list[Offer]:
+    """What the agent that runs has been given, or was refused: a shell is often allowed more, or less, than a service."""
+    refused = [note for note in status["notes"] if note.startswith(LOCKED_OR_FIRST)]
+    if refused:
+        return [Offer("lesser", "real-time priority", f"the agent says: {note}") for note in refused]
+    if not status["realtime"]:
+        return [Offer("lesser", "real-time priority", "the agent does not ask for it: agent.toml says realtime = false")]
+    return [Offer("good", "real-time priority", "the agent's main loop has it, and its memory is locked")]
+
+
+def _standing_by(status: Mapping[str, Any]) -> list[Offer]:
+    """What this robot lacks of what the components need that it stands by for."""
     held = [one for one in status["components"] if one["role"] == "standby" and one["lacks"] is not None]
     lacking = [(one, lack) for one in held for lack in one["lacks"]]
     if lacking:
@@ -105,7 +123,7 @@ def _looking_into() -> list[Offer]:
 def _captured_once(pid: int) -> tuple[str, ...]:
     """What the keeper has to say about a process that it captures once and lets go."""
     with Keeper.spawn() as keeper:
-        protected, _ = keeper.ask(Protect(pid, "/check"), Protected)
+        protected, _ = keeper.ask(Protect(pid, "/check", verb="capture"), Protected)
         captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1), Captured)
         os.close(content)
         keeper.ask(Release(), Released)
@@ -145,7 +163,7 @@ def _chosen_pids() -> Offer:
 
 def _real_time() -> Offer:
     if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[1] > 0:
-        return Offer("good", "real-time priority", "the agent's main loop can have it")
+        return Offer("good", "real-time priority", "an agent that is started from here can have it")
     text = "not for this user: a busy machine may look dead; set LimitRTPRIO=, see systemd/failover-agent.service"
     return Offer("lesser", "real-time priority", text)
 
@@ -153,7 +171,7 @@ def _real_time() -> Offer:
 def _memory_lock() -> Offer:
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
     if os.geteuid() == 0 or limit == resource.RLIM_INFINITY:
-        return Offer("good", "locked memory", "the agent's main loop is never swapped out")
+        return Offer("good", "locked memory", "the main loop of an agent that is started from here is never swapped out")
     return Offer("lesser", "locked memory", f"limited to {limit >> 20} MiB for this user; set LimitMEMLOCK=infinity")
 
 

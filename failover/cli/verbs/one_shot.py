@@ -92,7 +92,7 @@ def capture(arguments: argparse.Namespace) -> int:
     if target.exists() and not arguments.force:
         raise FailoverError(f"cannot write {target}: it exists; give another name, or --force to replace it")
     with Keeper.spawn() as keeper:
-        order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=terms_of(arguments))
+        order = Protect(arguments.pid, f"/pid/{arguments.pid}", terms=terms_of(arguments), verb="capture")
         protected, _ = _at_last(arguments.pid, lambda: keeper.ask(order, Protected))
         held = not arguments.leave_running
         whole = Capture(base=True, generation=1, sequence=1, hold=held)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import socket
+import tomllib
 from pathlib import Path
 
 from failover.cli import key_pairs
@@ -44,9 +47,34 @@ def enrol(arguments: argparse.Namespace) -> int:
             team.forget_secret_key(directory, arguments.name)
         path = team.write_secret_key(directory, arguments.name, secret)
         answer["secret_key_file"] = str(path)
-        sentence += f", and {path} to {arguments.name} alone, then remove it here"
+        sentence += f"; {_place_of(path, arguments.name, enrolled.robots[arguments.name], directory)}"
     _write(directory, enrolled)
     return _tell(arguments, answer, sentence)
+
+
+def _place_of(key: Path, name: str, member: Robot, directory: Path) -> str:
+    """Where a secret key that was made here belongs: on its own robot, which may be this machine."""
+    if _is_here(name, member, directory):
+        return f"this machine is {name}, so its secret key stays here, in {key}"
+    return f"if this machine is not {name}, copy {key} to {name} alone, then remove it here"
+
+
+def _is_here(name: str, member: Robot, directory: Path) -> bool:
+    """Whether this machine is known to be that member: agent.toml beside the team says so, or one of its addresses is ours."""
+    with contextlib.suppress(OSError, ValueError):
+        if tomllib.loads((directory.resolve().parent / "agent.toml").read_text()).get("robot") == name:
+            return True
+    return any(_is_ours(team.split_address(address, name)[0]) for address in member.beats)
+
+
+def _is_ours(host: str) -> bool:
+    """Whether a number is an address of this machine; a name is not looked up, for that can take its time."""
+    with contextlib.suppress(OSError, ValueError):
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+            return True
+    return False
 
 
 def show(arguments: argparse.Namespace) -> int:

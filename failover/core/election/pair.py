@@ -158,7 +158,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.unprotected, component.needs_base = False, False
     component.degraded = component.awaited = ""
     component.undelivered = component.unstored = ""
-    component.resumed_ns = component.resumed_age_ns = -1
+    component.resumed_ns = component.lost_ns = -1
     component.safe = component.vouched = component.shown = None
     component.handing, component.ending, component.reported = None, False, False
     component.ordered = False

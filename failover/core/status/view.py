@@ -164,8 +164,9 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(slow)
     if _protection(component, turn) is Protection.NONE and component.holding and (ending := _ending(component, turn)):
         notes.append(f"{' and '.join(ending)} cannot stand by yet: that robot still ends its own copy")
-    if component.holding and component.resumed_age_ns >= STALE_NS:
-        notes.append(f"it resumed at {turn.me} from a checkpoint that was {component.resumed_age_ns / NS_PER_S:.1f} s old")
+    if component.holding and component.lost_ns >= STALE_NS:
+        lost_s = component.lost_ns / NS_PER_S
+        notes.append(f"it resumed at {turn.me} from its last checkpoint and lost {lost_s:.1f} s of its work")
     if staying := failback.note(component):
         notes.append(staying)
     if component.unstored and component.state is State.STANDBY:

@@ -88,15 +88,15 @@ def _call_off(component: Component, turn: Turn, handing: Handing) -> None:
 
 def _refusal(component: Component, turn: Turn, target: str) -> str:
     if component.state is not State.PRIMARY:
-        return f"{component.name} is {component.state} at {turn.me}; only a running primary can be handed over"
+        return f"{component.name} is {component.state} at {turn.me}; only a running primary can be moved"
     if target == turn.me:
         return f"{component.name} runs at {turn.me} already"
     if not target:
         return f"{component.name} runs at {turn.me} and has no standby to go to; wait until it has one"
     if not turn.config.runs(target):
-        return f"cannot hand {component.name} over to {target}: it runs nothing; name a robot"
+        return f"cannot move {component.name} to {target}: it runs nothing; name a robot"
     if target not in turn.config.peers:
-        return f"cannot hand {component.name} over to {target!r}: the team knows {', '.join((turn.me, *turn.config.peers))}"
+        return f"cannot move {component.name} to {target!r}: the team knows {', '.join((turn.me, *turn.config.peers))}"
     if target != component.standby or not turn.alive(target):
         return f"{target} is not its living standby; set standby = {target!r} in its rules and wait until it is protected there"
     if component.acked is None or component.parent is None:

@@ -134,6 +134,10 @@ def test_a_program_that_cannot_be_started_is_refused_with_the_reason(guard: Guar
     refused = agent.ask(guard.order("/no/such/program"))
     assert isinstance(refused, Refused)
     assert "cannot start /no/such/program" in refused.message and "No such file" in refused.message
+    refused = agent.ask(guard.order("nosuch.py"))
+    assert isinstance(refused, Refused)
+    assert refused.message.startswith("cannot start nosuch.py: no directory of its PATH has nosuch.py")
+    assert "b'" not in refused.message
     guard.start(agent, "/bin/true")  # and the guard is still of use
 
 

@@ -33,7 +33,7 @@ NO_KIND = (
     "there is no such process",
     "that is not the number of a process",
     "not permitted; run as that user",
-    "cannot protect pid {} ({}): {}",
+    "cannot {} pid {} ({}): {}",
     "cannot capture {} (pid {}): {}",
     "cannot capture pid {}: {}",
     "has become another program (exec)",

@@ -158,6 +158,25 @@ def test_watching_shows_every_picture_until_interrupted(agent: Start) -> None:
     assert stand_in.asked[0].arguments["watch"] is True
 
 
+CHECKED = {
+    "refused": (
+        {"realtime": False, "notes": ["beats run at normal priority: the system refused SCHED_FIFO (not permitted); give it"]},
+        ("lesser", "the agent says: beats run at normal priority: the system refused SCHED_FIFO"),
+    ),
+    "not asked for": ({"realtime": False}, ("lesser", "agent.toml says realtime = false")),
+    "had": ({}, ("good", "the agent's main loop has it, and its memory is locked")),
+}
+
+
+@pytest.mark.parametrize(("answer", "said"), CHECKED.values(), ids=CHECKED)
+def test_check_says_what_the_agent_was_given_and_not_what_this_shell_may_have(
+    agent: Start, answer: dict[str, Any], said: tuple[str, str]
+) -> None:
+    ran = failover("check", "--json", socket=agent(answering(STATUS | {"components": []} | answer)).path)
+    found = [offer for offer in json.loads(ran.stdout)["offers"] if offer["what"] in ("real-time priority", "locked memory")]
+    assert [offer["verdict"] for offer in found] == [said[0]] and said[1] in found[0]["text"]
+
+
 # --- Run -------------------------------------------------------------------------------------------------------------
 
 
@@ -333,6 +352,30 @@ def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> Non
     assert failover(*words).returncode == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("stauts", "did you mean 'status'?"),
+        ("run --engine ptrce -- x", "'ptrce' is none of auto, ptrace, cooperative; did you mean 'ptrace'?"),
+        ("run --output=comitted -- x", "'comitted' is none of immediate, committed; did you mean 'committed'?"),
+        ("run --portable=x86-64-v9 -- x", "is none of no, x86-64-v1"),
+        (
+            "run --device /dev/x=repen -- x",
+            "'repen'; say reopen, hook, optional, or the path of a device; did you mean 'reopen'?",
+        ),
+        ("protect 1 --connections cary", "'cary' is none of reset, carry; did you mean 'carry'?"),
+        ("stop x --signal TREM", "did you mean 'TERM'?"),
+        ("team shwo", "'shwo' is none of create, enrol, show; did you mean 'show'?"),
+        ("team enrol x 192.0.2.1 --role servr", "'servr' is none of robot, server, witness; did you mean 'server'?"),
+        ("completion zhs", "'zhs' is none of bash, zsh, tcsh; did you mean 'zsh'?"),
+        ("logs x --stream 3", "3 is none of 1, 2"),
+    ],
+)
+def test_a_word_that_is_none_of_its_choices_is_answered_with_all_of_them(words: str, said: str) -> None:
+    ran = failover(*words.split())
+    assert (ran.returncode, said in ran.stderr) == (2, True), ran.stderr
+
+
 @pytest.mark.parametrize("verb", [verb.name for verb in parser.VERBS])
 def test_every_verb_explains_itself(verb: str) -> None:
     ran = failover(verb, "--help")
@@ -401,6 +444,35 @@ def test_servers_and_witnesses_are_enrolled_and_stay_what_they_are(tmp_path: Pat
     assert failover("team", "enrol", "gate", "10.0.0.9", "--replace", *place).returncode == 0
     shown = json.loads(failover("team", "show", *place).stdout)["robots"]
     assert {name: one["role"] for name, one in shown.items()} == {"hall": "server", "gate": "witness"}
+
+
+def enrolled(place: Path, name: str, address: str) -> str:
+    """What is said to somebody who enrols a robot, with a key that is made here."""
+    ran = failover("team", "enrol", name, address, "--directory", str(place))
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_a_robot_that_is_enrolled_on_itself_is_told_to_keep_its_key(tmp_path: Path) -> None:
+    place = tmp_path / "team"
+    failover("team", "create", "lab", "--directory", str(place))
+    (tmp_path / "agent.toml").write_text('robot = "r1"\n')
+    by_name, by_address = enrolled(place, "r1", "192.0.2.11"), enrolled(place, "r2", "127.0.0.1:7420")
+    for said, key in ((by_name, "r1.secret"), (by_address, "r2.secret")):
+        assert "its secret key stays here" in said and str(place / "keys" / key) in said and "remove" not in said
+    for name, address in (("r3", "192.0.2.13"), ("r4", "robot4.example")):
+        said = enrolled(place, name, address)
+        assert f"if this machine is not {name}, copy {place / 'keys' / name}.secret to {name} alone, then remove it here" in said
+
+
+def test_nothing_advises_to_delete_a_key_that_is_there(tmp_path: Path) -> None:
+    place = ["--directory", str(tmp_path)]
+    failover("team", "create", "lab", *place)
+    enrolled(tmp_path, "r1", "127.0.0.1")
+    (tmp_path / "team.toml").unlink()
+    failover("team", "create", "lab", *place)
+    ran = failover("team", "enrol", "r1", "127.0.0.1", *place)
+    assert ran.returncode == 1 and "r1.secret exists" in ran.stderr and "emove it" not in ran.stderr
 
 
 def test_without_a_team_file_the_way_to_one_is_named(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from failover.core.events import (
     CaptureFailed,
     Command,
     Committed,
+    Exited,
     Failback,
     Handover,
     NothingToCapture,
@@ -23,6 +24,7 @@ from failover.core.events import (
     Promote,
     Received,
     Release,
+    Restored,
     Run,
     Started,
     Stop,
@@ -323,3 +325,27 @@ def test_a_robot_finds_out_that_others_remember_a_life_that_its_ballot_does_not(
     node = Node(PAIR, 4, Ballot(), 0)
     node.step(Tick(), 0)
     assert node.outlived_by(Beat("robot2", 1, 1, 0, 0, 0, (echo,), ())) == remembered
+
+
+@pytest.mark.parametrize(("launch", "verb"), [(SPEC.launch, "run"), (Launch(pid=41), "protect")], ids=["run", "protect"])
+def test_a_start_is_refused_in_the_words_of_the_order(launch: Launch, verb: str) -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    node.step(Run(1, SPEC), 0)
+    (refusal,) = only(node.step(Run(2, replace(SPEC, launch=launch)), MS), acts.Answer)
+    assert not refusal.ok and refusal.sentence.startswith(f"cannot {verb} {SPEC.name}: ")
+
+
+@pytest.mark.parametrize(("lost_ns", "lost_s"), [(500 * MS, 0.5), (-1, 8.1)], ids=["known", "not known"])
+def test_a_component_that_resumes_says_what_was_lost_and_not_how_long_it_did_not_run(lost_ns: int, lost_s: float) -> None:
+    node = Node(ALONE, 1, Ballot(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    position = Position(capture.generation, capture.sequence, b"d")
+    node.step(Captured("/lab/x", 1, position, None), 5 * MS)
+    (restore,) = only(node.step(Exited("/lab/x", 1, 9), 6 * MS), acts.Restore)
+    assert isinstance(restore, acts.Restore)
+    ready = node.step(Restored("/lab/x", restore.epoch, position, 8_100 * MS, lost_ns), 9_000 * MS)
+    (told,) = (one.sentence for one in ready.told if "resumes from checkpoint" in one.sentence)
+    assert told.endswith(f"; it lost {lost_s} s of its work")
+    notes = node.status(9_001 * MS).components[0].notes
+    assert ("it resumed at robot1 from its last checkpoint and lost 8.1 s of its work" in notes) == (lost_ns < 0)

@@ -147,13 +147,13 @@ class PtraceSession:
         trees = None
         try:
             if reasons := thread_credentials.refuse(pid, order.terms.owner):
-                raise UnsupportedError(f"cannot protect pid {pid}: {reasons[0]}", reasons)
+                raise UnsupportedError(f"cannot {order.verb} pid {pid}: {reasons[0]}", reasons)
             surroundings = probe.surroundings_of(pid, order.streams, order.terms, may_repeat=order.is_guarded)
-            report = probe.probe(pid, surroundings, files_kept=order.names is not None)
+            report = probe.probe(pid, surroundings, files_kept=order.names is not None, verb=order.verb)
             trees = told_by_spokesman(pid, lambda tid: carried_capture.followed(tid, order.terms))
             reasons = (*report.reasons, *(trees.refuse() if trees else ()))
             if reasons:
-                raise UnsupportedError(f"cannot protect pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
+                raise UnsupportedError(f"cannot {order.verb} pid {pid} ({report.command}): {'; '.join(reasons)}", reasons)
             if surroundings.connections:
                 tcp_handover.heard_again(told_by_spokesman(pid, glance))
             kin = Kinship(pid, descendants.reaper_of(pid, is_guarded=order.streams is not None))

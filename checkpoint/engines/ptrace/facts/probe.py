@@ -42,18 +42,19 @@ COMMAND_LENGTH: Final = 200
 """Characters of a command line that a report shows."""
 
 
-def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: bool = False) -> Report:
+def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: bool = False, verb: str = "check") -> Report:
     """Look at a process.
 
     Args:
         surroundings: of a process that lives under a guard, see `surroundings_of`.
+        verb: what the user asked for, as a refusal says it.
 
     Raises:
         ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
     """
     try:
         around = surroundings or surroundings_of(pid, None)
-        refusals.require_traceable(pid, procfs.status(pid))
+        refusals.require_traceable(pid, procfs.status(pid), verb)
         return told_by_spokesman(pid, functools.partial(_probe, pid, around, files_kept))
     except ProcessGoneError as error:
         raise ProbeError(f"cannot examine pid {pid}: there is no such process (any more)") from error

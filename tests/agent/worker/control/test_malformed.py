@@ -237,3 +237,17 @@ def test_what_a_peer_says_that_it_lacks_is_sentences_or_nothing(lacking: Any, to
 def test_arguments_that_no_program_could_be_started_or_ended_with_are_refused(kind: type, arguments: dict[str, Any]) -> None:
     with pytest.raises(RefusedError, match="its arguments are not right"):
         arguments_of(kind, "verb", arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"engine": "ptrce"}, "engine: 'ptrce' is none of auto, ptrace, cooperative; did you mean 'ptrace'?"),
+        ({"connections": "cary"}, "connections: 'cary' is none of reset, carry; did you mean 'carry'?"),
+        ({"hooks": {"after_resmue": ["x"]}}, "did you mean 'after_resume'?"),
+    ],
+)
+def test_a_word_that_is_none_of_its_choices_is_refused_with_all_of_them(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(RefusedError) as refused:
+        arguments_of(RunArguments, "run", {"argv": ["x"], **arguments})
+    assert said in str(refused.value)

@@ -490,6 +490,26 @@ def test_check_names_what_stands_against_a_capture_and_touches_nothing(tmp_path:
     assert process.returncode == 0
 
 
+@pytest.mark.parametrize("kind", ["refused", "a thread", "ended"])
+def test_each_verb_refuses_a_process_in_its_own_name(kind: str, tmp_path: Path) -> None:
+    holder = "import os, sys, threading\nos.pidfd_open(os.getppid())\nthreading.Thread(target=sys.stdin.read).start()\n"
+    with subprocess.Popen([PYTHON, "-c", holder], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        assert process.stdin is not None
+        wait_for("its thread", lambda: len(thread_ids(process.pid)) == 2)
+        pid = process.pid
+        if kind == "a thread":
+            (pid,) = set(thread_ids(process.pid)) - {process.pid}
+        elif kind == "ended":
+            process.stdin.close()
+            wait_for("its end", lambda: procfs.status(process.pid).has_ended)
+        for words in (["check", str(pid)], ["capture", str(pid), "-o", str(tmp_path / "x")]):
+            ran = failover(*words)
+            assert ran.returncode == 1 and "protect" not in ran.stderr, ran.stderr
+            if not (kind == "refused" and words[0] == "check"):  # which shows a table
+                assert f"cannot {words[0]} " in ran.stderr and str(pid) in ran.stderr
+        process.stdin.close()
+
+
 def test_check_without_a_pid_says_what_this_machine_offers() -> None:
     ran = failover("check", "--json")
     offers = json.loads(ran.stdout)["offers"]

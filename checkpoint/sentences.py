@@ -1,0 +1,24 @@
+"""Parts of sentences for people: what the kernel said, and what was probably meant."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+
+def in_words(error: BaseException) -> str:
+    """An error as people read it: what the kernel says without its number, and a file's name as text, also where it was bytes."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    named = [
+        name if isinstance(name, int) else os.fsdecode(name) for name in (error.filename, error.filename2) if name is not None
+    ]
+    return error.strerror + (f" ({', '.join(map(str, named))})" if named else "")
+
+
+def near(said: str, choices: Iterable[str]) -> str:
+    """The question whether one of the choices was meant, to be added to a sentence; "" where none is near."""
+    import difflib  # for a mistake only
+
+    found = difflib.get_close_matches(said, list(choices), 1)
+    return f"; did you mean {found[0]!r}?" if found else ""
