@@ -90,12 +90,15 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
     Which files it carries its snapshots say.
     """
     carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
-    budget_ns = round(component.freeze_budget_ms * 1_000_000)
+    budget_ns, overrun_ns = round(component.freeze_budget_ms * 1_000_000), round(component.freeze_overrun_s * 1_000_000_000)
+    own = Terms(
+        carry, component.device_rules(), freeze_budget_ns=budget_ns, shared=component.shared, freeze_overrun_ns=overrun_ns
+    )
     if launch is None:
-        return Terms(carry, component.device_rules(), freeze_budget_ns=budget_ns, shared=component.shared)
+        return own
     devices = merged(arrived(launch.devices), component.device_rules())
     shared = tuple(dict.fromkeys((*launch.shared, *component.shared)))
-    return Terms(carry, devices, launch.connections == CARRY, budget_ns, shared)
+    return replace(own, devices=devices, connections=launch.connections == CARRY, shared=shared)
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:

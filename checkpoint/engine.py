@@ -122,7 +122,8 @@ class Terms(Struct, frozen=True):
         devices: what becomes of devices that it has open.
         connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
         freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
-            far as needed; 0: as short as can be.
+            far as needed; a freeze that would take longer is given up; 0: as short as can be.
+        freeze_overrun_ns: when no capture has kept to that for so long, one may take longer; 0: none may.
         owner: with whose rights its files are opened, and beyond whose rights nothing of it is captured: each capture asks again.
             None: with those that its process has; it may have any, for its owner is root, or the keeper has no rights to lend.
         shared: files, and folders with all that is in them, that others write to as well: they keep the content that they have
@@ -135,6 +136,7 @@ class Terms(Struct, frozen=True):
     freeze_budget_ns: int = 0
     shared: tuple[str, ...] = ()
     owner: Owner | None = None
+    freeze_overrun_ns: int = 0
 
     def is_shared(self, path: str) -> bool:
         """Whether a file is one of those that are shared, or lies in such a folder."""

@@ -32,6 +32,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_vessel
 from checkpoint.linux.trace import entry, remote_syscalls
 from checkpoint.linux.trace.remote_syscalls import Desk
+from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.round_trip import (
     ENGINE,
     PATIENCE_S,
@@ -204,6 +205,7 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
         with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while failover examined it"):
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         assert goes_on(worker)
+        assert remote_syscalls.patience_ns(Tracee(worker.pid)) == remote_syscalls.BUSY_TIMEOUT_NS, "it is busy here"
         monkeypatch.undo()
         captured_at_last(session, CaptureOrder(base=False, generation=1, sequence=2))
     expect_undisturbed(worker)

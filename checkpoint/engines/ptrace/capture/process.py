@@ -190,10 +190,10 @@ class CapturedProcess:
             self._flags.refresh(self.memory.lines, anew=True)
             self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
 
-    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+    def copy_running(self, *, base: bool, enough: int = 0, copied: RunningCopy | None = None) -> RunningCopy:
         """As `MemoryCapture.copy_running`, with what is prepared before."""
         self.prepare(base=base)
-        copied = self.memory.copy_running(base=base, enough=enough)
+        copied = self.memory.copy_running(base=base, enough=enough, copied=copied)
         if base:  # which takes long: a thread may have confined itself since
             self.onlooker.rights.prepare()
             self.onlooker.tables.prepare()
