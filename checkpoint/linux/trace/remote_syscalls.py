@@ -42,7 +42,7 @@ from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, Registers, TablePlaces
-from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.errors import CaptureError, ProcessGoneError, RanOnError
 from checkpoint.linux import abi
 from checkpoint.linux.memory.remote_memory import Memory, Place, ranges_of
 from checkpoint.linux.trace.thread_dispatch import Round
@@ -602,7 +602,7 @@ def set_back(guest: Guest, is_ours: Callable[[int], bool]) -> Registers:
         tracee.is_as_found = True  # whatever it stands in now it has come to by itself
         waited_ms = patience_ns(tracee) // 1_000_000
         _busy.set()
-        raise CaptureError(
+        raise RanOnError(
             f"pid {tracee.pid} has run on while failover examined it: failover got no processor for {waited_ms} ms; "
             "capture it again"
         )

@@ -32,11 +32,19 @@ from checkpoint.engine import PTRACE, CaptureOrder, ProtectOrder
 from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget, OverBudgetError
 from checkpoint.engines.ptrace.capture.memory import RunningCopy
 from checkpoint.engines.ptrace.capture.pages import Pages, joined, with_parcel
-from checkpoint.engines.ptrace.capture.process import CapturedProcess, Look
+from checkpoint.engines.ptrace.capture.process import RAN_ON_MAX, CapturedProcess, Look
 from checkpoint.engines.ptrace.capture.tree import CapturedTree, MovedError, SeenOthers
 from checkpoint.engines.ptrace.facts import describe, memory_limits, probe
 from checkpoint.engines.stream_output import Outputs
-from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError, let_go
+from checkpoint.errors import (
+    CaptureError,
+    CheckpointError,
+    ProbeError,
+    ProcessGoneError,
+    RanOnError,
+    UnsupportedError,
+    let_go,
+)
 from checkpoint.linux import abi, system_v_ipc
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.procfs import descendants, procfs
@@ -219,9 +227,14 @@ class PtraceSession:
         return self._captured(order, may_stay=order.base and order.hold and self._carried is None)
 
     def _captured(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
+        ran_on = 0
         for _ in range(SPOKESMEN_MAX):
             try:
                 return self._captured_once(order, may_stay=may_stay)
+            except RanOnError:
+                ran_on += 1
+                if ran_on == RAN_ON_MAX:
+                    raise
             except CaptureError:
                 if not self._speaks_by_another():
                     raise
