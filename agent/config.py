@@ -60,6 +60,9 @@ class HooksConfig:
         return found
 
 
+OVERRUN_S_MAX: Final = 3_600
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceConfig:
     """A rule for a device that needs more than a word.
@@ -84,8 +87,8 @@ class ComponentConfig:
         standby: the robot that keeps its snapshots; "" lets the team choose.
         prefer: the robot that should run it; "" for wherever it is.
         snapshot_period_ms: 0 for the agent's own.
-        freeze_budget_ms: how long it may stand still for a snapshot here, as far as that depends on what is copied; 0: as short
-            as can be.
+        freeze_budget_ms: how long it may stand still for a snapshot here: a longer freeze is given up; 0: as short as can be.
+        freeze_overrun_s: when no capture has kept to the budget for so long, one may take longer; 0: none may.
         portable: a level of processors that it must be able to go on at, see `checkpoint.program.cpu_baseline`; true for
             the usual one; "" for the agent's own.
         warm: a program that keeps its state itself is started here in advance, where this robot is its standby, and waits.
@@ -114,6 +117,7 @@ class ComponentConfig:
     prefer: str = ""
     snapshot_period_ms: int = 0
     freeze_budget_ms: float = 0
+    freeze_overrun_s: float = 20
     portable: bool | str = ""
     warm: bool = True
     ready_copy: bool = True
@@ -341,6 +345,10 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
         if not 0 <= component.freeze_budget_ms <= PERIOD_MS_MAX:
             raise ConfigError(
                 f"{where}: freeze_budget_ms is {component.freeze_budget_ms:g}; at most {PERIOD_MS_MAX}; 0: as short as can be"
+            )
+        if not 0 <= component.freeze_overrun_s <= OVERRUN_S_MAX:
+            raise ConfigError(
+                f"{where}: freeze_overrun_s is {component.freeze_overrun_s:g}; at most {OVERRUN_S_MAX}; 0: none takes longer"
             )
         try:
             _check_level(component.portable)

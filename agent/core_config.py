@@ -90,21 +90,23 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
     Which files it carries its snapshots say.
     """
     carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
-    budget_ns = round(component.freeze_budget_ms * 1_000_000)
-    detaches = (component if launch is None else launch).shared_memory == DETACH
-    if launch is None:
-        rules = component.device_rules()
-        return Terms(carry, rules, freeze_budget_ns=budget_ns, shared=component.shared, detaches_memory=detaches)
-    devices = merged(arrived(launch.devices), component.device_rules())
-    shared = tuple(dict.fromkeys((*launch.shared, *component.shared)))
-    return Terms(
+    budget_ns, overrun_ns = round(component.freeze_budget_ms * 1_000_000), round(component.freeze_overrun_s * 1_000_000_000)
+    own = Terms(
         carry,
-        devices,
-        launch.connections == CARRY,
-        budget_ns,
-        shared,
+        component.device_rules(),
+        freeze_budget_ns=budget_ns,
+        freeze_overrun_ns=overrun_ns,
+        shared=component.shared,
+        detaches_memory=(component if launch is None else launch).shared_memory == DETACH,
+    )
+    if launch is None:
+        return own
+    return replace(
+        own,
+        devices=merged(arrived(launch.devices), component.device_rules()),
+        connections=launch.connections == CARRY,
         refuses_connections=launch.connections == REFUSE,
-        detaches_memory=detaches,
+        shared=tuple(dict.fromkeys((*launch.shared, *component.shared))),
     )
 
 

@@ -128,7 +128,8 @@ class Terms(Struct, frozen=True):
         refuses_connections: a connection with others, of TCP or of unix sockets, stands against a capture; else it ends where the
             program goes on without it.
         freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
-            far as needed; 0: as short as can be.
+            far as needed; a freeze that would take longer is given up; 0: as short as can be.
+        freeze_overrun_ns: when no capture has kept to that for so long, one may take longer; 0: none may.
         owner: with whose rights its files are opened, and beyond whose rights nothing of it is captured: each capture asks again.
             None: with those that its process has; it may have any, for its owner is root, or the keeper has no rights to lend.
         shared: files, and folders with all that is in them, that others write to as well: they keep the content that they have
@@ -145,6 +146,7 @@ class Terms(Struct, frozen=True):
     owner: Owner | None = None
     detaches_memory: bool = False
     refuses_connections: bool = False
+    freeze_overrun_ns: int = 0
 
     def is_shared(self, path: str) -> bool:
         """Whether a file is one of those that are shared, or lies in such a folder."""

@@ -40,6 +40,10 @@ class ProcessGoneError(CaptureError):
     """The process ended while it was being looked at."""
 
 
+class RanOnError(CaptureError):
+    """The program did not wait for us any longer, because we got no processor. The next attempt is waited for longer."""
+
+
 class NothingCommittedError(CaptureError):
     """The program keeps its state itself, and has committed nothing yet: nothing is wrong, there is nothing to capture."""
 

@@ -78,6 +78,20 @@ class Unchanged(Struct, frozen=True):
     position: Position
 
 
+class UnderWay(Struct, frozen=True):
+    """The act Capture or Ship is carried out still; told every few seconds, so that what takes long is not begun anew.
+
+    Attributes:
+        position: None: it is being taken.
+        to: the robot or server that it is sent to; "" while it is being taken.
+    """
+
+    component: str
+    epoch: int
+    position: Position | None = None
+    to: str = ""
+
+
 class CaptureFailed(Struct, frozen=True):
     """The act Capture came to nothing; the program runs on and nothing was forgotten.
 
@@ -302,6 +316,7 @@ Event = (
     | Started
     | Captured
     | Unchanged
+    | UnderWay
     | CaptureFailed
     | NothingToCapture
     | Committed

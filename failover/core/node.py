@@ -38,6 +38,7 @@ from failover.core.events import (
     StoreFailed,
     Tick,
     Unchanged,
+    UnderWay,
     Unread,
     Warmed,
 )
@@ -347,6 +348,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             standby.captured(component, turn, event)
         case Unchanged():
             standby.unchanged(component, turn, event)
+        case UnderWay():
+            standby.under_way(component, turn, event)
         case CaptureFailed():
             standby.capture_failed(component, turn, event)
         case NothingToCapture():

@@ -241,7 +241,7 @@ class Config(Struct, frozen=True, dict=True):
         retry_ms: before another try of a capture that failed, or of a standby that did not answer.
         handover_ms: a planned move that takes longer is called off.
         grace_ms: after its own start a robot waits that long for peers that it has not heard yet (keys are handed over first).
-        ship_ms: a snapshot that is still on its way after that is given up.
+        ship_ms: a snapshot that is taken or sent, and of which nothing was heard for that long, is given up.
         restore_ms: a restore or start that says nothing for that long has failed.
         rule: by which primaries are replaced.
         servers: members, perhaps this one, that keep checkpoints and vote, and run nothing.

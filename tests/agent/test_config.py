@@ -122,6 +122,7 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (("# fine", "snapshot_period_ms = 0"), 5, "must be at least 1"),
         (('[components."/lab/a"]', "freeze_budget_ms = -1"), 4, "0: as short as can be"),
         (('[components."/lab/a"]', "freeze_budget_ms = nan"), 4, "freeze_budget_ms is nan"),
+        (('[components."/lab/a"]', "freeze_overrun_s = -1"), 4, "0: none takes longer"),
         (("link_mbit_s = -1",), 4, "0 means no cap"),
         (("keep_checkpoints = -1",), 4, "0 keeps none"),
         (("# fine", 'keep_for = "a week"'), 5, "'a week' is no span of time; write 90s, 10min, 2h or 3d"),

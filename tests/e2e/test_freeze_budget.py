@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.e2e import robots
 from tests.e2e.test_takeover import start_counting
 
-NEVER_KEPT = '[components."/demo/robot1/count"]\nfreeze_budget_ms = 0.001\n'
+NEVER_KEPT = '[components."/demo/robot1/count"]\nfreeze_budget_ms = 0.001\nfreeze_overrun_s = 0.001\n'
 ALWAYS_KEPT = '[components."/demo/robot1/count"]\nfreeze_budget_ms = 10000\n'
 
 SAID = "longer than its freeze_budget_ms of 0.001"

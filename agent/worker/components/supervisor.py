@@ -22,7 +22,7 @@ from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.system import clock
 from agent.system.adopted_process import Guest
 from agent.system.crash import end_lanes_on_mistake
-from agent.worker.components import launch, resume
+from agent.worker.components import launch, resume, under_way
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
 from agent.worker.components.hook_runner import Occasions
@@ -211,7 +211,8 @@ class Charge:
                     self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
                 component = self._present()
                 await self._occasions.before_capture(act, component.pid)
-                await self._snapshots.capture(component, act)
+                async with under_way.told(self.around.tell, events.UnderWay(self.name, act.epoch)):
+                    await self._snapshots.capture(component, act)
             case acts.Acknowledge():
                 if self.component is not None:
                     await self.component.acknowledge(act.position, is_safe=act.is_safe)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from agent.errors import AgentError, LaneError
 from agent.system.crash import end_lanes_on_mistake
+from agent.worker.components import under_way
 from agent.worker.replication.send_files import Bringing
 from agent.worker.replication.transfer import Shipper, digest_of
 from checkpoint.errors import CheckpointError
@@ -17,7 +18,7 @@ from checkpoint.snapshot.required_files import needs
 from checkpoint.store.index import Entry
 from checkpoint.store.store import Store
 from failover.core.acts import CancelShip, Ship
-from failover.core.events import Event, ShipEnded
+from failover.core.events import Event, ShipEnded, UnderWay
 from failover.core.wire.messages import Offer
 
 log = logging.getLogger("failover.dispatch")
@@ -74,7 +75,8 @@ class Dispatch:
     async def _ship(self, act: Ship) -> None:
         reason = ""
         try:
-            await self._send(act)
+            async with under_way.told(self._tell, UnderWay(act.component, act.epoch, act.position, act.to)):
+                await self._send(act)
         except (AgentError, CheckpointError) as error:
             reason = str(error)
         except OSError as error:

@@ -43,7 +43,10 @@ WINDOW: Final = WINDOW_CHUNKS * CHUNK_SIZE_MAX
 """Bytes under way without credit for more: keeps a 1 Gbit/s link with 10 ms of delay busy."""
 
 STORED_S: Final = 60.0
-"""A file counts as taken once it is durable, and a slow disk may take its time for the last 256 MB of it."""
+"""How long the sender of all bytes waits for the word that they are durable, or for a sign that the receiver is still at it."""
+
+SIGN_S: Final = 1.0
+"""Between two such signs: a busy robot checks and stores a snapshot of 2 GB for minutes."""
 
 GIVE_WAY_S: Final = 0.02
 """How long a chunk of a file waits for snapshots at most: they have the link to themselves, and a file arrives all the same."""
@@ -74,6 +77,7 @@ class _Outgoing(Struct):
     peer: str
     what: str
     until: int = 0
+    sent: bool = False
     taken: bool = False
     refused: str = ""
     moved: asyncio.Event = field(default_factory=asyncio.Event)
@@ -114,7 +118,8 @@ class Shipper:
                     await self._give_way()
                 await self._pace.wait(size)
                 await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
-            await self._until(transfer, lambda: transfer.taken, PATIENCE_S if isinstance(offer, Offer) else STORED_S)
+            transfer.sent = True
+            await self._until(transfer, lambda: transfer.taken, STORED_S)
         except (LaneError, asyncio.CancelledError):
             self._lane.say(peer, Cancel(number))
             raise
@@ -136,9 +141,9 @@ class Shipper:
         transfer.moved.set()
 
     async def _give_way(self) -> None:
-        """Let the snapshots that are under way go first, as long as a file may wait."""
+        """Let the bytes of snapshots go first, as long as a file may wait."""
         until = time.monotonic() + GIVE_WAY_S
-        while any(one.what is SNAPSHOT for one in self._outgoing.values()) and time.monotonic() < until:
+        while any(one.what is SNAPSHOT and not one.sent for one in self._outgoing.values()) and time.monotonic() < until:
             await asyncio.sleep(GIVE_WAY_S / 10)
 
     def lost(self, peer: str) -> None:
@@ -290,11 +295,13 @@ class Receiver:
             try:
                 await self._fill(peer, transfer, descriptor)
                 if isinstance(offer, Offer):
-                    self._lane.say(peer, Taken(offer.transfer))  # that it is stored, and proved, is said by the beat
-                    self._incoming.pop((peer, offer.transfer), None)
-                await self._desk.take(peer, offer, descriptor)
-                if isinstance(offer, Content):
-                    self._lane.say(peer, Taken(offer.transfer))
+                    self._incoming.pop((peer, offer.transfer), None)  # a newer one does not end what is whole
+                signs = asyncio.create_task(self._show_that_it_is_stored(peer, offer))
+                try:
+                    await self._desk.take(peer, offer, descriptor)
+                finally:
+                    signs.cancel()
+                self._lane.say(peer, Taken(offer.transfer))
             finally:
                 os.close(descriptor)
         except OSError as error:
@@ -307,6 +314,12 @@ class Receiver:
             self._lane.say(peer, Refuse(offer.transfer, str(error)))
         finally:
             self._incoming.pop((peer, offer.transfer), None)
+
+    async def _show_that_it_is_stored(self, peer: str, offer: Offered) -> None:
+        """Repeat the last credit, so that the sender knows that this robot has not forgotten it."""
+        while True:
+            await asyncio.sleep(SIGN_S)
+            self._lane.say(peer, Credit(offer.transfer, offer.size + WINDOW))
 
     async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
         offer, digest, end = transfer.offer, blake3(), 0

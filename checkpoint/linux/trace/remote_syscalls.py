@@ -33,6 +33,7 @@ import ctypes
 import functools
 import operator
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
@@ -41,7 +42,7 @@ from msgspec import Struct
 
 from checkpoint.arch import cpu as arch
 from checkpoint.arch.calls import Call, Registers, TablePlaces
-from checkpoint.errors import CaptureError, ProcessGoneError
+from checkpoint.errors import CaptureError, ProcessGoneError, RanOnError
 from checkpoint.linux import abi
 from checkpoint.linux.memory.remote_memory import Memory, Place, ranges_of
 from checkpoint.linux.trace.thread_dispatch import Round
@@ -62,6 +63,8 @@ MAGIC: Final = b"failover borrows these pages; 2\0"
 """Stands at the end of the code pages, and at the beginning of the table."""
 BATCH_TIMEOUT_S: Final = 1.0
 """How long a batch may take: its calls never wait, so only a machine that does not run the program at all exceeds this."""
+BUSY_TIMEOUT_NS: Final = 900_000_000
+"""How long a program waits for us on a machine that has once left us no processor for `arch.ENTRY_TIMEOUT_NS`."""
 STOPPED_TIMEOUT_NS: Final = 10_000_000_000
 """How long a program waits for us that somebody has stopped: that we are late is no reason for it to run."""
 CALL_LIMIT: Final = 200
@@ -208,12 +211,18 @@ class Guest(NamedTuple):
     lost: bytes = b""
 
 
+_busy = threading.Event()
+"""Set when a program has gone on by itself because this process got no processor."""
+
+
 def patience_ns(tracee: Tracee) -> int:
-    """How long a thread waits in our code for us before it goes on by itself.
+    """How long a thread waits in our code for us before it goes on by itself. After our end, all programs wait so long.
 
     Source: __ptrace_unlink() in kernel/ptrace.c: whose tracer dies stops again where its process is stopped.
     """
-    return STOPPED_TIMEOUT_NS if tracee.stopped_by else arch.ENTRY_TIMEOUT_NS
+    if tracee.stopped_by:
+        return STOPPED_TIMEOUT_NS
+    return BUSY_TIMEOUT_NS if _busy.is_set() else arch.ENTRY_TIMEOUT_NS
 
 
 class Desk:
@@ -591,9 +600,11 @@ def set_back(guest: Guest, is_ours: Callable[[int], bool]) -> Registers:
     found = arch.decode_registers(tracee.registers())
     if not is_ours(found[arch.INSTRUCTION_POINTER]):
         tracee.is_as_found = True  # whatever it stands in now it has come to by itself
-        raise CaptureError(
-            f"pid {tracee.pid} has run on while failover examined it: failover got no processor for "
-            f"{arch.ENTRY_TIMEOUT_NS // 1_000_000} ms; capture it again"
+        waited_ms = patience_ns(tracee) // 1_000_000
+        _busy.set()
+        raise RanOnError(
+            f"pid {tracee.pid} has run on while failover examined it: failover got no processor for {waited_ms} ms; "
+            "capture it again"
         )
     tracee.set_signal_mask(mask)
     tracee.set_registers(registers)

@@ -107,6 +107,7 @@ class Threads:
         asked_ns: when the first of them was asked to stop for the last `freeze`, by time.perf_counter_ns.
         is_one_of_many: other processes stand still meanwhile: one that waits inside the kernel (for a child of vfork, for one) is
             not waited for.
+        patience_ns: how long they may take to stop; None: as long as is usual.
 
     Args:
         mend: what is done to each thread that is let go as it was found, of which nothing else was asked.
@@ -125,6 +126,7 @@ class Threads:
         self._loose: dict[int, Tracee] = {}
         self.asked_ns = 0
         self.is_one_of_many = False
+        self.patience_ns: int | None = None
         self._burial: Burial | None = None
         self._seized: set[int] = set()
         self._have_ended = False
@@ -171,7 +173,8 @@ class Threads:
             self._known = {self.pid: self.leader, **self._held}
 
     def _freeze(self) -> None:
-        deadline = time.perf_counter() + STOP_TIMEOUT_S
+        patience_s = STOP_TIMEOUT_S if self.patience_ns is None else min(STOP_TIMEOUT_S, self.patience_ns / 1e9)
+        deadline = time.perf_counter() + patience_s
         ended: set[int] = set()
         self._moving.clear()
         self._have_ended = False
@@ -186,7 +189,7 @@ class Threads:
             fresh = [tid for tid in thread_ids(self.pid) if tid not in self._held and tid not in ended]
             if fresh and time.perf_counter() > deadline:
                 raise CaptureError(
-                    f"pid {self.pid} did not come to stand still within {STOP_TIMEOUT_S:g} s: it starts threads all the time, "
+                    f"pid {self.pid} did not come to stand still within {patience_s:g} s: it starts threads all the time, "
                     "or the machine leaves it no processor; capture it again"
                 )
 
@@ -306,7 +309,7 @@ class Threads:
                 is_here = is_here or (now == began and self._moving == {self.pid} and self.leader.is_here())
                 rest(now - began, is_here=is_here)
             now = time.perf_counter()
-            if now > deadline:
+            if self._moving and now > deadline:
                 raise no_stop(min(self._moving), now - began)
             if now > glance:
                 glance = now + GLANCE_S

@@ -12,7 +12,17 @@ from failover.core.component import Component, Flight, Turn
 from failover.core.election import lease, majority
 from failover.core.election.consent import grants, objects
 from failover.core.election.pair import supersede
-from failover.core.events import Captured, CaptureFailed, Committed, NothingToCapture, ShipEnded, Stored, StoreFailed, Unchanged
+from failover.core.events import (
+    Captured,
+    CaptureFailed,
+    Committed,
+    NothingToCapture,
+    ShipEnded,
+    Stored,
+    StoreFailed,
+    Unchanged,
+    UnderWay,
+)
 from failover.core.membership import Peer
 from failover.core.types import ENDED, HISTORY_MAX, MS, PEERS_MAX, Config, OnUnsupported, State
 from failover.core.wire.messages import NEEDS_BASE, Entry
@@ -114,6 +124,15 @@ def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
         return
     component.undelivered = ""
     component.due_ns = max(flight.started_ns + _period_ns(component, turn, flight), turn.now_ns)
+
+
+def under_way(component: Component, turn: Turn, event: UnderWay) -> None:
+    """What is taken, or sent, still may take its time: a base of a large program, on a busy machine, takes minutes."""
+    if event.epoch != component.epoch:
+        return
+    for flight in (component.flight, component.archives.get(event.to)):
+        if flight is not None and flight.position == event.position and event.to in ("", flight.to):
+            flight.until_ns = max(flight.until_ns, turn.now_ns + turn.config.ship_ms * MS)
 
 
 def capture_failed(component: Component, turn: Turn, event: CaptureFailed) -> None:

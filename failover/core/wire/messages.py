@@ -251,7 +251,7 @@ class Chunk(msgspec.Struct, frozen=True, tag="chunk"):
 
 
 class Taken(msgspec.Struct, frozen=True, tag="taken"):
-    """All bytes arrived and their digest is right. (That they are stored is said by the beat; a content is stored by then.)"""
+    """All bytes arrived, their digest is right, and the receiver has stored them, or has said by its heartbeat why not."""
 
     transfer: int
 

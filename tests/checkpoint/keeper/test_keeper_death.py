@@ -23,7 +23,10 @@ import pytest
 from checkpoint import arch
 from checkpoint.arch import cpu
 from checkpoint.engine import CaptureOrder, ProtectOrder
+from checkpoint.engines.ptrace.capture import process
+from checkpoint.engines.ptrace.capture import session as session_module
 from checkpoint.engines.ptrace.capture.frozen_process import Onlooker
+from checkpoint.engines.ptrace.capture.process import RAN_ON_MAX
 from checkpoint.errors import CaptureError
 from checkpoint.keeper import messages
 from checkpoint.keeper.messages import Channel, ChannelError, Reply
@@ -32,6 +35,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_vessel
 from checkpoint.linux.trace import entry, remote_syscalls
 from checkpoint.linux.trace.remote_syscalls import Desk
+from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.round_trip import (
     ENGINE,
     PATIENCE_S,
@@ -191,10 +195,12 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
 ) -> None:
     """Its code in the program waits for it, not for ever; by now the program has run on by itself."""
     wait_in_time = remote_syscalls._tables_when_done
+    tried: list[int] = []
 
     def wait_too_long(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
         tables = wait_in_time(memory, desks, end)
         assert goes_on(worker)
+        tried.append(len(tried))
         return tables
 
     with protected(worker) as session:
@@ -204,6 +210,8 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
         with pytest.raises(CaptureError, match=f"pid {worker.pid} has run on while failover examined it"):
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         assert goes_on(worker)
+        assert len(tried) == RAN_ON_MAX, "it was tried again, with more patience"
+        assert remote_syscalls.patience_ns(Tracee(worker.pid)) == remote_syscalls.BUSY_TIMEOUT_NS
         monkeypatch.undo()
         captured_at_last(session, CaptureOrder(base=False, generation=1, sequence=2))
     expect_undisturbed(worker)
@@ -250,6 +258,8 @@ def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: 
 @pytest.mark.parametrize("late", ["the first entry", "a batch"])
 def test_a_sleep_is_not_cut_short_where_a_keeper_is_late(late: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor where it dies: the thread gives itself everything back, and the kernel remembers no sleep any more by then."""
+    monkeypatch.setattr(session_module, "RAN_ON_MAX", 1)
+    monkeypatch.setattr(process, "RAN_ON_MAX", 1)
     with ended(start([sys.executable, "-c", SLEEPER], tmp_path)) as program:
         program.wait_for_line("ready")
         program.wait_until(lambda: procfs.stat(program.pid).state == "S", "it to sleep")

@@ -88,15 +88,20 @@ def test_its_tracer_is_ordinary_again_even_where_letting_go_goes_wrong(
         session.capture(CaptureOrder(base=False, sequence=3))
 
 
-def test_after_a_look_that_takes_long_and_before_the_first_there_is_no_precedence(allowed: None) -> None:
-    now, seen = [0.0], []
+def _weight() -> int:
+    return os.getpriority(os.PRIO_PROCESS, 0)
+
+
+def test_after_a_look_that_takes_long_and_before_the_first_it_has_weight_instead_of_precedence(allowed: None) -> None:
+    now, seen, usual = [0.0], [], _weight()
     ours = Precedence(lambda: now[0])
     for long in (0.001, 0.001, 1.0, 1.0, 0.001, 0.001):
         ours.take()
         seen.append(_policy() == os.SCHED_RR)
+        assert seen[-1] or _weight() == realtime_boost.NICE
         now[0] += long
         ours.give_back()
-        assert _policy() == os.SCHED_OTHER
+        assert (_policy(), _weight()) == (os.SCHED_OTHER, usual)
     assert seen == [False, True, True, False, False, True]
 
 

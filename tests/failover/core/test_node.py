@@ -31,6 +31,7 @@ from failover.core.events import (
     Stored,
     Tick,
     Unchanged,
+    UnderWay,
 )
 from failover.core.membership import Peer
 from failover.core.node import Node
@@ -163,6 +164,18 @@ def test_a_snapshot_that_was_lost_degrades_nothing_while_there_is_nothing_to_tak
     node.step(NothingToCapture("/lab/x", 1, "nothing yet"), 5_001 * MS)
     seen = node.status(9_000 * MS).components[0]
     assert (seen.protection, [note.partition(":")[0] for note in seen.notes]) == ("none", ["nothing to protect yet"])
+
+
+def test_a_snapshot_that_takes_long_is_not_begun_anew_while_it_is_under_way() -> None:
+    node = Node(replace(ALONE, ship_ms=500), 1, Ballot(), 0)
+    captures = [act for act in running(node).act if isinstance(act, acts.Capture)]
+    for now_ms in range(400, 4_000, 400):
+        ready = node.step(UnderWay("/lab/x", 1), now_ms * MS)
+        captures += [act for act in ready.act if isinstance(act, acts.Capture)]
+    assert len(captures) == 1, "it is taken once"
+    node.step(UnderWay("/lab/x", 7), 4_050 * MS)  # of another epoch
+    node.step(Tick(), 4_200 * MS)
+    assert only(node.step(Tick(), 6_000 * MS), acts.Capture), "nothing was heard of it"
 
 
 def test_a_first_commit_in_the_middle_of_a_capture_is_not_passed_over() -> None:

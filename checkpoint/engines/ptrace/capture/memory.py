@@ -23,6 +23,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct, field
 
+from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget, OverBudgetError
 from checkpoint.engines.ptrace.capture.memory_result import Taken, Unacknowledged, joined, since, with_one_tail
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
@@ -46,6 +47,8 @@ from checkpoint.runtime import parallel
 
 READ_CHUNK: Final = 8 << 20
 """Bytes that are read at a time while the program runs."""
+FREEZE_CHUNK: Final = 2 << 20
+"""Bytes that are read at a time in a freeze that must end in time."""
 BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first, where earlier ones copied as much."""
 BUFFER_SIZE_MIN: Final = 1 << 20
@@ -87,11 +90,15 @@ class RunningCopy(Struct):
         copies: oldest first; of a page that several have, the newest counts.
         valid: the pages of ``copies`` that no later scan has named.
         owed: what the snapshot would carry besides, by what was known when the last pass was over.
+        late: of a freeze that came to nothing: what it has named since.
+        start: see `MemoryCapture.start_over`.
     """
 
+    start: int = 0
     copies: list[Copy] = field(default_factory=list)
     valid: Words = field(default_factory=lambda: NONE)
     owed: Words = field(default_factory=lambda: NONE)
+    late: list[Scan] = field(default_factory=list)
 
     def add(self, copy: Copy) -> None:
         """Take in what was read since the last scan."""
@@ -144,7 +151,7 @@ class MemoryCapture:
         has_rings: some of them are rings of asynchronous I/O.
         has_segments: some of them are System V shared memory.
         readers: threads that copy while the program runs; more than one takes processors from it.
-        buffer: the component's; where nothing else is said, this process is all of it.
+        buffer, budget: the component's; where nothing else is said, this process is all of it.
 
     Args:
         tracker: owned from now on.
@@ -172,7 +179,9 @@ class MemoryCapture:
         self._vdso: Words = NONE
         self._followed: Words = NONE
         self.buffer = FreezeBuffer()
+        self.budget = FreezeBudget(0)
         self._is_armed = False
+        self._start = 0
         self._unacknowledged: list[Unacknowledged] = []
         self._left_out: Words = NONE
         self.acknowledged: Position | None = None
@@ -208,25 +217,32 @@ class MemoryCapture:
     def start_over(self) -> None:
         """Follow from the beginning with the next base: what was written is not known any more."""
         self._is_armed, self.acknowledged = False, None
+        self._start += 1
         self._guards.forget()
         self._unacknowledged.clear()
         self._left_out = NONE
 
     # While the program runs
 
-    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+    def copy_running(self, *, base: bool, enough: int = 0, copied: RunningCopy | None = None) -> RunningCopy:
         """Copy beforehand what is worth it, so that little is left for the freeze.
 
         Args:
+            copied: of this capture, before a freeze that came to nothing: it is carried on.
             enough: the pages that may be left, which are copied down to however many passes that takes as long as they catch up
                 with the program; 0: as few as is worth it.
         """
         self.refresh()
-        copied = RunningCopy()
-        if base:
-            self._copy_everything(copied)
+        is_again = copied is not None and copied.start == self._start
+        if copied is None or not is_again:
+            copied = RunningCopy(self._start)
+            if base:
+                self._copy_everything(copied)
+        for scan in copied.late:
+            copied.spoil(scan)
+        copied.late.clear()
         last = 0
-        for turn in range(BUDGET_PASS_LIMIT if enough else PASS_LIMIT):
+        for turn in range(BUDGET_PASS_LIMIT if enough or is_again else PASS_LIMIT):
             if not self._is_behind(copied, enough or (LARGE_COUNT if turn or base else WORTH_COUNT), base=base):
                 break
             self._catch_up(copied)
@@ -315,9 +331,10 @@ class MemoryCapture:
         scan = self._scan(everywhere=base)
         self._guards.named(scan)
         self._unacknowledged.append(Unacknowledged(None, scan.written, scan.cleared))
+        copied.late.append(scan)
         try:
             return self._taken(copied, scan, self._guards.found(self._mapped, self._tracker.watched), base=base)
-        except ProcessGoneError:
+        except (ProcessGoneError, OverBudgetError):
             raise
         except CaptureError:  # a page that has become a guard cannot be read
             guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
@@ -350,10 +367,16 @@ class MemoryCapture:
         missing = page_set.difference(page_set.union(owed, scan.written), guards)
         if base:
             missing = page_set.union(missing, self._vdso)  # for a machine whose kernel has another one
+        size = page_set.total_size(missing)
+        self.budget.require(size)
         began = time.perf_counter_ns()
-        content = self.buffer.piece(page_set.total_size(missing))
-        self._memory.read_pages_into(missing, content)
+        content = self.buffer.piece(size)
+        if self.budget.is_strict and size > FREEZE_CHUNK:
+            self._read_within_budget(missing, content)
+        else:
+            self._memory.read_pages_into(missing, content)
         copy_ns = time.perf_counter_ns() - began
+        self.budget.copied()
         self._left_out = guards
         return Taken(
             lines=self.lines,
@@ -366,6 +389,15 @@ class MemoryCapture:
             copy_ns=copy_ns,
             untouched=self._untouched(),
         )
+
+    def _read_within_budget(self, missing: Words, content: memoryview) -> None:
+        """Read in pieces, and look at the clock in between: on a busy machine copying takes longer than it used to."""
+        filled = 0
+        for piece in page_set.cut(missing, FREEZE_CHUNK):
+            self.budget.require(len(content) - filled)
+            size = page_set.total_size(piece)
+            self._memory.read_pages_into(piece, content[filled : filled + size])
+            filled += size
 
     def _untouched(self) -> Words:
         """Pages of files without a name that the process has mapped for itself, and has no copy of."""

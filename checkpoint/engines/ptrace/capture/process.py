@@ -9,6 +9,7 @@ import contextlib
 import functools
 import operator
 from collections.abc import Collection, Iterable, Iterator
+from typing import Final
 
 from msgspec import Struct
 
@@ -24,7 +25,7 @@ from checkpoint.engines.ptrace.capture.memory_result import Taken
 from checkpoint.engines.ptrace.capture.syscall_restart import Interruptions
 from checkpoint.engines.ptrace.facts.file_identity import Identities
 from checkpoint.engines.stream_output import Outputs
-from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError
+from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError, RanOnError
 from checkpoint.linux.memory.tracker import NONE, NOT_CARRIED
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.live_thread import SPOKESMEN_MAX, spokesman_of
@@ -43,6 +44,8 @@ from checkpoint.resources.survey import gather
 from checkpoint.runtime.identity_memo import Memo
 
 NOBODY: SharedPlaces = frozenset()
+RAN_ON_MAX: Final = 3
+"""Attempts at a program on a machine that leaves us no processor."""
 
 
 class Look(Struct, frozen=True):
@@ -132,10 +135,15 @@ class CapturedProcess:
     @classmethod
     def entered_first(cls, pid: int, order: ProtectOrder) -> CapturedProcess:
         """Enter the first process of a component; by another thread, where its first one has ended, or does so meanwhile."""
+        ran_on = 0
         for _ in range(SPOKESMEN_MAX):
             met = Met.by_its_spokesman(pid)
             try:
                 return cls.entered(met, order)
+            except RanOnError:
+                ran_on += 1
+                if ran_on == RAN_ON_MAX:
+                    raise
             except ProcessGoneError:
                 if spokesman_of(pid) == met.threads.pid:
                     raise
@@ -197,10 +205,10 @@ class CapturedProcess:
             self._flags.refresh(self.memory.lines, anew=True)
             self.identities.vmas(self.memory.lines, self._flags.flags, NONE)
 
-    def copy_running(self, *, base: bool, enough: int = 0) -> RunningCopy:
+    def copy_running(self, *, base: bool, enough: int = 0, copied: RunningCopy | None = None) -> RunningCopy:
         """As `MemoryCapture.copy_running`, with what is prepared before."""
         self.prepare(base=base)
-        copied = self.memory.copy_running(base=base, enough=enough)
+        copied = self.memory.copy_running(base=base, enough=enough, copied=copied)
         if base:  # which takes long: a thread may have confined itself since
             self.onlooker.rights.prepare()
             self.onlooker.tables.prepare()

@@ -30,14 +30,22 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from checkpoint.engine import NOTED, PTRACE, REFUSED, CaptureOrder, ProtectOrder
-from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget
+from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget, OverBudgetError
 from checkpoint.engines.ptrace.capture.memory import RunningCopy
 from checkpoint.engines.ptrace.capture.pages import Pages, joined, with_parcel
-from checkpoint.engines.ptrace.capture.process import CapturedProcess, Look
+from checkpoint.engines.ptrace.capture.process import RAN_ON_MAX, CapturedProcess, Look
 from checkpoint.engines.ptrace.capture.tree import CapturedTree, MovedError, SeenOthers
 from checkpoint.engines.ptrace.facts import describe, memory_limits, probe
 from checkpoint.engines.stream_output import Outputs
-from checkpoint.errors import CaptureError, CheckpointError, ProbeError, ProcessGoneError, UnsupportedError, let_go
+from checkpoint.errors import (
+    CaptureError,
+    CheckpointError,
+    ProbeError,
+    ProcessGoneError,
+    RanOnError,
+    UnsupportedError,
+    let_go,
+)
 from checkpoint.linux import abi, system_v_ipc
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.procfs import descendants, procfs
@@ -70,6 +78,8 @@ NS_PER_US: Final = 1000
 MOVED_S: Final = 2.0
 """How long a capture is made again because processes came and went in the middle of it."""
 MOVED_PAUSE_S: Final = 0.005
+FREEZES_MAX: Final = 4
+"""Freezes of one capture that may be given up because they would take too long."""
 
 
 class Frozen(Struct, frozen=True):
@@ -132,7 +142,9 @@ class PtraceSession:
         self._collects = False
         self._precedence = Precedence()
         self._reports = Reports()
-        self._budget = FreezeBudget(order.terms.freeze_budget_ns)
+        self._budget = FreezeBudget(order.terms.freeze_budget_ns, order.terms.freeze_overrun_ns)
+        self._budget_ms = order.terms.freeze_budget_ns / 1e6
+        first.memory.budget = self._budget
         self._owner = order.terms.owner
         self._epoch = 0
         self._closed = False
@@ -221,9 +233,14 @@ class PtraceSession:
         return self._captured(order, may_stay=order.base and order.hold and self._carried is None and self._is_single)
 
     def _captured(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
+        ran_on = 0
         for _ in range(SPOKESMEN_MAX):
             try:
                 return self._captured_once(order, may_stay=may_stay)
+            except RanOnError:
+                ran_on += 1
+                if ran_on == RAN_ON_MAX:
+                    raise
             except CaptureError:
                 if not self._speaks_by_another():
                     raise
@@ -276,6 +293,7 @@ class PtraceSession:
         self._refuse(probe.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept))
         first = CapturedProcess.entered_first(self.pid, self._first.order)
         self._first.close()
+        first.memory.budget = self._budget
         self._first = first
         self._tree.follow(first)
         if self._carried:
@@ -290,13 +308,17 @@ class PtraceSession:
         """
         deadline = time.monotonic() + MOVED_S
         self._longest_us = 0
+        copied: RunningCopy | None = None
+        given_up = 0
         while True:
             try:
                 self._tree.admit(held=self._held)
                 self._detach()
                 if base and (others := self._tree.processes()):
                     self._refuse(memory_limits.refuse_capture((self.pid, *(process.pid for process in others))))
-                copied = None if may_stay and not self._tree.processes() else self._copied_running(order, base=base)
+                may_stay = may_stay and not self._tree.processes()
+                copied = None if may_stay else self._copied_running(order, copied, base=base)
+                self._budget.begin(is_free=order.hold, is_last=given_up == FREEZES_MAX - 1)
                 frozen = self._frozen_look(copied, base=base, hold=order.hold)
                 if not order.hold:
                     self._require_whole(frozen.first, frozen.others)
@@ -310,6 +332,11 @@ class PtraceSession:
                 if is_last:
                     raise
                 time.sleep(MOVED_PAUSE_S)
+            except OverBudgetError as late:
+                let_go(late)
+                given_up += 1
+                if given_up == FREEZES_MAX:
+                    raise self._over_budget(given_up) from late
 
     def _detach(self) -> None:
         """Where the rules say so: find the shared memory that others have mapped, too, and tell of it as of its own."""
@@ -347,12 +374,28 @@ class PtraceSession:
             what = "another process has mapped shared memory of it in the middle of the capture, or it has unmapped some"
             raise CaptureError(f"cannot capture {self.component} (pid {self.pid}): {what}; capture it again")
 
-    def _copied_running(self, order: CaptureOrder, *, base: bool) -> RunningCopy:
-        """What is copied of the first process before the freeze; those of the others are kept by the tree."""
+    def _over_budget(self, given_up: int) -> CaptureError:
+        """What is said when no freeze of a capture fits the budget."""
+        coming_ns = self._budget.overrun_in_ns()
+        cure = "raise freeze_budget_ms, or set freeze_overrun_s"
+        if coming_ns is not None:
+            cure = f"in {coming_ns / 1e9:.0f} s one may take longer (freeze_overrun_s); to change that raise freeze_budget_ms"
+        return OverBudgetError(
+            f"cannot capture {self.component} (pid {self.pid}): failover gave {given_up} freezes up that would have taken "
+            f"longer than its freeze_budget_ms of {self._budget_ms:g}; {cure}"
+        )
+
+    def _copied_running(self, order: CaptureOrder, copied: RunningCopy | None, *, base: bool) -> RunningCopy:
+        """What is copied of the first process before the freeze; those of the others are kept by the tree.
+
+        Args:
+            copied: before a freeze that came to nothing.
+        """
         enough = self._enough()
         self._first.memory.readers = parallel.thread_count() if order.hold else 1  # it is not to run on by itself
-        copied = self._first.copy_running(base=base, enough=enough)
-        self._tree.copy_running(base=base, enough=enough)
+        is_again = copied is not None
+        copied = self._first.copy_running(base=base, enough=enough, copied=copied)
+        self._tree.copy_running(base=base, enough=enough, again=is_again)
         return copied
 
     def _enough(self) -> int:
@@ -398,12 +441,14 @@ class PtraceSession:
                 process.rehearse()
         began = self._freeze()
         try:
+            self._budget.require()
             others = None
             if self._tree.stand_still():
                 if copied is None:
                     raise MovedError(f"pid {self.pid} is not alone any more; capture it again")
                 self._refuse(refused_threads.refuse_kin(self._first.threads))
                 others = self._tree.begin_look()
+                self._budget.require()
             first = self._first.look(copied, self._outputs, base=base, opened=others.opened[self._first.pid] if others else None)
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
@@ -413,11 +458,22 @@ class PtraceSession:
                 self._require_whole(first, others)
             if hold and self._surroundings.connections:
                 self._departing = tcp_handover.depart(self._opened(first, others))
-        except BaseException:
+        except BaseException as error:
             self._note_freeze(began, self._thaw())
+            self._raise_if_late(error)
             raise
         ended = self._hold() if hold else self._thaw()
+        self._budget.ended(ended)
         return Frozen(first, others, self._note_freeze(began, ended), seen, self._departing, segments)
+
+    def _raise_if_late(self, error: BaseException) -> None:
+        """Whatever goes wrong with a capture when its time is over goes wrong because of that; but an end is an end.
+
+        Raises:
+            OverBudgetError: the time is over.
+        """
+        if isinstance(error, CaptureError) and not isinstance(error, ProcessGoneError) and self._budget.is_over:
+            raise OverBudgetError(str(error)) from error
 
     def _segments(self, others: SeenOthers | None) -> dict[int, Segment]:
         """The System V shared memory of this machine, where any of them has some: whoever runs may attach it, and be born."""
@@ -466,10 +522,12 @@ class PtraceSession:
         gc.disable()
         self._reports.keep()
         self._precedence.take()
+        self._first.threads.patience_ns = self._budget.left_ns()
         try:
             self._first.threads.freeze()
-        except BaseException:
+        except BaseException as error:
             self._be_ordinary()
+            self._raise_if_late(error)
             raise
         return self._first.threads.asked_ns
 

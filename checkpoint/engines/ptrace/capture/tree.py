@@ -218,7 +218,7 @@ class CapturedTree:
         """The first process is looked at anew."""
         self._first = first
         for process in self._known.values():
-            process.memory.buffer = first.memory.buffer
+            process.memory.buffer, process.memory.budget = first.memory.buffer, first.memory.budget
 
     def processes(self) -> tuple[CapturedProcess, ...]:
         """Those that are followed."""
@@ -292,7 +292,7 @@ class CapturedTree:
 
     def _add(self, process: CapturedProcess) -> None:
         process.threads.is_one_of_many = True
-        process.memory.buffer = self._first.memory.buffer
+        process.memory.buffer, process.memory.budget = self._first.memory.buffer, self._first.memory.budget
         process.detach(self._first.detached)
         self._known[process.pid] = process
 
@@ -308,14 +308,18 @@ class CapturedTree:
             self._refuse((reason,))
         return slot
 
-    def copy_running(self, *, base: bool, enough: int) -> None:
-        """As `MemoryCapture.copy_running`, with as many pages left of each of them."""
-        self._copied.clear()
+    def copy_running(self, *, base: bool, enough: int, again: bool) -> None:
+        """As `MemoryCapture.copy_running`, with as many pages left of each of them.
+
+        Args:
+            again: what was copied for a freeze that came to nothing is carried on.
+        """
+        before, self._copied = self._copied if again else {}, {}
         for pid, process in tuple(self._known.items()):
             try:
                 with _gone_if_ended(pid):
                     is_base = base or process.memory.acknowledged is None
-                    self._copied[pid] = process.copy_running(base=is_base, enough=enough)
+                    self._copied[pid] = process.copy_running(base=is_base, enough=enough, copied=before.get(pid))
             except ProcessGoneError:  # or it has executed another program
                 self._forget(pid)
             except CaptureError as error:
@@ -336,6 +340,7 @@ class CapturedTree:
         ended = set(self._ended)
         quiet = 0
         while quiet < QUIET_LISTINGS:
+            self._first.memory.budget.require()
             fresh = [pid for pid in self._kin.others() if pid not in self._standing and pid not in ended]
             quiet = 0 if fresh else quiet + 1
             for pid in fresh:
@@ -353,6 +358,7 @@ class CapturedTree:
         except ProcessGoneError:
             return False
         threads.is_one_of_many = True
+        threads.patience_ns = self._first.memory.budget.left_ns()
         try:
             threads.freeze()
         except ProcessGoneError:
@@ -445,6 +451,7 @@ class CapturedTree:
         if reasons := self._refusals(pid):
             self._refuse(reasons)
         met = self._met.get(pid) or replace(Met.of(pid), threads=threads)
+        self._first.memory.budget.require(procfs.status(pid).resident_size)
         process = CapturedProcess.entered_standing(met, self._first.order, self._free_slot())
         self._add(process)
         copied = process.copy_running(base=True)

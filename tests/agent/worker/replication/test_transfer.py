@@ -95,8 +95,8 @@ def content(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture(autouse=True)
-def _little_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def little_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer, "PATIENCE_S", 0.2)
 
 
@@ -126,6 +126,53 @@ def test_a_snapshot_arrives_whole(tmp_path: Path, content: Path) -> None:
     run(body())
 
 
+class Slow(Desk):
+    """Takes its time to check and to store."""
+
+    def __init__(self, free: asyncio.Event) -> None:
+        super().__init__()
+        self._free = free
+
+    async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
+        await self._free.wait()
+        await super().take(peer, offer, descriptor)
+
+
+def test_a_snapshot_that_is_stored_slowly_is_waited_for_as_long_as_its_receiver_shows_that_it_is_at_it(
+    tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transfer, "STORED_S", 1.0)
+    monkeypatch.setattr(transfer, "SIGN_S", 0.05)
+
+    async def body() -> None:
+        free = asyncio.Event()
+        two = Two(tmp_path, Slow(free))
+        shipping = asyncio.create_task(ship(two, content))
+        began = asyncio.get_running_loop().time()
+        while asyncio.get_running_loop().time() < began + 2.0:
+            assert not shipping.done(), "longer than its patience"
+            await asyncio.sleep(0.05)
+        assert not any(isinstance(message, Taken) for message in two.back.said), "it counts when it is stored, not before"
+        free.set()
+        await shipping
+        assert two.desk.taken == [content.read_bytes()]
+
+    run(body())
+
+
+def test_a_receiver_that_shows_nothing_is_not_waited_for(tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer, "STORED_S", 0.2)
+    monkeypatch.setattr(transfer, "SIGN_S", 10 * BOUND_S)
+
+    async def body() -> None:
+        two = Two(tmp_path, Slow(asyncio.Event()))
+        with pytest.raises(LaneError, match="robot2 took nothing"):
+            await ship(two, content)
+
+    run(body())
+
+
+@pytest.mark.usefixtures("little_patience")
 def test_never_more_chunks_are_under_way_than_there_is_credit_for(tmp_path: Path, content: Path) -> None:
     async def body() -> None:
         two = Two(tmp_path, Desk())
@@ -149,6 +196,7 @@ def test_an_offer_that_cannot_leave_is_given_up_at_once(tmp_path: Path, content:
     run(body())
 
 
+@pytest.mark.usefixtures("little_patience")
 @pytest.mark.parametrize("at", [0, 3])
 def test_a_sender_that_falls_silent_leaves_nothing_and_is_told_why(tmp_path: Path, content: Path, at: int) -> None:
     def spoil(message: Bulk) -> Bulk | None:
@@ -240,14 +288,14 @@ def test_a_mistake_in_taking_a_snapshot_in_is_not_passed_over(
 
     ended: list[int] = []
     monkeypatch.setattr(os, "_exit", ended.append)
-    monkeypatch.setattr(transfer, "PATIENCE_S", BOUND_S)
 
     async def body() -> None:
         two = Two(tmp_path, Mistaken())
-        await ship(two, content)
+        shipping = asyncio.create_task(ship(two, content))
         async with asyncio.timeout(BOUND_S):
             while not ended:
                 await asyncio.sleep(0)
+        shipping.cancel()
 
     run(body())
     assert ended == [crash.STATUS]

@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder, ProtectOrder, Terms
-from checkpoint.engines.ptrace.capture import memory
+from checkpoint.engines.ptrace.capture import freeze_budget, memory
 from checkpoint.engines.ptrace.capture.freeze_budget import FIRST_PAGE_NS, FIRST_REST_NS, FreezeBudget
 from checkpoint.engines.ptrace.capture.memory import MemoryCapture, RunningCopy
 from checkpoint.engines.ptrace.capture.process import CapturedProcess
 from checkpoint.engines.ptrace.capture.session import PtraceSession
+from checkpoint.errors import CaptureError
 from tests.checkpoint.engines.ptrace.capture.test_deltas import OBEDIENT
 from tests.checkpoint.round_trip import ENGINE, Program, at_last, ended, protected, start
 
@@ -54,8 +55,9 @@ class Obedient:
 
 
 @contextmanager
-def obedient(tmp_path: Path, budget_ns: int) -> Iterator[Obedient]:
-    order = ProtectOrder("/test/tracee", terms=Terms(freeze_budget_ns=budget_ns))
+def obedient(tmp_path: Path, budget_ns: int, overrun_ns: int = 1) -> Iterator[Obedient]:
+    """Where nothing else is said, no freeze is given up because it takes long."""
+    order = ProtectOrder("/test/tracee", terms=Terms(freeze_budget_ns=budget_ns, freeze_overrun_ns=overrun_ns))
     with ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path, "0.001"], tmp_path)) as program:
         session = at_last(lambda: ENGINE.protect(program.pid, order))
         assert isinstance(session, PtraceSession)
@@ -116,6 +118,60 @@ def test_a_program_that_cannot_be_caught_up_with_is_captured_all_the_same(
         one.program.kill()
     assert memory.PASS_LIMIT < len(passes) < memory.BUDGET_PASS_LIMIT, "it was seen to be of no use"
     assert one.session.frozen_size >= 2000 * PAGE
+
+
+@pytest.mark.root
+def test_a_freeze_that_would_take_too_long_is_given_up_and_the_next_ones_copy_less(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no budget is set: the program writes after the last pass, until it is let go a second time."""
+    monkeypatch.setattr(freeze_budget, "LONG_COPY_NS", 2_000 * FIRST_PAGE_NS)
+    given_up: list[int] = []
+    freeze = PtraceSession._freeze
+
+    def freezing(self: PtraceSession) -> int:
+        given_up.append(len(given_up))
+        if len(given_up) <= 2:
+            one.write(8_000)
+        return freeze(self)
+
+    with obedient(tmp_path, 0) as one:
+        monkeypatch.setattr(PtraceSession, "_freeze", freezing)
+        snapshot = one.session.capture(CaptureOrder(base=False, sequence=2))
+        one.program.kill()
+    assert len(given_up) == 3
+    assert len(snapshot.contents) >= 8_000 * PAGE
+    assert one.session.frozen_size < 2_000 * PAGE
+
+
+@pytest.mark.root
+def test_no_capture_takes_longer_than_its_budget_but_by_the_rule_and_what_it_copied_is_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that writes as fast as it is copied: given up, told why and until when, and captured when that time has come."""
+    hour_ns = 3_600_000_000_000
+    with obedient(tmp_path, 10 * MS, hour_ns) as one:
+        looks: list[int] = []
+        monkeypatch.setattr(PtraceSession, "_freeze", _writing_first(PtraceSession._freeze, one, looks))
+        with pytest.raises(CaptureError, match=r"gave 4 freezes up .* freeze_budget_ms of 10; in 3\d{3} s one may take longer"):
+            one.session.capture(CaptureOrder(base=False, sequence=2))
+        assert len(looks) == 4
+        one.session._budget._whole_ns -= hour_ns
+        snapshot = one.session.capture(CaptureOrder(base=False, sequence=3))
+        one.program.kill()
+    assert len(looks) == 5, "it was taken at once"
+    assert len(snapshot.contents) >= 8_192 * PAGE, "nothing is forgotten of what failed captures named"
+
+
+def _writing_first(freeze: Callable[[PtraceSession], int], one: Obedient, looks: list[int]) -> Callable[[PtraceSession], int]:
+    """Between the last pass and the freeze all 32 MB are written."""
+
+    def freezing(self: PtraceSession) -> int:
+        looks.append(len(looks))
+        one.write(8_192)
+        return freeze(self)
+
+    return freezing
 
 
 def test_what_a_capture_tells_is_the_longest_time_that_the_program_stood_still(
