@@ -363,7 +363,7 @@ def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> Non
             "run --device /dev/x=repen -- x",
             "'repen'; say reopen, hook, optional, or the path of a device; did you mean 'reopen'?",
         ),
-        ("protect 1 --connections cary", "'cary' is none of reset, carry; did you mean 'carry'?"),
+        ("protect 1 --connections cary", "'cary' is none of reset, carry, refuse; did you mean 'carry'?"),
         ("stop x --signal TREM", "did you mean 'TERM'?"),
         ("team shwo", "'shwo' is none of create, enrol, show; did you mean 'show'?"),
         ("team enrol x 192.0.2.1 --role servr", "'servr' is none of robot, server, witness; did you mean 'server'?"),

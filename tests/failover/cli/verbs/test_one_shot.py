@@ -565,7 +565,7 @@ def test_a_program_with_a_line_is_captured_and_restored_by_the_rule_that_is_give
             file = str(tmp_path / "x")
             assert failover("capture", str(process.pid), "-o", file).returncode == 1
             wrong = failover("capture", str(process.pid), "-o", file, "--device", f"{path}=close")
-            assert wrong.returncode == 1
+            assert wrong.returncode == 2, wrong
             assert "say reopen, hook, optional, or the path" in wrong.stderr
             assert failover("capture", str(process.pid), "-o", file, "--device", f"{path}=reopen").returncode == 0
         with subprocess.Popen(
