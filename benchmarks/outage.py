@@ -53,7 +53,7 @@ IN_FLIGHT_S = 0.03
 
 def outage(quick: bool, directory: Path) -> list[Figure]:
     """Cut a robot's power again and again, with one, two and four programs running there."""
-    return [_outages(story, directory) for story in (*_from_memory(quick), *_from_kept_states(quick))]
+    return [outages(story, directory) for story in (*_from_memory(quick), *_from_kept_states(quick))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def _from_kept_states(quick: bool) -> list[Story]:
     return stories
 
 
-def _outages(story: Story, directory: Path) -> Figure:
+def outages(story: Story, directory: Path) -> Figure:
     found: list[float] = []
     for number in range(story.cuts):
         with Stage(directory / f"outage-{story.case.replace(' ', '-')}-{number}", means(), story.settings) as stage:

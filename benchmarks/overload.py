@@ -8,12 +8,11 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +20,7 @@ from typing import Any, Final
 from benchmarks.cuts import BEAT_MS, DEAD, LEASE_MS
 from benchmarks.figures import Absent, Figure, Findings
 from benchmarks.figures import table as table_of
+from benchmarks.load import busy
 from benchmarks.running import BenchmarkError
 from failover.cli.demo.robots import RobotMachine, Stage, means, run
 
@@ -41,8 +41,6 @@ while True:
 """Writes 2 MB anew each 50 ms, which no compression makes less."""
 
 TASKS_A_PROCESSOR: Final = 2
-BUSY: Final = "while True: pass"
-
 RATES: Final = ("100mbit", "1gbit")
 BURST: Final = "128kb"
 QUEUE_MS: Final = 10
@@ -107,7 +105,7 @@ def _case(span_s: float, pace: Pace, rate: str, directory: Path) -> list[Figure]
         for robot in stage.robots:
             limits = ("tbf", "rate", rate, "burst", BURST, "latency", f"{QUEUE_MS}ms")
             run(["nsenter", "--net", f"--target={robot.process.pid}", "tc", "qdisc", "add", "dev", "wire", "root", *limits])
-        stack.enter_context(_busy())
+        stack.enter_context(busy(TASKS_A_PROCESSOR * (os.cpu_count() or 1)))
         began, sent = time.time(), _sent(primary)
         time.sleep(span_s)
         story, beats, moved = _story(stage.robots, began), standby.status()["beats"], _sent(primary) - sent
@@ -123,19 +121,6 @@ def _case(span_s: float, pace: Pace, rate: str, directory: Path) -> list[Figure]
         Figure("longest lateness of the standby's own loop", case, "ms", (beats["late_us_max"] / 1e3,)),
         Figure("over the cable", case, "MB/s", (moved / span_s / 1e6,)),
     ]
-
-
-@contextmanager
-def _busy() -> Iterator[None]:
-    """Tasks that calculate, `TASKS_A_PROCESSOR` for each processor."""
-    tasks = [subprocess.Popen([sys.executable, "-S", "-c", BUSY]) for _ in range(TASKS_A_PROCESSOR * (os.cpu_count() or 1))]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.kill()
-        for task in tasks:
-            task.wait()
 
 
 def _until_protected(primary: RobotMachine) -> None:
