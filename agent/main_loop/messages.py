@@ -5,7 +5,7 @@ The core's acts and events are plain Structs; each travels as its class name and
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import msgspec
 
@@ -47,33 +47,7 @@ ACTS: Final[dict[str, Any]] = {
     )
 }
 EVENTS: Final[dict[str, Any]] = {
-    kind.__name__: kind
-    for kind in (
-        events.Started,
-        events.Captured,
-        events.Unchanged,
-        events.CaptureFailed,
-        events.NothingToCapture,
-        events.Committed,
-        events.ShipEnded,
-        events.Stored,
-        events.StoreFailed,
-        events.Restored,
-        events.ActFailed,
-        events.Stopped,
-        events.Warmed,
-        events.Inquired,
-        events.Exited,
-        events.Noticed,
-        events.Unread,
-        events.Run,
-        events.Release,
-        events.Stop,
-        events.Failback,
-        events.Handover,
-        events.Promote,
-        events.Prefer,
-    )
+    kind.__name__: kind for kind in get_args(events.Event) if kind not in (events.Tick, events.Received)
 }
 
 _encoder = msgspec.msgpack.Encoder()

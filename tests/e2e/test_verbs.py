@@ -71,7 +71,7 @@ def forgotten(pair: Pair) -> Iterator[None]:
         (("protect", "me"), USAGE, "is not a whole number above zero"),
         (("logs", "nobody"), FAILED, "no component is called 'nobody'"),
         (("why", "nobody"), FAILED, "no component is called 'nobody'"),
-        (("statsu",), USAGE, "invalid choice: 'statsu'"),
+        (("statsu",), USAGE, "'statsu' is none of demo, run, protect"),
     ],
     ids=lambda value: " ".join(value)[:30] if isinstance(value, tuple) else None,
 )

@@ -42,6 +42,9 @@ CAPABILITIES: Final = (
         'shared memory that another process has mapped, too (`shared_memory = "detach"`)',
         "the program gets a copy of its own with the content of the checkpoint: the others no longer see what it writes there, "
         "nor it what they write (docs/shared-memory.md)",
+        "only what is mapped can be detached",
+        "is a copy of its own (shared_memory =",
+        "the program resumes with a copy of its own",
     ),
     refused(
         Area.MEMORY,
@@ -49,6 +52,8 @@ CAPABILITIES: Final = (
         "turn it off in the middleware that made it, protect the other process with the program, or give the program a copy of "
         "its own (`--shared-memory detach`, docs/shared-memory.md)",
         "which stays behind:",
+        "the shared memory {}{} is mapped by {} too",
+        "pid {}",
     ),
 )
 

@@ -42,7 +42,13 @@ CAPABILITIES: Final = (
         "the place of each process in control groups (cgroup v2 and v1)",
         "the same, where the group exists or is the program's own; else the restore says which place it lost. Limits of a group "
         "are not kept, and threads get the place of their process",
-        "was in the control group",
+        "pid {}",
+        "this kernel has no such hierarchy",
+        "that hierarchy is not mounted here",
+        "the group is not one of user {} here",
+        "that group does not exist here",
+        "an administrator writes the PID to cgroup.procs",
+        "were in the control group",
     ),
 )
 GUARDS: Final = re.compile(r"/failover-[0-9a-f]+(?=/|$)")

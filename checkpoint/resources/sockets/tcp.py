@@ -59,6 +59,7 @@ CAPABILITIES: Final = (
         "TCP connections with others",
         "reset: the program sees what it would see after a crash of its peer (ECONNRESET, EPOLLHUP, EPOLLERR). After an "
         "end of file it reads the end of file again; a connection that it is just opening is opened anew",
+        "If they are not opened anew",
     ),
     refused(
         Area.SOCKETS,

@@ -243,7 +243,7 @@ def test_arguments_that_no_program_could_be_started_or_ended_with_are_refused(ki
     ("arguments", "said"),
     [
         ({"engine": "ptrce"}, "engine: 'ptrce' is none of auto, ptrace, cooperative; did you mean 'ptrace'?"),
-        ({"connections": "cary"}, "connections: 'cary' is none of reset, carry; did you mean 'carry'?"),
+        ({"connections": "cary"}, "connections: 'cary' is none of reset, carry, refuse; did you mean 'carry'?"),
         ({"hooks": {"after_resmue": ["x"]}}, "did you mean 'after_resume'?"),
     ],
 )

@@ -9,6 +9,7 @@ import struct
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -128,10 +129,10 @@ def test_one_thread_that_confines_itself_while_everything_is_copied_is_known_to_
             first = session._first
             copy = first.memory.copy_running
 
-            def slowly(*, base: bool, enough: int) -> RunningCopy:
+            def slowly(**named: Any) -> RunningCopy:
                 (tmp_path / "confine").touch()
                 tracee.wait_for_line("confined")
-                return copy(base=base, enough=enough)
+                return copy(**named)
 
             monkeypatch.setattr(first.memory, "copy_running", slowly)
             captured_at_last(session, CaptureOrder())

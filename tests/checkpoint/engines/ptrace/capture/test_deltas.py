@@ -371,8 +371,8 @@ def test_what_is_dropped_after_it_was_copied_is_not_in_the_snapshot(
     copy_running = MemoryCapture.copy_running
     with ended(start([sys.executable, "-c", DROPPER, tmp_path], tmp_path)) as program, protected(program) as session:
 
-        def dropped_afterwards(self: MemoryCapture, *, base: bool, enough: int) -> RunningCopy:
-            copied = copy_running(self, base=base, enough=enough)
+        def dropped_afterwards(self: MemoryCapture, **named: Any) -> RunningCopy:
+            copied = copy_running(self, **named)
             go_on(program, "written", "dropped")
             return copied
 
