@@ -158,7 +158,8 @@ class Shipper:
         while not transfer.refused and not reached():
             transfer.moved.clear()
             try:
-                await asyncio.wait_for(transfer.moved.wait(), patience_s)
+                async with asyncio.timeout(patience_s):  # wait_for loses a cancellation that comes with the event
+                    await transfer.moved.wait()
             except TimeoutError:
                 raise LaneError(
                     f"{transfer.peer} took nothing for {patience_s:.0f} s in the middle of a {transfer.what}"
@@ -327,7 +328,8 @@ class Receiver:
         self._lane.say(peer, Credit(offer.transfer, WINDOW))
         while end < offer.size:
             try:
-                chunk = await asyncio.wait_for(transfer.chunks.get(), PATIENCE_S)
+                async with asyncio.timeout(PATIENCE_S):
+                    chunk = await transfer.chunks.get()
             except TimeoutError:
                 raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
             if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
