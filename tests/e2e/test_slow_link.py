@@ -27,7 +27,7 @@ while True:
 RATE = "8mbit"
 QUEUE_MS = 20
 INSTEAD = "instead of every"
-CABLE = "until robot2 has one"
+CABLE = "to reach robot2"
 """Of the reasons why snapshots are seldom this one's; on a busy machine the program may stand still for long besides."""
 
 needs_tbf = pytest.mark.skipif(
