@@ -257,7 +257,7 @@ class Tracee:
             try:
                 pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
             except ChildProcessError as error:
-                raise ProcessGoneError(f"pid {self.pid} ended while failover examined it") from error
+                raise self._gone() from error
             if pid:
                 return self.stop_of(status)
             waited = time.perf_counter() - began
@@ -286,9 +286,9 @@ class Tracee:
         try:
             found = os.waitid(os.P_PID, self.pid, options)
         except ChildProcessError as error:
-            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it") from error
+            raise self._gone() from error
         if found is not None and found.si_code in abi.ENDS:
-            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it")
+            raise self._gone()
         return self.reported() if found is not None else None
 
     def is_dead(self) -> bool:
@@ -304,8 +304,11 @@ class Tracee:
         try:
             pid, status = os.waitpid(self.pid, abi.WALL | os.WNOHANG)
         except ChildProcessError as error:
-            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it") from error
+            raise self._gone() from error
         return self.stop_of(status) if pid else None
+
+    def _gone(self) -> ProcessGoneError:
+        return ProcessGoneError(f"pid {self.pid} ended while failover examined it")
 
     def stop_of(self, status: int) -> Stop:
         """The stop that a wait status of it tells of.
@@ -314,7 +317,7 @@ class Tracee:
             ProcessGoneError: it tells of its end.
         """
         if not os.WIFSTOPPED(status):
-            raise ProcessGoneError(f"pid {self.pid} ended while failover examined it")
+            raise self._gone()
         stop = Stop(event=status >> 16, signal=os.WSTOPSIG(status))
         if stop.event == abi.PTRACE_EVENT_STOP:
             self.stopped_by = stop.signal if stop.signal != signal.SIGTRAP else 0

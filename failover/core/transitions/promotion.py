@@ -170,14 +170,11 @@ def _stands_still(component: Component, robot: str) -> bool:
 
 def _double(turn: Turn, robot: str) -> str:
     silent_s = (turn.now_ns - turn.team.peers[robot].heard_ns) / (1_000 * MS)
-    if unread := turn.team.unread(robot, turn.now_ns):
-        return (
-            f"{robot} lives and cannot be authenticated ({unread}): it may run it too, until they hear each other; then "
-            f"the copy of {turn.me} continues, and {robot} keeps its state aside"
-        )
+    unread = turn.team.unread(robot, turn.now_ns)
+    how = f"lives and cannot be authenticated ({unread}):" if unread else f"has not been heard for {silent_s:.0f} s; if it lives"
     return (
-        f"{robot} has not been heard for {silent_s:.0f} s; if it lives it may run it too, until they hear each other; then "
-        f"the copy of {turn.me} continues, and {robot} keeps its state aside"
+        f"{robot} {how} it may run it too, until they hear each other; then the copy of {turn.me} continues, "
+        f"and {robot} keeps its state aside"
     )
 
 
