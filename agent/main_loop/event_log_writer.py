@@ -32,7 +32,7 @@ SENTENCE_MAX: Final = 2_000
 
 
 class Scribe:
-    """One life's lines. `note` and `unwritten` belong to the heart, and no lock of the thread's can make them wait.
+    """One life's lines. `note` and `unwritten` belong to the main loop, and no lock of the thread's can make them wait.
 
     Attributes:
         trouble: why the story cannot be written now, or what is missing in it; "" if all is well.

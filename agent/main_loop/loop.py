@@ -34,9 +34,9 @@ from agent.main_loop.messages import (
     Inventory,
     Life,
     SpeakKey,
-    ToHeart,
     ToLanes,
     Told,
+    ToMainLoop,
 )
 from agent.main_loop.outbox import Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
@@ -64,7 +64,7 @@ GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
 
 REST_SHARE: Final = 3
-"""While the heart rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
+"""While the main loop rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
 
 LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
@@ -88,7 +88,7 @@ OUTLIVED: Final = (
 log = logging.getLogger("failover.heart")
 
 
-class Heart:
+class MainLoop:
     """One life of one robot's agent."""
 
     def __init__(self, settings: Settings, ballot: vote_record.Ballot, notifier: Notifier) -> None:
@@ -206,7 +206,7 @@ class Heart:
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
 
-        In a flood of what is refused the heart leaves half of the time to others: it runs before all ordinary processes.
+        In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
         self._rests = self._node is not None and self._node.rests(now_ns)
@@ -277,7 +277,7 @@ class Heart:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
 
     def _came_ns(self, wall_ns: int) -> int:
-        """When a beat came that waited because this heart rests: its sender was not late. 0: now, or a stall of ours."""
+        """When a beat came that waited because this main loop rests: its sender was not late. 0: now, or a stall of ours."""
         if not self._rests or not wall_ns:
             return 0
         came_ns, now_ns = clock.of_wall_ns(wall_ns), clock.now_ns()
@@ -317,7 +317,7 @@ class Heart:
         except (ChannelClosedError, ChannelError) as error:
             self._replace_lanes(str(error))
 
-    def _heed(self, message: ToHeart) -> None:
+    def _heed(self, message: ToMainLoop) -> None:
         match message:
             case Happened():
                 event = messages.event_of(message)
@@ -426,9 +426,9 @@ def beat(settings: Settings, notifier: Notifier) -> None:
         ) from error
     ballot = vote_record.Ballot(directory, settings.config.robot)
     ballot.open()
-    while remembered := Heart(settings, ballot, notifier).run():
+    while remembered := MainLoop(settings, ballot, notifier).run():
         ballot.outlive(remembered)
         ballot.open()
 
 
-__all__ = ["Ballot", "Heart", "beat"]
+__all__ = ["Ballot", "MainLoop", "beat"]

@@ -17,8 +17,8 @@ from agent.system import syscalls
 
 BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
-HEART_PRIORITY: Final = 60
-"""SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
+MAIN_LOOP_PRIORITY: Final = 60
+"""SCHED_FIFO priority of the main loop: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
 
 
 class Laps(Struct):
@@ -67,10 +67,10 @@ def become_realtime() -> tuple[str, ...]:
     """
     notes: list[str] = []
     try:
-        if (priority := syscalls.become_realtime(HEART_PRIORITY)) < HEART_PRIORITY:
+        if (priority := syscalls.become_realtime(MAIN_LOOP_PRIORITY)) < MAIN_LOOP_PRIORITY:
             notes.append(
                 f"beats run at real-time priority {priority}: what has a higher one may delay them; "
-                f"allow {HEART_PRIORITY} (LimitRTPRIO, ulimit -r)"
+                f"allow {MAIN_LOOP_PRIORITY} (LimitRTPRIO, ulimit -r)"
             )
     except OSError as error:
         notes.append(

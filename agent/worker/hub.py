@@ -43,7 +43,7 @@ from failover.core.wire.codec import KEY_SIZE_MIN
 from failover.core.wire.messages import VERSION, Bulk, Errand, ErrandDone, Goodbye, Hello
 
 ALIVE_S: Final = 0.5
-"""Between two signs of life to the heart."""
+"""Between two signs of life to the main loop."""
 
 ANSWER_PATIENCE_S: Final = 60.0
 """How long an operator's command may take; a handover's own limit in the core is shorter."""
@@ -73,12 +73,12 @@ class Switchboard:
 
     verbs: Questions
 
-    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
+    def __init__(self, settings: Settings, main_loop: Channel[ToLanes]) -> None:
         self.settings = settings
         config = settings.config
         self._runtime = Path(config.runtime_directory)
-        self._heart = heart
-        self._outgoing: asyncio.Queue[messages.ToHeart] = asyncio.Queue()
+        self._main_loop = main_loop
+        self._outgoing: asyncio.Queue[messages.ToMainLoop] = asyncio.Queue()
         self._numbers = itertools.count(1)
         self._questions: dict[int, asyncio.Future[Told]] = {}
         self._commands: dict[int, asyncio.Future[acts.Answer]] = {}
@@ -109,7 +109,7 @@ class Switchboard:
 
     @abstractmethod
     async def prepare(self) -> messages.Inventory:
-        """Have ready whatever is needed before anything can be asked; what the heart must know of it."""
+        """Have ready whatever is needed before anything can be asked; what the main loop must know of it."""
 
     @abstractmethod
     def obeys(self, act: acts.Act) -> None:
@@ -135,15 +135,15 @@ class Switchboard:
         """A peer greets on a new bulk lane."""
 
     async def run(self) -> None:
-        """From the heart's first word to its last.
+        """From the main loop's first word to its last.
 
         Raises:
             AgentError, CheckpointError: something needed to begin cannot be had.
         """
         loop = asyncio.get_running_loop()
         make_directory(self._runtime)
-        loop.add_reader(self._heart.fileno(), self._listen_to_heart)
-        speaking = asyncio.create_task(self._speak_to_heart())
+        loop.add_reader(self._main_loop.fileno(), self._listen_to_main_loop)
+        speaking = asyncio.create_task(self._speak_to_main_loop())
         living = asyncio.create_task(self._show_life())
         self._life = await self._begun
         self._say(await self.prepare())
@@ -155,7 +155,7 @@ class Switchboard:
         try:
             await self._end.wait()
         finally:
-            loop.remove_reader(self._heart.fileno())
+            loop.remove_reader(self._main_loop.fileno())
             await server.close()
             self._wires.close()
             await self.errands.close()
@@ -165,14 +165,14 @@ class Switchboard:
             speaking.cancel()
             living.cancel()
 
-    # --- the heart ---
+    # --- the main loop ---
 
     def tell(self, event: Event) -> None:
         """Pass an event to the core."""
         self._say(messages.happened(event))
 
     async def ask(self, what: Literal["status", "why"]) -> Told:
-        """Ask the heart for the core's view, or for what it has not written down yet."""
+        """Ask the main loop for the core's view, or for what it has not written down yet."""
         number = next(self._numbers)
         answer: asyncio.Future[Told] = asyncio.get_running_loop().create_future()
         self._questions[number] = answer
@@ -197,7 +197,7 @@ class Switchboard:
         finally:
             self._commands.pop(number, None)
 
-    def _say(self, message: messages.ToHeart) -> None:
+    def _say(self, message: messages.ToMainLoop) -> None:
         self._outgoing.put_nowait(message)
 
     async def _show_life(self) -> None:
@@ -205,32 +205,32 @@ class Switchboard:
             self._say(Alive())
             await asyncio.sleep(ALIVE_S)
 
-    async def _speak_to_heart(self) -> None:
+    async def _speak_to_main_loop(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
             message = await self._outgoing.get()
             while True:
                 try:
-                    self._heart.send(message)
+                    self._main_loop.send(message)
                     break
                 except ChannelClosedError:
                     self._end.set()
                     return
                 except ChannelError:
                     writable = asyncio.Event()
-                    loop.add_writer(self._heart.fileno(), writable.set)
+                    loop.add_writer(self._main_loop.fileno(), writable.set)
                     await writable.wait()
-                    loop.remove_writer(self._heart.fileno())
+                    loop.remove_writer(self._main_loop.fileno())
 
-    def _listen_to_heart(self) -> None:
+    def _listen_to_main_loop(self) -> None:
         try:
             for _ in range(MESSAGES_A_TURN):
-                message, _descriptors = self._heart.receive()
+                message, _descriptors = self._main_loop.receive()
                 self._heed(message)
         except BlockingIOError:
             return
         except ChannelError:
-            asyncio.get_running_loop().remove_reader(self._heart.fileno())
+            asyncio.get_running_loop().remove_reader(self._main_loop.fileno())
             self._end.set()
 
     def _heed(self, message: ToLanes) -> None:
@@ -370,7 +370,7 @@ def _resolve(waiting: dict[int, asyncio.Future[Any]], number: int, answer: Any) 
 
 
 def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
-    """Be the other process of the heart that started us with CONFIG and DESCRIPTOR; its signals are its own."""
+    """Be the other process of the main loop that started us with CONFIG and DESCRIPTOR; its signals are its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     allocator.be_frugal()

@@ -78,8 +78,8 @@ log = logging.getLogger("failover.lanes")
 class Lanes(Switchboard):
     """One life of the process."""
 
-    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
-        super().__init__(settings, heart)
+    def __init__(self, settings: Settings, main_loop: Channel[ToLanes]) -> None:
+        super().__init__(settings, main_loop)
         self.charges: dict[str, Charge] = {}
         self._inquiries: set[str] = set()
         config = settings.config
@@ -398,7 +398,7 @@ class Lanes(Switchboard):
     def _memory(self) -> Memory:
         keepers = {charge.component.keeper.pid for charge in self.charges.values() if charge.component is not None}
         budget = self.places.budget
-        ours = (self._life.heart, os.getpid())
+        ours = (self._life.main_loop, os.getpid())
         return Memory(
             sum(map(memory_limits.held, ours)), sum(memory_limits.held(pid) for pid in keepers if pid), budget.held, budget.limit
         )
@@ -419,5 +419,5 @@ def _keeps_state(store: Store, name: str) -> bool:
 
 
 def main() -> int:
-    """Be the lanes of the heart that started us."""
+    """Be the lanes of the main loop that started us."""
     return live(Lanes)

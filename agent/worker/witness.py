@@ -25,8 +25,8 @@ log = logging.getLogger("failover.lanes")
 class Witness(Switchboard):
     """One life of the process."""
 
-    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
-        super().__init__(settings, heart)
+    def __init__(self, settings: Settings, main_loop: Channel[ToLanes]) -> None:
+        super().__init__(settings, main_loop)
         self.connect(Questions(self))
 
     async def prepare(self) -> Inventory:
@@ -51,5 +51,5 @@ class Witness(Switchboard):
 
 
 def main() -> int:
-    """Be the other process of the witness's heart that started us."""
+    """Be the other process of the witness's main loop that started us."""
     return live(Witness)

@@ -30,7 +30,7 @@ def seldom_used() -> set[str]:
     return set(slim_imports.SELDOM_USED) - ({"inspect"} if sys.version_info >= (3, 12) else set())
 
 
-def test_the_heart_loads_neither_asyncio_nor_what_reads_pages() -> None:
+def test_the_main_loop_loads_neither_asyncio_nor_what_reads_pages() -> None:
     loaded = loaded_by("agent.main", "agent.main_loop.loop")
     assert "agent.main_loop.loop" in loaded
     assert not loaded & {

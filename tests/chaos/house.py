@@ -62,7 +62,7 @@ STEP_MS: Final = 50
 
 PROGRAMS: Final = Path(__file__).parent / "programs"
 MODULES: Final = {
-    "heart": b"agent.main",
+    "main_loop": b"agent.main",
     "lanes": b"agent.worker.process",
     "keeper": b"checkpoint",
     "guard": b"agent.guard.server",

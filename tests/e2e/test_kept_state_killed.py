@@ -45,8 +45,8 @@ OTHERS: Final = {
     "keeper": ("keeper",),
     "lanes": ("lanes",),
     "guard": ("guard",),
-    "agent": ("heart", "lanes"),
-    "agent_and_keeper": ("heart", "lanes", "keeper"),
+    "agent": ("main_loop", "lanes"),
+    "agent_and_keeper": ("main_loop", "lanes", "keeper"),
 }
 
 
@@ -154,7 +154,7 @@ def kill_other(going: Voyage, robot: RobotMachine, way: str) -> None:
     """A part of what stands around the program."""
     before, lives = going.now(), going.lives()
     kill(robot, OTHERS[way])
-    if "heart" in OTHERS[way]:
+    if "main_loop" in OTHERS[way]:
         robots.until(lambda: going.lives() > lives, "the other robot to take over")
         assert (going.now().why, going.now().epoch) == ("taken-over", max(before.epoch, 1) + 1)
     revived(robot, OTHERS[way])

@@ -22,10 +22,10 @@ from tests.e2e.test_deaths import COUNT, numbers, parts
 pytestmark = pytest.mark.root
 
 STOPPED = {
-    "heart": ("heart",),
-    "agent": ("heart", "lanes"),
-    "heart_and_keeper": ("heart", "keeper"),
-    "agent_and_keeper": ("heart", "lanes", "keeper"),
+    "main_loop": ("main_loop",),
+    "agent": ("main_loop", "lanes"),
+    "main_loop_and_keeper": ("main_loop", "keeper"),
+    "agent_and_keeper": ("main_loop", "lanes", "keeper"),
 }
 """Parts whose rest makes a robot silent; the guard, which stands by itself, freezes the program before its lease ends."""
 

@@ -96,7 +96,7 @@ def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, Ro
 
 @pytest.mark.root
 def test_a_lanes_process_that_takes_long_to_end_holds_up_no_beat(pair: tuple[RobotMachine, RobotMachine]) -> None:
-    """On a busy machine it may wait for a processor before it can end. Here we hold its end up: the heart hears nothing of it,
+    """On a busy machine it may wait for a processor before it can end. Here we hold its end up: the main loop hears nothing of it,
     ends it at last, and beats on for a dozen leases while it still is there.
     """
     first, second = pair
@@ -136,13 +136,13 @@ def test_a_cable_that_is_cut_is_noticed_and_one_that_is_back_too(pair: tuple[Rob
     robots.until(lambda: robots.connected(first) and robots.connected(second), "both to hear each other again")
 
 
-def test_no_thread_of_a_heart_is_at_ordinary_priority(pair: tuple[RobotMachine, RobotMachine]) -> None:
+def test_no_thread_of_the_main_loop_is_at_ordinary_priority(pair: tuple[RobotMachine, RobotMachine]) -> None:
     """One that writes to the disk could be kept from a processor with the interpreter's lock in its hand, and beats with it."""
     first, _ = pair
     if not first.status()["realtime"]:
         pytest.skip("needs real-time priority")
-    heart = robots.host_pid(first, first.status()["pid"])
-    policies = [os.sched_getscheduler(int(thread)) for thread in os.listdir(f"/proc/{heart}/task")]
+    main_loop = robots.host_pid(first, first.status()["pid"])
+    policies = [os.sched_getscheduler(int(thread)) for thread in os.listdir(f"/proc/{main_loop}/task")]
     assert len(policies) > 1
     assert {policy & ~os.SCHED_RESET_ON_FORK for policy in policies} == {os.SCHED_FIFO}
 

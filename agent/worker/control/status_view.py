@@ -75,7 +75,7 @@ def team_view(
         "robot": settings.config.robot,
         "team": settings.team.team,
         "role": settings.me.role,
-        "pid": life.heart,
+        "pid": life.main_loop,
         "version": version(),
         "life": life.boot,
         "insecure": settings.config.insecure,

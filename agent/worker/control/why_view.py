@@ -109,7 +109,7 @@ class Telling:
         }
 
     async def _own(self, component: str, age_ms_max: int) -> tuple[list[Line], int]:
-        """This robot's lines, oldest first; what the heart has not written yet is asked for before the disk is read."""
+        """This robot's lines, oldest first; what the main loop has not written yet is asked for before the disk is read."""
         told = await self._lanes.ask("why")
         try:
             kept = await asyncio.to_thread(event_log.read, Path(self._lanes.settings.config.state_directory))

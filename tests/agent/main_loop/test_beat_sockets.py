@@ -40,7 +40,7 @@ def lanes() -> Iterator[tuple[BeatLane, BeatLane]]:
 
 
 def waits(lane: BeatLane) -> bool:
-    """Whether something comes, as the heart's loop finds out."""
+    """Whether something comes, as the main loop finds out."""
     with closing(select.epoll()) as loop:
         loop.register(lane.fileno(), select.EPOLLIN)
         return bool(loop.poll(PATIENCE_MS / 1e3))
