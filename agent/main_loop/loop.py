@@ -34,14 +34,14 @@ from agent.main_loop.messages import (
     Inventory,
     Life,
     SpeakKey,
-    ToLanes,
     Told,
     ToMainLoop,
+    ToWorker,
 )
 from agent.main_loop.outbox import Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
 from agent.main_loop.vote_record_writer import Persister
-from agent.main_loop.worker_process import LanesProcess
+from agent.main_loop.worker_process import WorkerProcess
 from agent.system import clock, syscalls
 from agent.system.sd_notify import Notifier, watchdog_period_ns
 from checkpoint.keeper.messages import ChannelClosedError, ChannelError
@@ -66,17 +66,17 @@ GAP_BEATS: Final = 3
 REST_SHARE: Final = 3
 """While the main loop rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
 
-LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
-"""How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
+WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
+"""How long the worker may say nothing; then another one takes its place. Meanwhile the guards' leases are not renewed."""
 
-LANES_LOOK_NS: Final = NANOSECONDS_A_SECOND
-"""Between two looks at lanes that say nothing: longer than between their signs of life, so that others are not looked at."""
+WORKER_LOOK_NS: Final = NANOSECONDS_A_SECOND
+"""Between two looks at a worker that says nothing: longer than between two signs of life, which one that works gives."""
 
-LANES_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
-"""The same before their first word: an interpreter starts."""
+WORKER_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
+"""The same before its first word: an interpreter starts."""
 
-LANES_TRIES: Final = 5
-"""Lanes processes that may die before their first word; then something is wrong that no restart cures."""
+WORKER_TRIES: Final = 5
+"""Workers that may die before their first word; then something is wrong that no restart cures."""
 
 STARTED: Final = "protecting this robot and its neighbours"
 
@@ -105,7 +105,7 @@ class MainLoop:
         self._hearing = codec.Receiver(settings.team.team)
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
         self._keys: dict[str, bytes] = {}
-        self._lanes = LanesProcess(settings)
+        self._worker = WorkerProcess(settings)
         self._node: Node | None = None
         durable = core_vote_record.decode(ballot.record.core)
         self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
@@ -119,11 +119,11 @@ class MainLoop:
         self._listens = True
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
-        self._lanes_deaths = 0
+        self._worker_deaths = 0
         self._turned_ns = clock.now_ns()
-        self._lanes_silent_ns = self._lanes_unseen_ns = 0
-        self._lanes_allowed_ns = LANES_BIRTH_NS
-        self._lanes_turns: starvation.Turns | None = None
+        self._worker_silent_ns = self._worker_unseen_ns = 0
+        self._worker_allowed_ns = WORKER_BIRTH_NS
+        self._worker_turns: starvation.Turns | None = None
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
@@ -140,7 +140,7 @@ class MainLoop:
             0; or the life of this robot that the team remembers and its ballot does not: another one above it must begin.
 
         Raises:
-            AgentError: the lanes cannot be started at all.
+            AgentError: the worker cannot be started at all.
         """
         self._begin()
         watchdog_ns = watchdog_period_ns()
@@ -166,23 +166,23 @@ class MainLoop:
         syscalls.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
             self._notes = clock.become_realtime()
-        self._start_lanes()  # told what was refused
+        self._start_worker()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
 
-    def _start_lanes(self) -> None:
+    def _start_worker(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
-        self._lanes.start()
-        self._expect_lanes()
+        self._worker.start()
+        self._expect_worker()
 
-    def _expect_lanes(self) -> None:
-        self._lanes_spoke(LANES_BIRTH_NS << self._lanes_deaths)  # a machine so busy gets no busier
-        self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
-        self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
+    def _expect_worker(self) -> None:
+        self._worker_spoke(WORKER_BIRTH_NS << self._worker_deaths)  # a machine so busy gets no busier
+        self._poll.register(self._worker.fileno(), select.EPOLLIN | select.EPOLLHUP)
+        self._worker.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
 
     def _turn(self) -> None:
         """Sleep, then one round of everything that came, then the core's deadline."""
-        self._lanes.flush()
+        self._worker.flush()
         self._rest()
         came = self._poll.poll(self._pause_s())
         if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
@@ -190,13 +190,13 @@ class MainLoop:
         for descriptor, _ in came:
             if descriptor == self._beats.fileno():
                 self._hear()
-            elif descriptor == self._lanes.fileno():
-                self._listen_to_lanes()
+            elif descriptor == self._worker.fileno():
+                self._listen_to_worker()
             elif descriptor == self._persister.fileno():
                 self._note_persisted()
             elif descriptor == self._wake.fileno():
                 self._ending = True
-        self._watch_lanes()
+        self._watch_worker()
         if self._node is not None:
             late_ns = clock.now_ns() - self._node.next_deadline_ns()
             if late_ns >= 0:
@@ -215,27 +215,27 @@ class MainLoop:
             self._listens = listens
             self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
 
-    def _watch_lanes(self) -> None:
-        """Count how long the lanes say nothing.
+    def _watch_worker(self) -> None:
+        """Count how long the worker says nothing.
 
-        A turn of our own that took long proves nothing about them, and neither does a time in which the kernel kept them from
-        running: the ones in their place would say as little.
+        A turn of our own that took long proves nothing about it, and neither does a time in which the kernel kept it from
+        running: another one in its place would say as little.
         """
         now_ns = clock.now_ns()
-        self._lanes_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
+        self._worker_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
         self._turned_ns = now_ns
-        if self._lanes_unseen_ns < LANES_LOOK_NS:
+        if self._worker_unseen_ns < WORKER_LOOK_NS:
             return
-        before, self._lanes_turns = self._lanes_turns, starvation.look(self._lanes.pid)
-        self._lanes_silent_ns += starvation.had_ns(before, self._lanes_turns, self._lanes_unseen_ns)
-        self._lanes_unseen_ns = 0
-        if self._lanes_silent_ns > self._lanes_allowed_ns:
-            self._replace_lanes(f"it was silent for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s of processor time")
+        before, self._worker_turns = self._worker_turns, starvation.look(self._worker.pid)
+        self._worker_silent_ns += starvation.had_ns(before, self._worker_turns, self._worker_unseen_ns)
+        self._worker_unseen_ns = 0
+        if self._worker_silent_ns > self._worker_allowed_ns:
+            self._replace_worker(f"it was silent for {self._worker_silent_ns / NANOSECONDS_A_SECOND:.0f} s of processor time")
 
-    def _lanes_spoke(self, allowed_ns: int) -> None:
-        """Their silence counts from now on, and may last so long."""
-        self._lanes_silent_ns = self._lanes_unseen_ns = 0
-        self._lanes_turns, self._lanes_allowed_ns = None, allowed_ns
+    def _worker_spoke(self, allowed_ns: int) -> None:
+        """The worker's silence counts from now on, and may last so long."""
+        self._worker_silent_ns = self._worker_unseen_ns = 0
+        self._worker_turns, self._worker_allowed_ns = None, allowed_ns
 
     def _pause_s(self) -> float:
         if self._node is None:
@@ -309,19 +309,19 @@ class MainLoop:
         for number, ballot in self._persister.finished():
             self._obey(self._outbox.kept(number, ballot, clock.now_ns()))
 
-    def _listen_to_lanes(self) -> None:
+    def _listen_to_worker(self) -> None:
         try:
-            for message in self._lanes.receive():
-                self._lanes_spoke(LANES_SILENCE_NS)
+            for message in self._worker.receive():
+                self._worker_spoke(WORKER_SILENCE_NS)
                 self._heed(message)
         except (ChannelClosedError, ChannelError) as error:
-            self._replace_lanes(str(error))
+            self._replace_worker(str(error))
 
     def _heed(self, message: ToMainLoop) -> None:
         match message:
             case Happened():
                 event = messages.event_of(message)
-                self._lanes.answered(event)
+                self._worker.answered(event)
                 self._step(event)
             case Inventory():
                 self._take_inventory(message)
@@ -332,16 +332,16 @@ class MainLoop:
             case Alive():
                 pass
             case _:
-                self._lanes.send(self._told(message))
+                self._worker.send(self._told(message))
 
     def _take_inventory(self, inventory: Inventory) -> None:
-        """The node is born with what was found; a node that lives already is told what the old lanes took with them."""
-        self._lanes_deaths = 0
+        """The node is born with what was found; a node that lives already is told what the old worker took with it."""
+        self._worker_deaths = 0
         if self._node is not None:
-            for event in self._lanes.lost(inventory):
+            for event in self._worker.lost(inventory):
                 self._step(event)
             return
-        self._lanes.ready()
+        self._worker.ready()
         boot = self._ballot.record.boot
         config = node_config(self._settings)
         durable = self._outbox.durable
@@ -349,19 +349,19 @@ class MainLoop:
         self._notifier.ready(STARTED)
         log.info("robot %s sends heartbeats, life %d", self._me, boot)
 
-    def _replace_lanes(self, why: str) -> None:
-        """Start another lanes process; one that never gets as far as an inventory is not tried for ever.
+    def _replace_worker(self, why: str) -> None:
+        """Start another worker; one that never gets as far as an inventory is not tried for ever.
 
         Raises:
             AgentError: `LANES_TRIES` of them died at once.
         """
-        self._lanes_deaths += 1
-        if self._lanes_deaths > LANES_TRIES:
-            raise AgentError(f"the worker process ended {LANES_TRIES} times at once ({why}); its last words stand above")
+        self._worker_deaths += 1
+        if self._worker_deaths > WORKER_TRIES:
+            raise AgentError(f"the worker process ended {WORKER_TRIES} times at once ({why}); its last words stand above")
         log.error("the worker process is gone (%s); guards and programs run on, and another worker starts", why)
-        self._poll.unregister(self._lanes.fileno())
-        self._lanes.replace()
-        self._expect_lanes()
+        self._poll.unregister(self._worker.fileno())
+        self._worker.replace()
+        self._expect_worker()
 
     # --- obligations out ---
 
@@ -377,9 +377,9 @@ class MainLoop:
             self._act(act)
 
     def _act(self, act: Act) -> None:
-        self._lanes.order(act)
+        self._worker.order(act)
 
-    def _told(self, question: messages.Ask) -> ToLanes:
+    def _told(self, question: messages.Ask) -> ToWorker:
         now_ns = clock.now_ns()
         refused = Counter(self._refused)
         refused[str(codec.Reason.NOT_OURS)] += self._beats.dropped()
@@ -400,11 +400,11 @@ class MainLoop:
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
 
     def _end(self) -> None:
-        self._lanes.send(Farewell())
-        self._lanes.flush()
+        self._worker.send(Farewell())
+        self._worker.flush()
         self._persister.close(PERSIST_PATIENCE_S)
         self._scribe.close(PERSIST_PATIENCE_S)
-        self._lanes.wait()
+        self._worker.wait()
         self._beats.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)

@@ -110,7 +110,7 @@ class Ask(msgspec.Struct, frozen=True, tag=True):
 
 
 class BeatCounts(msgspec.Struct, frozen=True):
-    """What the beat lane has seen.
+    """What the heartbeats' sockets have seen.
 
     Attributes:
         refused: frames not believed, by reason.
@@ -134,7 +134,7 @@ class Told(msgspec.Struct, frozen=True, tag=True):
     """Main loop to worker: the answer to `Ask`.
 
     Attributes:
-        story: lines that are not on the disk yet; what is kept there the lanes read themselves.
+        story: lines that are not on the disk yet; the worker reads the others itself.
         troubles: sentences: why a ballot, or the story, cannot be written.
     """
 
@@ -150,7 +150,7 @@ class Farewell(msgspec.Struct, frozen=True, tag=True):
     """Main loop to worker: the agent ends; components live on."""
 
 
-ToLanes = Order | Life | Told | Farewell
+ToWorker = Order | Life | Told | Farewell
 ToMainLoop = Happened | Inventory | SpeakKey | HearKey | Alive | Ask
 
 

@@ -20,7 +20,7 @@ from failover.core.wire.messages import Beat
 
 
 class Due(Struct, frozen=True):
-    """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the lanes.
+    """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the worker.
 
     Attributes:
         persist: (number, ballot); `Outbox.kept` is told the number once it is durable.

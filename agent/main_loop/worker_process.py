@@ -17,17 +17,17 @@ from typing import Final
 from agent.config import Settings
 from agent.errors import AgentError
 from agent.main_loop import messages
-from agent.main_loop.messages import Inventory, ToLanes, ToMainLoop
+from agent.main_loop.messages import Inventory, ToMainLoop, ToWorker
 from checkpoint.keeper.messages import Channel, ChannelError, pair
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.events import Event
 
 WAITING_LIMIT: Final = 4_096
-"""Messages that wait for a lanes process which does not read; beyond it, it is hung and is replaced."""
+"""Messages that wait for a worker which does not read; beyond it, it is hung and is replaced."""
 
 MESSAGES_A_TURN: Final = 64
-"""Taken from the lanes in one turn of the main loop."""
+"""Taken from the worker in one turn of the main loop."""
 
 END_PATIENCE_S: Final = 5.0
 
@@ -42,7 +42,7 @@ Source: the documentation of subprocess.
 """
 
 
-class LanesProcess:
+class WorkerProcess:
     """One child process after another, and what the core still expects of it."""
 
     def __init__(self, settings: Settings) -> None:
@@ -54,7 +54,7 @@ class LanesProcess:
         self._successor = threading.Thread(target=self._succeed, name="successor", daemon=True)
         self._successor.start()  # now, while nobody minds: a main loop would wait for the birth of a thread at ordinary priority
         self._channel: Channel[ToMainLoop] | None = None
-        self._waiting: deque[ToLanes] = deque()
+        self._waiting: deque[ToWorker] = deque()
         self._expected: dict[tuple[str, str], Act] = {}
         self._admitted: dict[str, acts.Admit] = {}
         self._warm: dict[str, acts.Warm] = {}
@@ -136,7 +136,7 @@ class LanesProcess:
         assert self._channel is not None, "start comes first"
         return self._channel.fileno()
 
-    def send(self, message: ToLanes) -> None:
+    def send(self, message: ToWorker) -> None:
         """Queue a message; it leaves in `flush`, as soon as the process reads."""
         if len(self._waiting) >= WAITING_LIMIT:
             log.error("the worker process does not read; the main loop ends it")

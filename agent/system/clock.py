@@ -18,7 +18,7 @@ from agent.system import syscalls
 BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 MAIN_LOOP_PRIORITY: Final = 60
-"""SCHED_FIFO priority of the main loop: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
+"""SCHED_FIFO priority of the main loop: above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
 
 
 class Laps(Struct):

@@ -39,8 +39,8 @@ limit, for what comes after it begins then: asked to end first, it could go on f
 def starter() -> str:
     """The command that asks systemd for a transient service; "" where systemd did not start our parent, or does not obey us.
 
-    Called by the lanes, whose parent is the service's main process. An agent that is merely a descendant of some service (of a CI
-    runner, of a desktop's terminal) may live in namespaces where systemd's services are strangers.
+    Called by the worker, whose parent is the service's main process. An agent that is merely a descendant of some service (of a
+    CI runner, of a desktop's terminal) may live in namespaces where systemd's services are strangers.
     """
     if os.geteuid() != 0 or os.environ.get(STARTED) != str(os.getppid()) or not os.path.isdir("/run/systemd/system"):
         return ""

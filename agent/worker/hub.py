@@ -23,7 +23,7 @@ from agent import config as configuration
 from agent.config import Settings
 from agent.errors import AgentError, LaneError
 from agent.main_loop import messages
-from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, ToLanes, Told
+from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, Told, ToWorker
 from agent.system import syscalls
 from agent.system.log_setup import set_up_log
 from agent.worker.control.queries import QUESTIONS, Questions
@@ -73,7 +73,7 @@ class Switchboard:
 
     verbs: Questions
 
-    def __init__(self, settings: Settings, main_loop: Channel[ToLanes]) -> None:
+    def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         self.settings = settings
         config = settings.config
         self._runtime = Path(config.runtime_directory)
@@ -98,7 +98,7 @@ class Switchboard:
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
         self._wires = Wires(self._links, self._links_changed)
         self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links, self._unread)
-        self._lane = self._ways.bulk
+        self._replication_link = self._ways.bulk
 
     def connect(self, verbs: Questions) -> None:
         """Have the orders of people and robots carried out by these."""
@@ -120,19 +120,19 @@ class Switchboard:
         """What ``status`` shows."""
 
     async def stop_work(self) -> None:
-        """Give up what is under way, while the lanes still stand."""
+        """Give up what is under way, while the connections still stand."""
 
     async def close(self) -> None:
         """Give back what is left, when nobody can ask for anything any more."""
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """A word about a snapshot on the bulk lane."""
+        """A word about a snapshot on the replication link."""
 
-    def lane_lost(self, peer: str) -> None:
+    def link_lost(self, peer: str) -> None:
         """The bulk lane to a peer is gone, and every transfer on it."""
 
-    def lane_is_new(self, peer: str) -> None:
-        """A peer greets on a new bulk lane."""
+    def link_is_new(self, peer: str) -> None:
+        """A peer greets on a new replication link."""
 
     async def run(self) -> None:
         """From the main loop's first word to its last.
@@ -233,7 +233,7 @@ class Switchboard:
             asyncio.get_running_loop().remove_reader(self._main_loop.fileno())
             self._end.set()
 
-    def _heed(self, message: ToLanes) -> None:
+    def _heed(self, message: ToWorker) -> None:
         match message:
             case Order():
                 self.obeys(messages.act_of(message))
@@ -253,8 +253,8 @@ class Switchboard:
 
     def _way_changed(self, way: int, peer: str, state: LinkState, reason: str) -> None:
         """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
-        lane = "replication link" if way == BULK else f"link {way}"
-        log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
+        link = "replication link" if way == BULK else f"link {way}"
+        log.info("%s to %s: %s%s", link, peer, state, f": {reason}" if reason else "")
         had_words = self._ways.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
             key = self._ways.beat_key(peer)
@@ -262,7 +262,7 @@ class Switchboard:
             self._say(SpeakKey(peer, key))
             return
         if way == BULK:
-            self.lane_lost(peer)
+            self.link_lost(peer)
         if had_words:
             self.errands.lost(peer)
 
@@ -281,7 +281,7 @@ class Switchboard:
             log.info("%s", sentence)
             self.tell(events.Noticed("", sentence))
         try:
-            await self._lane.hold_to_devices()
+            await self._replication_link.hold_to_devices()
         except LaneError as error:
             log.critical("%s; the worker process starts anew", error)
             self._end.set()
@@ -316,7 +316,7 @@ class Switchboard:
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
         if way == BULK and not hello.again:
-            self.lane_is_new(peer)  # a new connection: what was half here stays half
+            self.link_is_new(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
             self._unread(peer, reason)
@@ -342,7 +342,7 @@ class Switchboard:
         return [
             *self._own_troubles,
             *self._incompatible.values(),
-            *self._lane.troubles(),
+            *self._replication_link.troubles(),
             *self._ways.troubles,
             *self._links.notes(),
         ]
@@ -369,7 +369,7 @@ def _resolve(waiting: dict[int, asyncio.Future[Any]], number: int, answer: Any) 
         future.set_result(answer)
 
 
-def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
+def live(kind: Callable[[Settings, Channel[ToWorker]], Switchboard]) -> int:
     """Be the other process of the main loop that started us with CONFIG and DESCRIPTOR; its signals are its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -386,7 +386,7 @@ def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
     return 0
 
 
-async def _live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard], settings: Settings, descriptor: int) -> None:
+async def _live(kind: Callable[[Settings, Channel[ToWorker]], Switchboard], settings: Settings, descriptor: int) -> None:
     end = socket.socket(fileno=descriptor)
     end.setblocking(False)
-    await kind(settings, Channel(end, ToLanes)).run()
+    await kind(settings, Channel(end, ToWorker)).run()

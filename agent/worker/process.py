@@ -18,8 +18,8 @@ from typing import Any, Final
 from agent.config import Settings
 from agent.core_config import retention
 from agent.errors import TROUBLE, GuardLostError, LaneError
-from agent.main_loop.messages import Inventory, ToLanes, Told
-from agent.system.crash import end_lanes_on_mistake
+from agent.main_loop.messages import Inventory, Told, ToWorker
+from agent.system.crash import end_worker_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
 from agent.worker.components import launch, prerequisites
@@ -75,10 +75,10 @@ STORE_PAUSE_S: Final = 0.1
 log = logging.getLogger("failover.lanes")
 
 
-class Lanes(Switchboard):
+class Worker(Switchboard):
     """One life of the process."""
 
-    def __init__(self, settings: Settings, main_loop: Channel[ToLanes]) -> None:
+    def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         super().__init__(settings, main_loop)
         self.charges: dict[str, Charge] = {}
         self._inquiries: set[str] = set()
@@ -93,7 +93,7 @@ class Lanes(Switchboard):
         self.places = Places(
             sockets, state / "logs", self._nursery, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
-        self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
+        self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self))
 
     async def prepare(self) -> Inventory:
@@ -107,13 +107,13 @@ class Lanes(Switchboard):
         settled = self._deposit.settled
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks, self._alive)
         self._sources = Sources(store, self._from_program)
-        self._bringing = Bringing(self._shipper, self._lane.say, self._sources.open, self._note_bringing)
+        self._bringing = Bringing(self._shipper, self._replication_link.say, self._sources.open, self._note_bringing)
         self._dispatch = Dispatch(
             store, self._shipper, self.tell, self._links.hindrance, self._bringing, lambda name: here(name).bring_data
         )
-        self._receiver = Receiver(self._lane, self._store_path, self._deposit)
+        self._receiver = Receiver(self._replication_link, self._store_path, self._deposit)
         self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
-        self._contents = Receiver(self._lane, self._store_path, self._stock)
+        self._contents = Receiver(self._replication_link, self._store_path, self._stock)
         self._tasks: set[asyncio.Task[None]] = set()
         self._new_here = asyncio.Event()
         self._task(self._tidy_contents())
@@ -220,12 +220,16 @@ class Lanes(Switchboard):
             log.warning("the output of earlier checkpoints is not complete here: %s", error)
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """A word about a snapshot on the bulk lane."""
+        """A word about a snapshot on the replication link."""
         match message:
             case Offer() if self.votes_only(peer):
-                self._lane.say(peer, Refuse(message.transfer, f"{peer} is a witness: it votes, and keeps no snapshots"))
+                self._replication_link.say(
+                    peer, Refuse(message.transfer, f"{peer} is a witness: it votes, and keeps no snapshots")
+                )
             case Offer() if hindrance := self._links.hindrance():
-                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
+                self._replication_link.say(
+                    peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}")
+                )
             case Offer():
                 self._receiver.offered(peer, message)
             case Belongings() | Content() if self.votes_only(peer):
@@ -245,13 +249,13 @@ class Lanes(Switchboard):
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
 
-    def lane_lost(self, peer: str) -> None:
+    def link_lost(self, peer: str) -> None:
         """The bulk lane to a peer is gone, and every transfer on it."""
         self._shipper.lost(peer)
         self._bringing.lost(peer)
 
-    def lane_is_new(self, peer: str) -> None:
-        """A peer greets on a new bulk lane: what was half here stays half."""
+    def link_is_new(self, peer: str) -> None:
+        """A peer greets on a new replication link: what was half here stays half."""
         self._receiver.lost(peer)
         self._contents.lost(peer)
         self._stock.lost(peer)
@@ -263,7 +267,7 @@ class Lanes(Switchboard):
         return Limits(config.bring, size_bytes(config.bring_size), runs=self.settings.me.role != "server")
 
     async def _compare(self, peer: str, asked: Belongings) -> None:
-        self._lane.say(peer, await self._stock.compare(peer, asked))
+        self._replication_link.say(peer, await self._stock.compare(peer, asked))
 
     async def _from_program(self, component: str, need: Need) -> int:
         """A file that only the running program leads to, through its keeper."""
@@ -317,7 +321,7 @@ class Lanes(Switchboard):
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
 
     def tell(self, event: events.Event) -> None:
         """See `agent.worker.hub.Switchboard.tell`."""
@@ -388,7 +392,7 @@ class Lanes(Switchboard):
             self._life,
             told,
             self.charges,
-            self._lane.links,
+            self._replication_link.links,
             notices,
             self._links.shown(),
             self._around.store,
@@ -419,5 +423,5 @@ def _keeps_state(store: Store, name: str) -> bool:
 
 
 def main() -> int:
-    """Be the lanes of the main loop that started us."""
-    return live(Lanes)
+    """Be the worker of the main loop that started us."""
+    return live(Worker)

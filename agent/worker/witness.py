@@ -11,7 +11,7 @@ import logging
 from typing import Any
 
 from agent.config import Settings
-from agent.main_loop.messages import Inventory, ToLanes, Told
+from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.worker.control.queries import Questions
 from agent.worker.control.status_view import team_view
 from agent.worker.hub import Switchboard, live
@@ -25,7 +25,7 @@ log = logging.getLogger("failover.lanes")
 class Witness(Switchboard):
     """One life of the process."""
 
-    def __init__(self, settings: Settings, main_loop: Channel[ToLanes]) -> None:
+    def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         super().__init__(settings, main_loop)
         self.connect(Questions(self))
 
@@ -43,11 +43,15 @@ class Witness(Switchboard):
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
         """Nobody should offer one."""
         if isinstance(message, Offer):
-            self._lane.say(peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots"))
+            self._replication_link.say(
+                peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots")
+            )
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        return team_view(self.settings, self._life, told, {}, self._lane.links, self.notices(), self._links.shown(), None)
+        return team_view(
+            self.settings, self._life, told, {}, self._replication_link.links, self.notices(), self._links.shown(), None
+        )
 
 
 def main() -> int:

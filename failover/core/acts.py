@@ -66,7 +66,7 @@ class Capture(Struct, frozen=True):
 
 
 class Ship(Struct, frozen=True):
-    """Send the snapshot at ``position`` over the bulk lane. → ShipEnded.
+    """Send the snapshot at ``position`` over the replication link. → ShipEnded.
 
     Attributes:
         parent: the standby's present position; None for a base.

@@ -32,7 +32,7 @@ UNSTEADY_FACTOR = 2
 """The margin is so many times the lateness that was seen: the next one may be longer."""
 
 UNREAD_NS = 10_000 * MS
-"""A sign of a member that cannot be authenticated proves for so long that its robot lives: its lanes knock every two seconds."""
+"""A sign of a member that cannot be authenticated proves for so long that its robot lives: its agent connects every 2 s."""
 
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""

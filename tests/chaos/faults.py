@@ -21,11 +21,11 @@ from tests.chaos.network import Way
 LEASE_S: Final = LEASE_MS / 1_000
 PARTS: Final[tuple[tuple[str, ...], ...]] = (
     ("main_loop",),
-    ("lanes",),
+    ("worker",),
     ("keeper",),
     ("guard",),
-    ("main_loop", "lanes"),
-    ("main_loop", "lanes", "keeper"),
+    ("main_loop", "worker"),
+    ("main_loop", "worker", "keeper"),
 )
 """What is killed, or stands still, at one instant."""
 

@@ -32,15 +32,15 @@ SPREAD_S = 0.15
 RESTORE_S = 0.25
 """A handover, its restore included, takes about so long."""
 
-NAMES = {"main_loop": b"agent.main", "lanes": b"agent.worker.process", "keeper": b"checkpoint", "guard": b"agent.guard.server"}
+NAMES = {"main_loop": b"agent.main", "worker": b"agent.worker.process", "keeper": b"checkpoint", "guard": b"agent.guard.server"}
 """Module of each part of an agent: the third word of its command line."""
 
 WAYS = {
     "keeper": ("keeper",),
-    "lanes": ("lanes",),
+    "worker": ("worker",),
     "main_loop": ("main_loop",),
-    "agent": ("main_loop", "lanes"),
-    "agent_and_keeper": ("main_loop", "lanes", "keeper"),
+    "agent": ("main_loop", "worker"),
+    "agent_and_keeper": ("main_loop", "worker", "keeper"),
 }
 
 Pair = tuple[RobotMachine, RobotMachine]
@@ -79,7 +79,7 @@ def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
 def revived(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Bring the agent back, if it was killed, and wait until it answers."""
     if "main_loop" in names:
-        robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "lanes"), "the agent to be gone")
+        robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
         robots.start_agent(robot)
     robots.until(lambda: robots.answers(robot), "the agent to answer")
 

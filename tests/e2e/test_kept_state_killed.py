@@ -43,10 +43,10 @@ CYCLE: Final = ("program", "program", "robot", "other", "robot")
 
 OTHERS: Final = {
     "keeper": ("keeper",),
-    "lanes": ("lanes",),
+    "worker": ("worker",),
     "guard": ("guard",),
-    "agent": ("main_loop", "lanes"),
-    "agent_and_keeper": ("main_loop", "lanes", "keeper"),
+    "agent": ("main_loop", "worker"),
+    "agent_and_keeper": ("main_loop", "worker", "keeper"),
 }
 
 

@@ -19,7 +19,7 @@ from msgspec import Struct
 from agent.core_config import terms_here
 from agent.errors import TROUBLE
 from agent.system import clock
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.worker.components import launch
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
@@ -121,7 +121,7 @@ class ReadyCopy:
         task = asyncio.create_task(work)
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
         return task
 
     # --- Following the checkpoints ---

@@ -120,7 +120,7 @@ class Memory(Struct, frozen=True):
     """Bytes of private memory of this robot's agent.
 
     Attributes:
-        agent: of the main loop and the lanes; ``keepers``: of those that follow a component here.
+        agent: of the main loop and the worker; ``keepers``: of those that follow a component here.
         remembered: of both, what holds pages that deltas are told from, and proved by; ``remembered_max``: its bound, xor_cache.
     """
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from agent.errors import TROUBLE, GuardError
 from agent.system import clock
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.system.permissions import SAID
 from agent.worker.components import launch
 from agent.worker.components.component import Component
@@ -52,7 +52,7 @@ class Standby:
         """
         self.cool()
         self._work = asyncio.create_task(self._keep_warm(program, owner, tell))
-        self._work.add_done_callback(end_lanes_on_mistake)
+        self._work.add_done_callback(end_worker_on_mistake)
 
     def cool(self) -> None:
         """Nothing is to wait any more; what does is ended, and nobody waits for that."""

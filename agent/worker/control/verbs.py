@@ -52,8 +52,8 @@ START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
 
 
-class Lanes(Lines, Protocol):
-    """What of `agent.worker.process.Lanes` is needed here."""
+class Worker(Lines, Protocol):
+    """What of `agent.worker.process.Worker` is needed here."""
 
     places: Places
     charges: dict[str, Charge]
@@ -65,10 +65,10 @@ class Lanes(Lines, Protocol):
 class Verbs(Questions):
     """Every verb of the control socket."""
 
-    def __init__(self, lanes: Lanes) -> None:
-        super().__init__(lanes)
-        self._lanes = lanes
-        self._outflow = Outflow(lanes)
+    def __init__(self, worker: Worker) -> None:
+        super().__init__(worker)
+        self._worker = worker
+        self._outflow = Outflow(worker)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -108,10 +108,10 @@ class Verbs(Questions):
         name = await self._known(str(arguments.get("name", "")))
         arguments = {**arguments, "name": name}
         primary = (await self._view(name)).get("primary", "")
-        told = await self._lanes.ask("status")
+        told = await self._worker.ask("status")
         living = {peer.robot for peer in told.status.peers if peer.state in ("alive", "suspect")} if told.status else set()
         if primary in living:
-            return await self._lanes.errands.send(primary, verb, arguments, say.caller.uid)
+            return await self._worker.errands.send(primary, verb, arguments, say.caller.uid)
         return await self.orders()[verb](arguments, say.caller.uid)
 
     async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -139,7 +139,7 @@ class Verbs(Questions):
             shared=self._shared(name, wanted.shared, wanted.carry),
             devices=self._device_rules(name, wanted.devices),
             connections=self._connections(name, wanted.connections),
-            shared_memory=wanted.shared_memory or self._lanes.settings.component(name).shared_memory,
+            shared_memory=wanted.shared_memory or self._worker.settings.component(name).shared_memory,
         )
         charge = await self._begin(name, launch, inheritance.uid, say.caller.uid)
         started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
@@ -159,7 +159,7 @@ class Verbs(Questions):
 
     def _environment(self, name: str, wanted: RunArguments) -> dict[str, str]:
         """The program's variables, also those that have libraries choose code for a mixed fleet."""
-        settings = self._lanes.settings
+        settings = self._worker.settings
         level = level_of(wanted.portable, settings.config, settings.component(name))
         return cpu_baseline.environment(wanted.env, level) if level else wanted.env
 
@@ -175,7 +175,7 @@ class Verbs(Questions):
     async def _taken_in(self, wanted: ProtectArguments, guest: Guest, caller: Caller) -> dict[str, Any]:
         """Protect a process that is the caller's."""
         assert guest.rights is not None, "it was asked whose it is"
-        for known in self._lanes.charges.values():
+        for known in self._worker.charges.values():
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release ends that")
         name = await self._fresh_name(wanted.name, "", caller.uid)
@@ -189,7 +189,7 @@ class Verbs(Questions):
             devices=devices,
             connections=connections,
             shared=shared,
-            shared_memory=wanted.shared_memory or self._lanes.settings.component(name).shared_memory,
+            shared_memory=wanted.shared_memory or self._worker.settings.component(name).shared_memory,
         )
         charge = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
         return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
@@ -197,7 +197,7 @@ class Verbs(Questions):
     async def release(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
         name = await self._known(arguments_of(NameArguments, "release", arguments).name)
-        charge = self._lanes.charge(name)
+        charge = self._worker.charge(name)
         pid = charge.component.pid if charge.component is not None else None
         await self._command(by, lambda number: events.Release(number, name))
         await charge.let_go()  # the order came before the answer
@@ -207,7 +207,7 @@ class Verbs(Questions):
         """End a component."""
         wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
-        end = self._lanes.charge(name).end()
+        end = self._worker.charge(name).end()
         await self._command(by, lambda number: events.Stop(number, name, wanted.signal))
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
@@ -229,7 +229,7 @@ class Verbs(Questions):
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot lacks of what a component needs to go on here."""
         name = arguments_of(NameArguments, "lacks", arguments).name
-        return {"lacks": list(await self._lanes.lacking(name) if name in await self._names() else ())}
+        return {"lacks": list(await self._worker.lacking(name) if name in await self._names() else ())}
 
     async def _check_fit(self, name: str, order: str, robot: str) -> None:
         """Ask the robot that a component is to move to whether it could go on there.
@@ -241,7 +241,7 @@ class Verbs(Questions):
         """
         if robot not in await self._reachable():
             return
-        if reasons := await prerequisites.asked_of(self._lanes.errands, robot, name):
+        if reasons := await prerequisites.asked_of(self._worker.errands, robot, name):
             sentence = f"cannot {order.format(name, robot)}, which could not resume it: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 
@@ -249,7 +249,7 @@ class Verbs(Questions):
         began_ns, before = clock.now_ns(), await self._view(name)
         answer = await self._command(by, make)
         view = await self._view(name)
-        if view["primary"] != self._lanes.settings.config.robot:
+        if view["primary"] != self._worker.settings.config.robot:
             view = await self._running_at(view["primary"], name)
         took_ms = (clock.now_ns() - began_ns) / 1e6
         told = {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
@@ -263,7 +263,7 @@ class Verbs(Questions):
         """
         deadline_ns = clock.now_ns() + int(START_PATIENCE_S * 1e9)
         while True:
-            view = await self._lanes.errands.send(robot, "standing", {"name": name})
+            view = await self._worker.errands.send(robot, "standing", {"name": name})
             if view.get("role") == "primary" and view["state"] in ("running", "degraded"):
                 return view
             if view.get("state") in ("ended", "failed") or view.get("primary") not in (robot, None):
@@ -286,15 +286,15 @@ class Verbs(Questions):
     async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Have a robot run what nobody is heard to run; or, unless it is ``sure``, tell what that would risk."""
         wanted = arguments_of(PromoteArguments, "promote", arguments)
-        name, me = await self._known(wanted.name), self._lanes.settings.config.robot
+        name, me = await self._known(wanted.name), self._worker.settings.config.robot
         robot = wanted.robot or await self._newest_at(name)
-        if robot not in self._lanes.settings.team.robots:
-            known = ", ".join(sorted(self._lanes.settings.team.robots))
+        if robot not in self._worker.settings.team.robots:
+            known = ", ".join(sorted(self._worker.settings.team.robots))
             raise RefusedError(f"cannot promote {robot!r} for {name}: the team knows {known}")
         order = {"name": name, "robot": robot, "sure": wanted.sure}
         if robot == me:
             return await self._permitted(self._promoted, order, say.caller.uid)
-        return await self._lanes.errands.send(robot, "promoted", order, say.caller.uid)
+        return await self._worker.errands.send(robot, "promoted", order, say.caller.uid)
 
     async def _promoted(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Promote this robot, or tell what that would risk."""
@@ -306,7 +306,7 @@ class Verbs(Questions):
 
     async def _newest_at(self, name: str) -> str:
         """The living robot with the newest checkpoint; this one, or the lesser name, of several."""
-        me, team = self._lanes.settings.config.robot, self._lanes.settings.team.robots
+        me, team = self._worker.settings.config.robot, self._worker.settings.team.robots
         seen = [(me, await self._view(name))]
         others = await self._reachable()
         asked = (self._asked(peer, "standing", {"name": name}) for peer in others)
@@ -333,7 +333,7 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no path that means the same on every robot.
         """
-        return _named_whole("carry", (*wanted, *self._lanes.settings.component(name).carry))
+        return _named_whole("carry", (*wanted, *self._worker.settings.component(name).carry))
 
     def _shared(self, name: str, wanted: list[str], carried: list[str]) -> tuple[str, ...]:
         """What others write to as well: what was asked for, and what this robot's operator rules besides.
@@ -341,14 +341,14 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no path that means the same on every robot, or travels with the component.
         """
-        paths = _named_whole("share", (*wanted, *self._lanes.settings.component(name).shared))
+        paths = _named_whole("share", (*wanted, *self._worker.settings.component(name).shared))
         if both := contradiction(self._carried(name, carried), paths):
             raise RefusedError(both)
         return paths
 
     def _connections(self, name: str, wanted: str) -> str:
         """What becomes of a component's connections with others: what was asked for, else what this robot's operator wants."""
-        return wanted or self._lanes.settings.component(name).connections
+        return wanted or self._worker.settings.component(name).connections
 
     def _device_rules(self, name: str, wanted: dict[str, str]) -> tuple[tuple[str, str], ...]:
         """What becomes of a component's devices on every robot: what was asked for, and what this robot's operator wants here.
@@ -363,7 +363,7 @@ class Verbs(Questions):
                 rule_from(path, said)
         except ValueError as error:
             raise RefusedError(str(error)) from error
-        own = travelling(self._lanes.settings.component(name).device_rules())
+        own = travelling(self._worker.settings.component(name).device_rules())
         return tuple({**wanted, **dict(own)}.items())
 
     async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Charge:
@@ -376,9 +376,9 @@ class Verbs(Questions):
         Raises:
             RefusedError: the core says no, or it could not be started; with the reasons.
         """
-        config = self._lanes.settings.config
-        rules = rules_for(config, self._lanes.settings.component(name))
-        charge = self._lanes.charge(name)
+        config = self._worker.settings.config
+        rules = rules_for(config, self._worker.settings.component(name))
+        charge = self._worker.charge(name)
         charge.guest = guest
         charge.started.clear()
         charge.ended = None
@@ -404,7 +404,7 @@ class Verbs(Questions):
 
     async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:
         """Have the core decide, by the right of this user. Raises RefusedError: it says no."""
-        answer = await self._lanes.command(lambda number: replace(make(number), by=asking(by)))
+        answer = await self._worker.command(lambda number: replace(make(number), by=asking(by)))
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return answer
@@ -419,8 +419,8 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no name, or one that somebody else has used and not released; or this user has too many.
         """
-        own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
-        told = await self._lanes.ask("status")
+        own = f"/{self._worker.settings.team.team}/{self._worker.settings.config.robot}/"
+        told = await self._worker.ask("status")
         known = {one.name: one for one in told.status.components} if told.status else {}
         if not wanted:
             stem = own + (os.path.basename(command) or "program")
@@ -428,7 +428,7 @@ class Verbs(Questions):
             free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
             wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
         name = wanted if wanted.startswith("/") else own + wanted
-        check_components(uid, name, known.values(), self._lanes.settings.config.components_per_user)
+        check_components(uid, name, known.values(), self._worker.settings.config.components_per_user)
         if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
             check_right(uid, name, known[name].owner)
         try:

@@ -26,7 +26,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from agent.errors import LaneError
 from agent.system.connection_quota import Arrivals, plain
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.system.rtnetlink import allow_absent
 from agent.worker.network.links import Device
 from failover.config.team import for_lookup, split_address
@@ -91,7 +91,7 @@ class Keys(Struct, frozen=True):
 
     @property
     def present(self) -> bool:
-        """Whether the lane is authenticated and encrypted."""
+        """Whether the link is authenticated and encrypted."""
         return bool(self.secret)
 
 
@@ -194,7 +194,7 @@ class Link:
         self._socket.connect(self._address)
         self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
         for task in self._tasks:
-            task.add_done_callback(end_lanes_on_mistake)
+            task.add_done_callback(end_worker_on_mistake)
 
     def say(self, message: Bulk) -> bool:
         """Queue a small message; it overtakes chunks. False: there is no connection, it was dropped."""
@@ -289,7 +289,7 @@ class Link:
             waiting[1].set_exception(LaneError(f"the replication link to {self.peer} went down: {reason}"))
 
 
-class BulkLane:
+class ReplicationLink:
     """All connections of this robot. Lives in one asyncio loop."""
 
     def __init__(
@@ -357,7 +357,7 @@ class BulkLane:
         self._tasks.append(asyncio.create_task(self._hear(router)))
         self._tasks.append(asyncio.create_task(self._watch(monitor)))
         for task in self._tasks:
-            task.add_done_callback(end_lanes_on_mistake)
+            task.add_done_callback(end_worker_on_mistake)
         for peer in self._peers:
             self._connect(peer)
 

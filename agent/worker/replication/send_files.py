@@ -77,7 +77,7 @@ class Bringing:
     ) -> None:
         """
         Args:
-            say: on the bulk lane; False: it is not connected.
+            say: on the replication link; False: it is not connected.
             note: told (component, peer, sentence) what is on its way, for the status; "" when nothing is any more.
         """
         self._shipper = shipper

@@ -20,7 +20,7 @@ from blake3 import blake3
 from msgspec import Struct, field
 
 from agent.errors import LaneError
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from checkpoint.errors import StoreError
 from failover.core.wire.messages import (
     CHUNK_SIZE_MAX,
@@ -55,7 +55,7 @@ INCOMING_LIMIT: Final = 64
 """Transfers that one peer may have open here: one a component is all that it needs."""
 
 
-class Lane(Protocol):
+class Link(Protocol):
     """What of `agent.worker.network.replication_link.BulkLane` is needed here."""
 
     def say(self, peer: str, message: Bulk) -> bool: ...
@@ -86,12 +86,12 @@ class _Outgoing(Struct):
 class Shipper:
     """The transfers that leave this robot."""
 
-    def __init__(self, lane: Lane, bytes_a_second: float = 0.0) -> None:
+    def __init__(self, link: Link, bytes_a_second: float = 0.0) -> None:
         """
         Args:
             bytes_a_second: cap on all transfers together; 0 for none.
         """
-        self._lane = lane
+        self._link = link
         self._pace = Pace(bytes_a_second)
         self._numbers = itertools.count(time.monotonic_ns())
         self._outgoing: dict[int, _Outgoing] = {}
@@ -109,7 +109,7 @@ class Shipper:
         number = next(self._numbers)
         transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
         try:
-            if not self._lane.say(peer, msgspec.structs.replace(offer, transfer=number)):
+            if not self._link.say(peer, msgspec.structs.replace(offer, transfer=number)):
                 raise LaneError(f"the replication link to {peer} is not connected")
             for offset in range(0, offer.size, CHUNK_SIZE_MAX):
                 size = min(CHUNK_SIZE_MAX, offer.size - offset)
@@ -117,11 +117,11 @@ class Shipper:
                 if isinstance(offer, Content):
                     await self._give_way()
                 await self._pace.wait(size)
-                await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
+                await self._link.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
             transfer.sent = True
             await self._until(transfer, lambda: transfer.taken, STORED_S)
         except (LaneError, asyncio.CancelledError):
-            self._lane.say(peer, Cancel(number))
+            self._link.say(peer, Cancel(number))
             raise
         finally:
             del self._outgoing[number]
@@ -230,12 +230,12 @@ class Receiver:
     Bytes are written by a thread, chunk by chunk; credit is given as they are written.
     """
 
-    def __init__(self, lane: Lane, directory: Path, desk: Desk[Any]) -> None:
+    def __init__(self, link: Link, directory: Path, desk: Desk[Any]) -> None:
         """
         Args:
             directory: on the store's file system, for the unnamed files.
         """
-        self._lane = lane
+        self._link = link
         self._directory = directory
         self._desk = desk
         self._incoming: dict[tuple[str, int], _Incoming] = {}
@@ -248,11 +248,11 @@ class Receiver:
         try:
             self._check(peer, offer)
         except Refusal as refusal:
-            self._lane.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
+            self._link.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
             return
         transfer = self._incoming[peer, offer.transfer] = _Incoming(offer, asyncio.Queue(WINDOW_CHUNKS))
         transfer.task = asyncio.create_task(self._receive(peer, transfer))
-        transfer.task.add_done_callback(end_lanes_on_mistake)
+        transfer.task.add_done_callback(end_worker_on_mistake)
 
     def chunk(self, peer: str, chunk: Chunk) -> None:
         """Take one chunk in; one without credit ends its transfer."""
@@ -263,7 +263,7 @@ class Receiver:
             transfer.chunks.put_nowait(chunk)
         except asyncio.QueueFull:
             self._drop((peer, chunk.transfer))
-            self._lane.say(peer, Refuse(chunk.transfer, "a chunk came without credit"))
+            self._link.say(peer, Refuse(chunk.transfer, "a chunk came without credit"))
 
     def cancelled(self, peer: str, message: Cancel) -> None:
         """The sender gave up."""
@@ -302,17 +302,17 @@ class Receiver:
                     await self._desk.take(peer, offer, descriptor)
                 finally:
                     signs.cancel()
-                self._lane.say(peer, Taken(offer.transfer))
+                self._link.say(peer, Taken(offer.transfer))
             finally:
                 os.close(descriptor)
         except OSError as error:
             why = f"cannot write it there: {error.strerror}"
             log.warning("gave up %s from %s: %s", _named(offer), peer, why)
-            self._lane.say(peer, Refuse(offer.transfer, why))
+            self._link.say(peer, Refuse(offer.transfer, why))
             self._desk.not_taken(peer, offer, why)
         except (LaneError, StoreError) as error:
             log.warning("gave up %s: %s", _named(offer), error)
-            self._lane.say(peer, Refuse(offer.transfer, str(error)))
+            self._link.say(peer, Refuse(offer.transfer, str(error)))
         finally:
             self._incoming.pop((peer, offer.transfer), None)
 
@@ -320,12 +320,12 @@ class Receiver:
         """Repeat the last credit, so that the sender knows that this robot has not forgotten it."""
         while True:
             await asyncio.sleep(SIGN_S)
-            self._lane.say(peer, Credit(offer.transfer, offer.size + WINDOW))
+            self._link.say(peer, Credit(offer.transfer, offer.size + WINDOW))
 
     async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
         offer, digest, end = transfer.offer, blake3(), 0
         what = SNAPSHOT if isinstance(offer, Offer) else FILE
-        self._lane.say(peer, Credit(offer.transfer, WINDOW))
+        self._link.say(peer, Credit(offer.transfer, WINDOW))
         while end < offer.size:
             try:
                 async with asyncio.timeout(PATIENCE_S):
@@ -336,7 +336,7 @@ class Receiver:
                 raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
             await asyncio.to_thread(_keep, descriptor, chunk, digest)
             end += len(chunk.content)
-            self._lane.say(peer, Credit(offer.transfer, end + WINDOW))
+            self._link.say(peer, Credit(offer.transfer, end + WINDOW))
         if digest.digest() != offer.digest:
             raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
 

@@ -234,7 +234,7 @@ def released(directory: Path, trouble: GuardError | None = None) -> Exception | 
             return name
 
         verbs = Verbs.__new__(Verbs)
-        verbs.__dict__.update(_lanes=SimpleNamespace(charge=lambda _: charge), _command=command, _known=known)
+        verbs.__dict__.update(_worker=SimpleNamespace(charge=lambda _: charge), _command=command, _known=known)
         answer = asyncio.create_task(verbs.release({"name": NAME}, 0))
         await settled()
         assert not answer.done()

@@ -31,7 +31,7 @@ class Listener:
         self.heard += content
 
 
-class Lanes:
+class Worker:
     """A robot whose core says that the component is in a state, while its charge has not heard of an end."""
 
     def __init__(self, places: Places, state: State) -> None:
@@ -62,7 +62,7 @@ def places(tmp_path: Path) -> Places:
 )
 def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Places, state: State, heard: bytes) -> None:
     listener: Any = Listener()
-    outflow = Outflow(Lanes(places, state))
+    outflow = Outflow(Worker(places, state))
     asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
     assert listener.heard == heard
 
@@ -74,7 +74,7 @@ def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wro
     logs.close()
     listener: Any = Listener()
     listener.caller = SimpleNamespace(uid=7001)
-    outflow = Outflow(Lanes(places, State.PRIMARY))
+    outflow = Outflow(Worker(places, State.PRIMARY))
     with pytest.raises(RefusedError, match="belongs to uid 7002"):
         asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
     assert listener.heard == b""

@@ -79,7 +79,7 @@ def test_whose_snapshots_they_were_is_known_after_the_claim_that_ends_their_admi
 
 
 def test_a_snapshot_whose_facts_are_no_facts_is_refused_by_name(tmp_path: Path) -> None:
-    """From a peer that may send it; the lanes go on."""
+    """From a peer that may send it; the worker goes on."""
     told: list[Any] = []
 
     class Reading(Deposit):
