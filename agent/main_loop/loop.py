@@ -49,7 +49,6 @@ from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
 from failover.core.node import Node
-from failover.core.types import Ballot
 from failover.core.wire import codec
 from failover.core.wire.messages import Beat
 
@@ -91,7 +90,7 @@ log = logging.getLogger("failover.heart")
 class MainLoop:
     """One life of one robot's agent."""
 
-    def __init__(self, settings: Settings, ballot: vote_record.Ballot, notifier: Notifier) -> None:
+    def __init__(self, settings: Settings, record_file: vote_record.VoteRecordFile, notifier: Notifier) -> None:
         """Bind the beat sockets; nothing runs yet.
 
         Raises:
@@ -99,7 +98,7 @@ class MainLoop:
         """
         self._settings = settings
         self._me = settings.config.robot
-        self._ballot = ballot
+        self._record_file = record_file
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
         self._hearing = codec.Receiver(settings.team.team)
@@ -107,10 +106,10 @@ class MainLoop:
         self._keys: dict[str, bytes] = {}
         self._worker = WorkerProcess(settings)
         self._node: Node | None = None
-        durable = core_vote_record.decode(ballot.record.core)
+        durable = core_vote_record.decode(record_file.record.core)
         self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
-        self._persister = Persister(lambda wanted: ballot.keep(core_vote_record.encode(wanted)))
-        self._scribe = Scribe(Path(settings.config.state_directory), self._me, ballot.record.boot)
+        self._persister = Persister(lambda wanted: record_file.keep(core_vote_record.encode(wanted)))
+        self._scribe = Scribe(Path(settings.config.state_directory), self._me, record_file.record.boot)
         self._poll = select.epoll()
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
@@ -137,7 +136,7 @@ class MainLoop:
         """Beat until SIGTERM or SIGINT. Components live on.
 
         Returns:
-            0; or the life of this robot that the team remembers and its ballot does not: another one above it must begin.
+            0; or the life of this robot that the team remembers and its vote record does not: another one above it must begin.
 
         Raises:
             AgentError: the worker cannot be started at all.
@@ -178,7 +177,7 @@ class MainLoop:
     def _expect_worker(self) -> None:
         self._worker_spoke(WORKER_BIRTH_NS << self._worker_deaths)  # a machine so busy gets no busier
         self._poll.register(self._worker.fileno(), select.EPOLLIN | select.EPOLLHUP)
-        self._worker.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
+        self._worker.send(Life(self._record_file.record.boot, os.getpid(), self._notes))
 
     def _turn(self) -> None:
         """Sleep, then one round of everything that came, then the core's deadline."""
@@ -287,7 +286,7 @@ class MainLoop:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
         life = self._node.outlived_by(beat) if self._node is not None else 0
         if life:
-            told = (beat.sender, life, self._me, vote_record.FILE_NAME, self._ballot.record.boot, life + 1)
+            told = (beat.sender, life, self._me, vote_record.FILE_NAME, self._record_file.record.boot, life + 1)
             log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
@@ -306,8 +305,8 @@ class MainLoop:
         self._gaps += gap_us > GAP_BEATS * self._settings.config.beat_ms * 1_000
 
     def _note_persisted(self) -> None:
-        for number, ballot in self._persister.finished():
-            self._obey(self._outbox.kept(number, ballot, clock.now_ns()))
+        for number, durable in self._persister.finished():
+            self._obey(self._outbox.kept(number, durable, clock.now_ns()))
 
     def _listen_to_worker(self) -> None:
         try:
@@ -342,7 +341,7 @@ class MainLoop:
                 self._step(event)
             return
         self._worker.ready()
-        boot = self._ballot.record.boot
+        boot = self._record_file.record.boot
         config = node_config(self._settings)
         durable = self._outbox.durable
         self._node = Node(config, boot, durable, clock.now_ns(), inventory.held, inventory.found)
@@ -412,7 +411,7 @@ class MainLoop:
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:
-    """Live one life, from the ballot to the farewell; and another, if the team remembers a later one than the ballot.
+    """Live one life, from the vote record to the farewell; and another, if the team remembers a later one than it does.
 
     Raises:
         AgentError: what is needed to begin cannot be had.
@@ -424,11 +423,8 @@ def beat(settings: Settings, notifier: Notifier) -> None:
         raise AgentError(
             f"cannot use the state directory {directory}: {error.strerror}; name another in state_directory"
         ) from error
-    ballot = vote_record.Ballot(directory, settings.config.robot)
-    ballot.open()
-    while remembered := MainLoop(settings, ballot, notifier).run():
-        ballot.outlive(remembered)
-        ballot.open()
-
-
-__all__ = ["Ballot", "MainLoop", "beat"]
+    record_file = vote_record.VoteRecordFile(directory, settings.config.robot)
+    record_file.open()
+    while remembered := MainLoop(settings, record_file, notifier).run():
+        record_file.outlive(remembered)
+        record_file.open()

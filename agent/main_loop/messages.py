@@ -135,7 +135,7 @@ class Told(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         story: lines that are not on the disk yet; the worker reads the others itself.
-        troubles: sentences: why a ballot, or the story, cannot be written.
+        troubles: sentences: why a vote record, or the story, cannot be written.
     """
 
     number: int

@@ -13,7 +13,7 @@ from failover.core.event_log.decisions import Decision, Facts, Line, Sighting
 from failover.core.event_log.merge import Timed, merged, precedes
 from failover.core.events import Captured, Noticed, Received, Run, Started, Tick
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, Record, State
+from failover.core.types import MS, ComponentSpec, Config, Held, Launch, Record, State, VoteRecord
 from failover.core.wire.messages import Beat, Entry
 
 SPEC = ComponentSpec("/lab/x", launch=Launch(("x",)))
@@ -28,7 +28,7 @@ def told(node: Node, event: object, at_ms: int) -> list[Decision]:
 def standing_by() -> Node:
     """robot1, standby of robot2's component, with a checkpoint from an earlier life; it hears robot2 over two links."""
     record = Record("/lab/x", 3, "robot2", State.STANDBY, trusted=True, spec=SPEC)
-    node = Node(PAIR, 2, Ballot((record,)), 0, (Held("/lab/x", (Position(193, 5, b"d"),)),))
+    node = Node(PAIR, 2, VoteRecord((record,)), 0, (Held("/lab/x", (Position(193, 5, b"d"),)),))
     held = Entry("/lab/x", tuple(State).index(State.PRIMARY), 3, "robot2", standby="robot1")
     for counter, link in enumerate(("wire", "air"), start=1):
         node.step(Received(Beat("robot2", 7, counter, total=1, entries=(held,)), link), counter * 10 * MS)
@@ -83,7 +83,7 @@ def test_an_own_stall_is_told_and_stands_beside_the_decisions_after_it() -> None
 
 
 def test_a_primary_tells_what_its_loss_would_cost() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     (_, claim) = told(node, Run(1, SPEC), 0)
     assert claim.facts.checkpoint == 0 and claim.facts.checkpoint_age_ns == -1 and claim.facts.lease_left_ns is None
     (capture,) = (one for one in node.step(Started("/lab/x", 1), 1 * MS).act if isinstance(one, acts.Capture))
@@ -95,7 +95,7 @@ def test_a_primary_tells_what_its_loss_would_cost() -> None:
 
 
 def test_what_is_noticed_about_an_unknown_component_is_nobodys_story() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     told(node, Tick(), 0)
     assert told(node, Noticed("/lab/strange", "something"), 1) == []
     assert [one.component for one in told(node, Noticed("", "the cable is out"), 1)] == [""]
