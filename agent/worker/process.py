@@ -30,7 +30,7 @@ from agent.worker.components.process_pool import Nursery
 from agent.worker.components.run_records import Records
 from agent.worker.components.snapshots import newest_of
 from agent.worker.components.statistics import Memory
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.status_view import team_view
 from agent.worker.control.verbs import Verbs
 from agent.worker.hub import Switchboard, live, make_directory
@@ -80,7 +80,7 @@ class Worker(Switchboard):
 
     def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         super().__init__(settings, main_loop)
-        self.charges: dict[str, Charge] = {}
+        self.supervisors: dict[str, Supervisor] = {}
         self._inquiries: set[str] = set()
         config = settings.config
         state, runtime = Path(config.state_directory), Path(config.runtime_directory)
@@ -132,7 +132,7 @@ class Worker(Switchboard):
     async def _give_signs(self) -> None:
         """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""
         while True:
-            if any(one.component is not None or one.figures.spec is not None for one in self.charges.values()):
+            if any(one.component is not None or one.figures.spec is not None for one in self.supervisors.values()):
                 await asyncio.to_thread(self._alive.sign)
             await asyncio.sleep(SIGN_S)
 
@@ -143,7 +143,7 @@ class Worker(Switchboard):
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._dispatch.close()
         await self._bringing.close()
-        await asyncio.gather(*(charge.close() for charge in self.charges.values()))
+        await asyncio.gather(*(supervisor.close() for supervisor in self.supervisors.values()))
 
     async def close(self) -> None:
         """Let another life have the store."""
@@ -181,17 +181,17 @@ class Worker(Switchboard):
             case acts.Inquire():
                 self._task(self._inquire(act))
             case _:
-                self.charge(act.component).order(act)
+                self.supervisor(act.component).order(act)
 
-    def charge(self, name: str) -> Charge:
+    def supervisor(self, name: str) -> Supervisor:
         """The component of that name, known or new."""
-        if name not in self.charges:
-            self.charges[name] = Charge(name, self._around)
-            self.charges[name].begin()
-        return self.charges[name]
+        if name not in self.supervisors:
+            self.supervisors[name] = Supervisor(name, self._around)
+            self.supervisors[name].begin()
+        return self.supervisors[name]
 
     async def _find_guards(self, records: Records) -> tuple[Found, ...]:
-        """Take the guards that outlived the last agent into charge."""
+        """Find the guards that outlived the last agent, and supervise their components."""
         found = []
         for path in guard_sockets(self.places):
             try:
@@ -202,7 +202,7 @@ class Worker(Switchboard):
                 continue
             epoch = records.epoch(component.name)
             component.keeper.names = self._names_of_brought(component.name)
-            self.charge(component.name).adopt(component, epoch)
+            self.supervisor(component.name).adopt(component, epoch)
             running = standing.state in ("running", "frozen")
             found.append(Found(component.name, epoch, running, standing.exit_status or 0))
             log.info("%s: found again, pid %d, %s", component.name, component.pid, standing.state)
@@ -271,14 +271,14 @@ class Worker(Switchboard):
 
     async def _from_program(self, component: str, need: Need) -> int:
         """A file that only the running program leads to, through its keeper."""
-        running = self.charge(component).component
+        running = self.supervisor(component).component
         if running is None:
             raise LaneError(f"{need.path} is not here any more, and the program does not run here")
         _, (descriptor,) = await running.keeper.ask(messages.OpenFile(need.path, need.digest))
         return int(descriptor)
 
     def _note_bringing(self, component: str, peer: str, sentence: str) -> None:
-        on_its_way = self.charge(component).figures.bringing
+        on_its_way = self.supervisor(component).figures.bringing
         on_its_way.pop(peer, None)
         if sentence:
             on_its_way[peer] = sentence
@@ -288,8 +288,8 @@ class Worker(Switchboard):
         said: dict[str, str] = {}
         while True:
             await asyncio.sleep(LOOK_S)
-            for name, charge in list(self.charges.items()):
-                if charge.component is None or charge.component.engine == COOPERATIVE:
+            for name, supervisor in list(self.supervisors.items()):
+                if supervisor.component is None or supervisor.component.engine == COOPERATIVE:
                     continue
                 outline = await asyncio.to_thread(newest_of, self._around.store, name)
                 try:
@@ -325,16 +325,16 @@ class Worker(Switchboard):
 
     def tell(self, event: events.Event) -> None:
         """See `agent.worker.hub.Switchboard.tell`."""
-        if isinstance(event, events.Captured) and self.charge(event.component).figures.snapshots == 1:
+        if isinstance(event, events.Captured) and self.supervisor(event.component).figures.snapshots == 1:
             self._new_here.set()  # the first one of it: look at once who else writes to its files
         super().tell(event)
 
     def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
-        figures = self.charge(offer.component).figures
+        figures = self.supervisor(offer.component).figures
         if figures.spec is None:
             self._new_here.set()  # the first one of it: look at once whether it could go on here
         figures.stored(snapshot, offer.size, offer.spec)
-        self.charge(offer.component).copy.accepted(snapshot.position)
+        self.supervisor(offer.component).copy.accepted(snapshot.position)
 
     async def _look_what_is_lacking(self) -> None:
         """Now and then, and when a component is new here: what this robot lacks of what it stands by for, and which files of what
@@ -343,25 +343,25 @@ class Worker(Switchboard):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._new_here.wait(), LACKS_S)
             self._new_here.clear()
-            waiting = [charge for charge in self.charges.values() if charge.component is None and charge.figures.spec is not None]
+            waiting = [one for one in self.supervisors.values() if one.component is None and one.figures.spec is not None]
             found = await prerequisites.look(self._around, waiting)
-            for charge in waiting:
-                charge.figures.lacks = found.get(charge.name)
-            contested = await prerequisites.contested(self._around, tuple(self.charges.values()))
-            for charge in self.charges.values():
-                charge.figures.contested = contested.get(charge.name, ())
+            for supervisor in waiting:
+                supervisor.figures.lacks = found.get(supervisor.name)
+            contested = await prerequisites.contested(self._around, tuple(self.supervisors.values()))
+            for supervisor in self.supervisors.values():
+                supervisor.figures.contested = contested.get(supervisor.name, ())
 
     async def lacking(self, name: str) -> tuple[str, ...]:
         """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it.
 
         Nor where a hook gets it ready first, which may bring what is lacking: then the restore itself tells.
         """
-        charge = self.charge(name)
-        if charge.is_prepared_first:
+        supervisor = self.supervisor(name)
+        if supervisor.is_prepared_first:
             return ()
-        found = (await prerequisites.look(self._around, (charge,))).get(name)
-        if charge.figures.spec is not None:
-            charge.figures.lacks = found
+        found = (await prerequisites.look(self._around, (supervisor,))).get(name)
+        if supervisor.figures.spec is not None:
+            supervisor.figures.lacks = found
         return found or ()
 
     async def _inquire(self, act: acts.Inquire) -> None:
@@ -391,7 +391,7 @@ class Worker(Switchboard):
             self.settings,
             self._life,
             told,
-            self.charges,
+            self.supervisors,
             self._replication_link.links,
             notices,
             self._links.shown(),
@@ -400,7 +400,7 @@ class Worker(Switchboard):
         )
 
     def _memory(self) -> Memory:
-        keepers = {charge.component.keeper.pid for charge in self.charges.values() if charge.component is not None}
+        keepers = {one.component.keeper.pid for one in self.supervisors.values() if one.component is not None}
         budget = self.places.budget
         ours = (self._life.main_loop, os.getpid())
         return Memory(

@@ -45,7 +45,7 @@ log = logging.getLogger("failover.component")
 
 
 @dataclass(slots=True)
-class Charge:
+class Supervisor:
     """The component and what is to be done with it.
 
     Attributes:

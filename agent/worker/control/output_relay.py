@@ -15,7 +15,7 @@ from agent.guard.output_logs import STREAMS, OutputLogs
 from agent.main_loop.messages import Told
 from agent.system.permissions import check_right
 from agent.worker.components.paths import Places, log_directory
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.arguments import PieceArguments, arguments_of
 from agent.worker.control.server import Conversation
 from agent.worker.network.remote_orders import Errands
@@ -36,7 +36,7 @@ class Worker(Protocol):
 
     settings: Settings
     places: Places
-    charges: dict[str, Charge]
+    supervisors: dict[str, Supervisor]
     errands: Errands
 
     async def ask(self, what: Any) -> Told: ...
@@ -103,26 +103,26 @@ class Outflow:
 
     async def _standing(self, name: str) -> tuple[bool, str]:
         """Whether the component's end is a record, and the robot to ask for what it wrote; "" for this one."""
-        charge = self._worker.charges.get(name)
-        if charge is not None and charge.ended is not None and charge.ended.done():
+        supervisor = self._worker.supervisors.get(name)
+        if supervisor is not None and supervisor.ended is not None and supervisor.ended.done():
             return True, ""
-        if charge is not None and charge.component is not None:
+        if supervisor is not None and supervisor.component is not None:
             return False, ""
         view, peers = await self._view(name)
         return (view.state in ENDED, _where(view, peers)) if view is not None else (False, "")
 
     async def _has_ended(self, name: str) -> bool:
-        """The core's word: status shows it, and peers hear it, before it is written and our own charge is told.
+        """The core's word: status shows it, and peers hear it, before it is written and our own supervisor is told.
 
-        Held output waits for the charge: then the end is on record at every robot that is heard.
+        Held output waits for the supervisor: then the end is on record at every robot that is heard.
         """
         view, _ = await self._view(name)
         if view is None or view.state not in ENDED:
             return False
         if not self._is_held(name) or view.primary != self._worker.settings.config.robot:
             return True
-        charge = self._worker.charges.get(name)
-        return charge is not None and charge.ended is not None and charge.ended.done()
+        supervisor = self._worker.supervisors.get(name)
+        return supervisor is not None and supervisor.ended is not None and supervisor.ended.done()
 
     def _is_held(self, name: str) -> bool:
         logs = OutputLogs(log_directory(name, self._worker.places))

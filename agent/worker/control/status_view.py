@@ -23,7 +23,7 @@ from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, P
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
     from agent.worker.components.statistics import Commits, Figures, Memory
-    from agent.worker.components.supervisor import Charge
+    from agent.worker.components.supervisor import Supervisor
     from checkpoint.store.store import Kept, Store
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
@@ -60,7 +60,7 @@ def team_view(
     settings: Settings,
     life: Life,
     told: Told,
-    charges: Mapping[str, Charge],
+    supervisors: Mapping[str, Supervisor],
     links: Mapping[str, Link],
     notices: list[str],
     interfaces: list[dict[str, object]],
@@ -88,7 +88,7 @@ def team_view(
         "notes": notes,
         "links": interfaces,
         "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
-        "components": [_component(one, charges.get(one.name), settings, store) for one in (view.components if view else ())],
+        "components": [_component(one, supervisors.get(one.name), settings, store) for one in (view.components if view else ())],
         "beats": {
             "sent": beats.sent,
             "heard": beats.heard,
@@ -140,12 +140,12 @@ def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | No
     return figures.lacks if figures is not None and view.state is State.STANDBY else None
 
 
-def told_lacks(view: ComponentView, charge: Charge | None, robot: str) -> list[str]:
+def told_lacks(view: ComponentView, supervisor: Supervisor | None, robot: str) -> list[str]:
     """The same for people; what a hook perhaps brings before the program goes on is no refusal yet."""
-    if charge is None:
+    if supervisor is None:
         return []
-    lacks = _lacks(view, charge.figures) or ()
-    if charge.is_prepared_first:
+    lacks = _lacks(view, supervisor.figures) or ()
+    if supervisor.is_prepared_first:
         return [f"{robot} lacks this now, and the hook before_resume must bring it: {lack}" for lack in lacks]
     return [f"{robot} could not resume it: {lack}" for lack in lacks]
 
@@ -175,9 +175,9 @@ def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     )
 
 
-def _component(view: ComponentView, charge: Charge | None, settings: Settings, store: Store | None) -> dict[str, Any]:
-    figures = charge.figures if charge is not None else None
-    running = charge.component if charge is not None else None
+def _component(view: ComponentView, supervisor: Supervisor | None, settings: Settings, store: Store | None) -> dict[str, Any]:
+    figures = supervisor.figures if supervisor is not None else None
+    running = supervisor.component if supervisor is not None else None
     newest = view.positions[0] if view.positions else None
     engine = running.engine if running is not None else figures.engine if figures is not None else PTRACE
     held = running is not None and running.logs.is_held
@@ -220,7 +220,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "unstored": view.unstored,
         "lacks": _lacks(view, figures),
         "contested": list(_contested(view, figures)),
-        "prepared_first": charge is not None and charge.is_prepared_first,
+        "prepared_first": supervisor is not None and supervisor.is_prepared_first,
         "promise": view.promise,
         "promise_differs": view.differs,
         "home": view.home,
@@ -231,7 +231,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "reasons": list(figures.reasons) if figures else [],
         "notes": [
             *view.notes,
-            *told_lacks(view, charge, settings.config.robot),
+            *told_lacks(view, supervisor, settings.config.robot),
             *(f"NOT PROTECTED, a restore of it is refused: {reason}" for reason in _contested(view, figures)),
             *_own_notes(view, figures),
             *_over_budget(view, figures, settings),

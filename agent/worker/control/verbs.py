@@ -19,7 +19,7 @@ from agent.system.adopted_process import Guest
 from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for
 from agent.worker.components import prerequisites
 from agent.worker.components.paths import Places
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.arguments import (
     HandoverArguments,
     LogsArguments,
@@ -56,9 +56,9 @@ class Worker(Lines, Protocol):
     """What of `agent.worker.process.Worker` is needed here."""
 
     places: Places
-    charges: dict[str, Charge]
+    supervisors: dict[str, Supervisor]
 
-    def charge(self, name: str) -> Charge: ...
+    def supervisor(self, name: str) -> Supervisor: ...
     async def lacking(self, name: str) -> tuple[str, ...]: ...
 
 
@@ -141,18 +141,19 @@ class Verbs(Questions):
             connections=self._connections(name, wanted.connections),
             shared_memory=wanted.shared_memory or self._worker.settings.component(name).shared_memory,
         )
-        charge = await self._begin(name, launch, inheritance.uid, say.caller.uid)
-        started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
-        if charge.component is not None:
-            component = charge.component
+        supervisor = await self._begin(name, launch, inheritance.uid, say.caller.uid)
+        figures = supervisor.figures
+        started: dict[str, Any] = {"name": name, "notes": list(figures.notes), "reasons": list(figures.reasons)}
+        if supervisor.component is not None:
+            component = supervisor.component
             started |= {"pid": component.pid, "inner_pid": component.inner_pid, "isolated": component.isolated}
-            started["notes"] = [*component.notes, *charge.figures.notes]
+            started["notes"] = [*component.notes, *figures.notes]
         if not wanted.wait:
             return started
         await say.update({"started": started})
         await self._outflow.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
-        if charge.ended is not None and charge.ended.done():
-            report = charge.ended.result()
+        if supervisor.ended is not None and supervisor.ended.done():
+            report = supervisor.ended.result()
             return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
         view = await self._view(name)  # it ended on another robot
         return {"name": name, "exit_status": view.get("exit_status"), "failed": view["state"] == "failed", "reason": ""}
@@ -175,7 +176,7 @@ class Verbs(Questions):
     async def _taken_in(self, wanted: ProtectArguments, guest: Guest, caller: Caller) -> dict[str, Any]:
         """Protect a process that is the caller's."""
         assert guest.rights is not None, "it was asked whose it is"
-        for known in self._worker.charges.values():
+        for known in self._worker.supervisors.values():
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release ends that")
         name = await self._fresh_name(wanted.name, "", caller.uid)
@@ -191,23 +192,23 @@ class Verbs(Questions):
             shared=shared,
             shared_memory=wanted.shared_memory or self._worker.settings.component(name).shared_memory,
         )
-        charge = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
-        return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
+        supervisor = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
+        return {"name": name, "pid": wanted.pid, "notes": list(supervisor.figures.notes)}
 
     async def release(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
         name = await self._known(arguments_of(NameArguments, "release", arguments).name)
-        charge = self._worker.charge(name)
-        pid = charge.component.pid if charge.component is not None else None
+        supervisor = self._worker.supervisor(name)
+        pid = supervisor.component.pid if supervisor.component is not None else None
         await self._command(by, lambda number: events.Release(number, name))
-        await charge.let_go()  # the order came before the answer
+        await supervisor.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
 
     async def stop(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """End a component."""
         wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
-        end = self._worker.charge(name).end()
+        end = self._worker.supervisor(name).end()
         await self._command(by, lambda number: events.Stop(number, name, wanted.signal))
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
@@ -366,7 +367,7 @@ class Verbs(Questions):
         own = travelling(self._worker.settings.component(name).device_rules())
         return tuple({**wanted, **dict(own)}.items())
 
-    async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Charge:
+    async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Supervisor:
         """Have a component started or taken in, and wait until it is.
 
         Args:
@@ -378,29 +379,29 @@ class Verbs(Questions):
         """
         config = self._worker.settings.config
         rules = rules_for(config, self._worker.settings.component(name))
-        charge = self._worker.charge(name)
-        charge.guest = guest
-        charge.started.clear()
-        charge.ended = None
-        end = charge.end()
+        supervisor = self._worker.supervisor(name)
+        supervisor.guest = guest
+        supervisor.started.clear()
+        supervisor.ended = None
+        end = supervisor.end()
         try:
             spec = ComponentSpec(name, config.robot, launch, rules, owner)
             await self._command(by, lambda number: events.Run(number, spec))
         except RefusedError as refusal:
-            raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
-        begun = asyncio.ensure_future(charge.started.wait())
+            raise RefusedError(str(refusal), refusal.kind, supervisor.figures.reasons) from refusal
+        begun = asyncio.ensure_future(supervisor.started.wait())
         try:
             both: set[asyncio.Future[Any]] = {begun, end}
             await asyncio.wait(both, timeout=START_PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
         finally:
             begun.cancel()
-            charge.guest = None
+            supervisor.guest = None
         if end.done() and end.result().failed:
             verb = "protect" if launch.pid else "start"
-            raise RefusedError(f"cannot {verb} {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
-        if not charge.started.is_set():
+            raise RefusedError(f"cannot {verb} {name}: {end.result().reason}", "RefusedError", supervisor.figures.reasons)
+        if not supervisor.started.is_set():
             raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; see failover why {name}")
-        return charge
+        return supervisor
 
     async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:
         """Have the core decide, by the right of this user. Raises RefusedError: it says no."""

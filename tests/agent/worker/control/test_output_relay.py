@@ -32,13 +32,13 @@ class Listener:
 
 
 class Worker:
-    """A robot whose core says that the component is in a state, while its charge has not heard of an end."""
+    """A robot whose core says that the component is in a state, while its supervisor has not heard of an end."""
 
     def __init__(self, places: Places, state: State) -> None:
         self.settings: Any = None
         self.errands: Any = None
         self.places = places
-        self.charges: Any = {NAME: SimpleNamespace(ended=None, component=SimpleNamespace())}
+        self.supervisors: Any = {NAME: SimpleNamespace(ended=None, component=SimpleNamespace())}
         self._view = SimpleNamespace(name=NAME, state=state, primary="r1", positions=())
 
     async def ask(self, _what: object, _component: str = "") -> Any:
