@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from agent.errors import GuardError
 from agent.guard.messages import BeginTask
-from agent.guard.program import Ward
+from agent.guard.program import GuardedProgram
 from agent.system import clock
 from agent.worker.components import launch, process_pool, warm_program
 from agent.worker.components.component import Component
@@ -172,9 +172,9 @@ def test_a_program_whose_lease_is_over_is_frozen_before_it_hears_anything(tmp_pa
             return lambda *_: done.append(name)
 
     nothing = cast(Any, Noting())
-    ward = Ward(NAME, Born(1, 1), nothing, str(tmp_path), nothing, committed=False, warm=True, task=nothing)
-    ward.set_lease(1)
-    ward.begin_task(BeginTask(4, None, (0, 0)), ())
+    program = GuardedProgram(NAME, Born(1, 1), nothing, str(tmp_path), nothing, committed=False, warm=True, task=nothing)
+    program.set_lease(1)
+    program.begin_task(BeginTask(4, None, (0, 0)), ())
     assert done == ["open", "freeze", "begin", "begin"]
 
 
