@@ -26,7 +26,7 @@ from agent.worker.components import launch, prerequisites
 from agent.worker.components.context import Surroundings
 from agent.worker.components.hooks import Hooks
 from agent.worker.components.paths import Places, guard_sockets
-from agent.worker.components.process_pool import Nursery
+from agent.worker.components.process_pool import ProcessPool
 from agent.worker.components.run_records import Records
 from agent.worker.components.snapshots import newest_of
 from agent.worker.components.statistics import Memory
@@ -87,11 +87,11 @@ class Worker(Switchboard):
         self._store_path = state / "store"
         sockets = runtime / "guards"
         self._starter = starter()
-        self._nursery = Nursery(sockets, self._starter)
+        self._process_pool = ProcessPool(sockets, self._starter)
         contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
         self._alive = LastAlive.found(state / "last_alive")
         self.places = Places(
-            sockets, state / "logs", self._nursery, "", config.robot, contents, PageBudget(config.xor_cache_size)
+            sockets, state / "logs", self._process_pool, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
         self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self))
@@ -126,7 +126,7 @@ class Worker(Switchboard):
         found = await self._find_guards(records)
         await self._mend_logs(found)
         if found:
-            self._nursery.begin()
+            self._process_pool.begin()
         return Inventory(_held(store), found)
 
     async def _give_signs(self) -> None:
@@ -147,7 +147,7 @@ class Worker(Switchboard):
 
     async def close(self) -> None:
         """Let another life have the store."""
-        await self._nursery.close()
+        await self._process_pool.close()
         self._store.close()
 
     async def _open_store(self) -> Store:

@@ -68,7 +68,7 @@ async def start(name: str, program: Program, places: Places, epoch: int = 0, own
     Raises:
         GuardError: it could not be started; nothing is left of it.
     """
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     try:
         component.begin_output(os.geteuid() if owner is None else owner)
     except OSError as error:
@@ -115,7 +115,7 @@ async def watch(name: str, guest: Guest, places: Places) -> Component:
         GuardError: it has ended.
     """
     try:
-        component = Component(name, await places.nursery.guard(), places)
+        component = Component(name, await places.process_pool.guard(), places)
     except (GuardError, OSError):
         guest.close()
         raise
@@ -161,7 +161,7 @@ async def restore(
     check_rights(name, outline, owner, started)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain, owner=owner)
     laps.lap("reading the newest")
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     request = _vessel_for(name, outline, places, outage_ns, total_of(outline.output), task)
     component.engine_wanted = task.engine if task is not None else PTRACE
     component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
@@ -234,7 +234,7 @@ async def lay(
     counted_ns = now_ns()
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     check_rights(name, outline, owner, started)
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
     request = _vessel_for(name, outline, places, age_ns + COPY_CLOCKS_AHEAD_NS, None, counted_ns=counted_ns)
     try:
@@ -352,7 +352,7 @@ async def begin_again(
         if waiting is not None:
             await waiting.undo()
         raise
-    component = waiting or Component(name, await places.nursery.guard(), places)
+    component = waiting or Component(name, await places.process_pool.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
     component.keeper.terms = terms_of(outline, terms, bound_of(owner, program.inheritance))
     try:
@@ -383,7 +383,7 @@ async def start_to_wait(name: str, program: Program, places: Places, owner: int)
         GuardError: it could not be started; nothing is left of it.
     """
     _check_owner(name, program, owner)
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     component.engine_wanted = COOPERATIVE
     return await _born(component, _starting(name, under_epoch(program, 0), places, messages.Task(warm=True)))
 

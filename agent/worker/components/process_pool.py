@@ -66,7 +66,7 @@ class KeeperLink(Struct):
         self.dialogue.close()
 
 
-class Nursery:
+class ProcessPool:
     """Starts guards and keepers. Lives in one loop."""
 
     def __init__(self, sockets: Path, starter: str) -> None:

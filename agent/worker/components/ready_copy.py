@@ -83,7 +83,7 @@ class ReadyCopy:
         work, self._work = self._work, None
         ready, self._ready = self._ready, None
         self._figures.copy = CopyFigures()
-        self._around.places.nursery.relieve(self._name, False)
+        self._around.places.process_pool.relieve(self._name, False)
         if work is not None:
             work.cancel()
         if ready is not None:
@@ -210,11 +210,11 @@ class ReadyCopy:
     def _stands(self, ready: Ready, laid: messages.Laid) -> None:
         self._ready = ready
         self._figures.copy = CopyFigures(True, laid.size, laid.position)
-        self._around.places.nursery.relieve(self._name, True)
+        self._around.places.process_pool.relieve(self._name, True)
 
     async def _end(self, why: str) -> None:
         ready, self._ready = self._ready, None
         self._figures.copy = CopyFigures(why=why)
-        self._around.places.nursery.relieve(self._name, False)
+        self._around.places.process_pool.relieve(self._name, False)
         if ready is not None:
             await asyncio.shield(self._undone(ready))

@@ -78,7 +78,7 @@ class Deposit:
         self._admitted[act.component] = act
         if act.sender:
             self._senders[act.component] = act.sender
-        self._places.nursery.expect(sum(bool(known.sender) for known in self._admitted.values()))
+        self._places.process_pool.expect(sum(bool(known.sender) for known in self._admitted.values()))
 
     def last_sender(self, component: str) -> str:
         """From whom its snapshots come, or came until this robot claimed it; "" from nobody."""

@@ -22,7 +22,7 @@ from agent.worker.components import launch, process_pool
 from agent.worker.components.component import Captured, Component
 from agent.worker.components.launch import Program
 from agent.worker.components.paths import Places, guard_sockets
-from agent.worker.components.process_pool import Nursery
+from agent.worker.components.process_pool import ProcessPool
 from checkpoint.engine import NO_TERMS
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError
 from checkpoint.model import OutputPiece
@@ -59,13 +59,13 @@ def live(directory: Path, story: Story) -> None:
     """Run a story in a loop of its own; every guard and keeper that waits is ended after it."""
 
     async def whole() -> None:
-        cradle = Nursery(directory / "guards", "")
+        pool = ProcessPool(directory / "guards", "")
         (directory / "guards").mkdir()
-        places = Places(directory / "guards", directory / "logs", cradle, robot="robot1")
+        places = Places(directory / "guards", directory / "logs", pool, robot="robot1")
         try:
             await asyncio.wait_for(story(places), 2 * PATIENCE_S)
         finally:
-            await cradle.close()
+            await pool.close()
 
     asyncio.run(whole())
 

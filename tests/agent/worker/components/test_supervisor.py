@@ -292,8 +292,8 @@ def test_what_is_lacking_is_looked_at_once_the_copy_that_was_here_has_ended(
             return SimpleNamespace(end=lambda: None)
 
         monkeypatch.setattr(prerequisites, "_compared", compared)
-        nursery = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
-        places = cast(Any, SimpleNamespace(nursery=nursery))
+        process_pool = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
+        places = cast(Any, SimpleNamespace(process_pool=process_pool))
         around = Surroundings(places, nothing, Records(tmp_path), lambda _: None, nothing, nothing, lambda _: ComponentConfig())
         supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
         supervisor.begin()

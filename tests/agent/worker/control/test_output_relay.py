@@ -47,8 +47,8 @@ class Worker:
 
 @pytest.fixture
 def places(tmp_path: Path) -> Places:
-    nursery: Any = None
-    found = Places(tmp_path / "state", tmp_path / "run", nursery)
+    process_pool: Any = None
+    found = Places(tmp_path / "state", tmp_path / "run", process_pool)
     logs = OutputLogs(log_directory(NAME, found))
     logs.write(1, 0, WRITTEN)
     logs.commit((COMMITTED, 0))
