@@ -35,7 +35,7 @@ class Scribe:
     """One life's lines. `note` and `unwritten` belong to the main loop, and no lock of the thread's can make them wait.
 
     Attributes:
-        trouble: why the story cannot be written now, or what is missing in it; "" if all is well.
+        trouble: why the event log cannot be written now, or what is missing in it; "" if all is well.
     """
 
     def __init__(self, state_directory: Path, robot: str, life: int) -> None:

@@ -394,7 +394,7 @@ class MainLoop:
         )
         troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble)))
         if question.what == "why":
-            return Told(question.number, now_ns, story=self._scribe.unwritten(), beats=counts, troubles=troubles)
+            return Told(question.number, now_ns, unwritten=self._scribe.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
 

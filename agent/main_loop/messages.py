@@ -103,7 +103,7 @@ class HearKey(msgspec.Struct, frozen=True, tag=True):
 
 
 class Ask(msgspec.Struct, frozen=True, tag=True):
-    """Worker to main loop: show me the team, or tell me the story. Answer: `Told`."""
+    """Worker to main loop: show me the team, or the decisions that are not on the disk yet. Answer: `Told`."""
 
     number: int
     what: Literal["status", "why"]
@@ -134,14 +134,14 @@ class Told(msgspec.Struct, frozen=True, tag=True):
     """Main loop to worker: the answer to `Ask`.
 
     Attributes:
-        story: lines that are not on the disk yet; the worker reads the others itself.
-        troubles: sentences: why a vote record, or the story, cannot be written.
+        unwritten: lines of the event log that are not on the disk yet; the worker reads the others itself.
+        troubles: sentences: why a vote record, or the event log, cannot be written.
     """
 
     number: int
     now_ns: int
     status: StatusView | None = None
-    story: tuple[Line, ...] = ()
+    unwritten: tuple[Line, ...] = ()
     beats: BeatCounts = BeatCounts()
     troubles: tuple[str, ...] = ()
 

@@ -36,7 +36,7 @@ NOBODY: Final = -1
 """For what a robot asks another one by itself: it may be told how things stand, and no more."""
 
 SAID: Final = "; it said: "
-"""Begins, at the end of a sentence of status or story, what a program wrote last."""
+"""Begins, at the end of a sentence of the status or the event log, what a program wrote last."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 

@@ -264,7 +264,7 @@ class Membership:
         return robot not in self.peers or not self.peers[robot].boot
 
     def unreadable(self, robot: str, why: str, now_ns: int) -> str:
-        """Note what could not be authenticated; a sentence for the story where it is the first, or says more than before.
+        """Note what could not be authenticated; a sentence for the event log where it is the first, or says more than before.
 
         Of a peer that lives it says nothing: anybody may send from its address.
         """

@@ -87,7 +87,7 @@ class World:
         self.now_ns = until_ns
 
     def note(self, sentence: str) -> None:
-        """Something for whoever reads the story afterwards."""
+        """Something for the log that a failed seed prints."""
         self.log.append(f"{self.now_ns / MS:10.3f}  {sentence}")
 
     def _tell(self, robot: str, what: object) -> None:

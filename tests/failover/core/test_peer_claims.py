@@ -39,7 +39,7 @@ def test_more_are_refused_counted_and_told(state: State, said: int) -> None:
         ready = talk.hear("robot1", entry(state, said, "robot1", NEWEST))
     assert epoch(talk) == 7
     assert f"not believed, 3 times, last 0 s ago: robot1 says epoch {said} of {NAME}, {said - 7} above" in told(talk, "robot1")
-    assert not talk.node.status(talk.now_ns).healthy and not ready.told, "the story has the first, the tenth, the hundredth"
+    assert not talk.node.status(talk.now_ns).healthy and not ready.told, "the event log has the first, the tenth, the hundredth"
 
 
 def test_a_robot_that_says_it_runs_something_in_an_impossible_epoch_is_not_replaced_while_it_lives() -> None:

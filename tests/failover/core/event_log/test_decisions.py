@@ -94,7 +94,7 @@ def test_a_primary_tells_what_its_loss_would_cost() -> None:
     assert noticed.facts.output_pending == 77
 
 
-def test_what_is_noticed_about_an_unknown_component_is_nobodys_story() -> None:
+def test_what_is_noticed_about_an_unknown_component_leaves_no_line() -> None:
     node = Node(ALONE, 1, VoteRecord(), 0)
     told(node, Tick(), 0)
     assert told(node, Noticed("/lab/strange", "something"), 1) == []
@@ -112,10 +112,10 @@ def line(robot: str, number: int, *, counter: int = 0, life: int = 1, epoch: int
 
 def order(*lines: tuple[Line, int]) -> list[str]:
     """The sentences in the order told; every line with its instant in ms by the common clock."""
-    stories: dict[str, list[Timed]] = {}
+    logs: dict[str, list[Timed]] = {}
     for one, at_ms in lines:
-        stories.setdefault(one.robot, []).append(Timed(one, at_ms * MS))
-    return [timed.line.decision.sentence for timed in merged(stories)]
+        logs.setdefault(one.robot, []).append(Timed(one, at_ms * MS))
+    return [timed.line.decision.sentence for timed in merged(logs)]
 
 
 def test_whoever_heard_of_a_decision_decided_later_whatever_the_clocks_say() -> None:
@@ -158,24 +158,24 @@ def test_no_wrong_clock_turns_cause_and_consequence_round(seed: int) -> None:
     heard: dict[str, dict[str, tuple[int, int]]] = {robot: {} for robot in wrong_ms}
     beats = dict.fromkeys(wrong_ms, 0)
     numbers = {robot: itertools.count(1) for robot in wrong_ms}
-    stories: dict[str, list[Timed]] = {robot: [] for robot in wrong_ms}
+    logs: dict[str, list[Timed]] = {robot: [] for robot in wrong_ms}
     for now_ms in range(1_000):
         robot = dice.choice(list(wrong_ms))
         if dice.random() < 0.1:
             one = line(robot, next(numbers[robot]), counter=beats[robot] + 1, **heard[robot])
-            stories[robot].append(Timed(one, (now_ms + wrong_ms[robot]) * MS))
+            logs[robot].append(Timed(one, (now_ms + wrong_ms[robot]) * MS))
         else:
             beats[robot] += 1
             listener = dice.choice([other for other in wrong_ms if other != robot])
             heard[listener][robot] = (1, beats[robot])
-    place = {(timed.line.robot, timed.line.number): at for at, timed in enumerate(merged(stories))}
-    assert len(place) == sum(map(len, stories.values())), seed
-    for effect in (timed.line for story in stories.values() for timed in story):
+    place = {(timed.line.robot, timed.line.number): at for at, timed in enumerate(merged(logs))}
+    assert len(place) == sum(map(len, logs.values())), seed
+    for effect in (timed.line for log in logs.values() for timed in log):
         heard_of = {one.robot: one.counter for one in effect.decision.facts.seen} | {effect.robot: beats[effect.robot] + 1}
         causes = [
             timed.line
             for robot, beat in heard_of.items()
-            for timed in stories[robot]
+            for timed in logs[robot]
             if timed.line.decision.facts.counter <= beat and (robot != effect.robot or timed.line.number < effect.number)
         ]
         assert all(place[cause.robot, cause.number] < place[effect.robot, effect.number] for cause in causes), seed
