@@ -13,7 +13,7 @@ base.
 
 On the standby, when it takes over:
 
-    component = await launch.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted
+    component = await launch.restore(name, chain_descriptors, places, options)         # stopped, whole, uncommitted
     await component.resume()                                                            # it runs, protected already
 """
 

@@ -18,7 +18,7 @@ from agent.guard.program import GuardedProgram
 from agent.system import clock
 from agent.worker.components import launch, process_pool, warm_program
 from agent.worker.components.component import Component
-from agent.worker.components.launch import Program
+from agent.worker.components.launch import Program, RestoreOptions
 from agent.worker.components.paths import Places, guard_sockets
 from agent.worker.components.warm_program import Standby
 from checkpoint.linux.spawn.vessel import Born
@@ -78,7 +78,7 @@ async def left_by(places: Places, script: str) -> tuple[Captures, int]:
 async def prepared(places: Places, captures: Captures, waiting: Component) -> Component:
     elsewhere = replace(places, robot="robot2")
     return await launch.begin_again(
-        NAME, program(STEPS), captures.chain, elsewhere, outage_ns=5, owner=0, epoch=4, why=TAKEN_OVER, waiting=waiting
+        NAME, program(STEPS), captures.chain, elsewhere, RestoreOptions(5, owner=0, epoch=4), TAKEN_OVER, waiting
     )
 
 
