@@ -31,7 +31,7 @@ from agent.worker.components.run_records import Records
 from agent.worker.components.snapshots import newest_of
 from agent.worker.components.statistics import Memory
 from agent.worker.components.supervisor import Supervisor
-from agent.worker.control.status_view import team_view
+from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.control.verbs import Verbs
 from agent.worker.hub import Switchboard, live, make_directory
 from agent.worker.replication.receive_files import Limits, Stock
@@ -387,17 +387,9 @@ class Worker(Switchboard):
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
         notices = [*self.notices(), *self._around.store.notices[-NOTICES_SHOWN:]]
-        return team_view(
-            self.settings,
-            self._life,
-            told,
-            self.supervisors,
-            self._replication_link.links,
-            notices,
-            self._links.shown(),
-            self._around.store,
-            self._memory(),
-        )
+        links, interfaces = self._replication_link.links, self._links.shown()
+        ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory())
+        return team_view(self.settings, self._life, told, ours)
 
     def _memory(self) -> Memory:
         keepers = {one.component.keeper.pid for one in self.supervisors.values() if one.component is not None}

@@ -13,7 +13,7 @@ from typing import Any
 from agent.config import Settings
 from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.worker.control.queries import Questions
-from agent.worker.control.status_view import team_view
+from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.hub import Switchboard, live
 from checkpoint.keeper.messages import Channel
 from failover.core import acts
@@ -49,9 +49,8 @@ class Witness(Switchboard):
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        return team_view(
-            self.settings, self._life, told, {}, self._replication_link.links, self.notices(), self._links.shown(), None
-        )
+        ours = WorkerView(self._replication_link.links, self.notices(), self._links.shown())
+        return team_view(self.settings, self._life, told, ours)
 
 
 def main() -> int:

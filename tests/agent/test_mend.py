@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agent.main import main
-from agent.main_loop.vote_record import VoteRecord
+from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.store.store import open_store
 from failover.config import team
 from failover.config.team import Robot, Team
@@ -43,7 +43,7 @@ def config(tmp_path: Path) -> Path:
         f'robot = "robot1"\nteam_directory = "{directory}"\nstate_directory = "{tmp_path}/state"\n'
         f'runtime_directory = "{tmp_path}/run"\ninsecure = true\n'
     )
-    record_file = VoteRecord(tmp_path / "state", "robot1")
+    record_file = VoteRecordFile(tmp_path / "state", "robot1")
     record_file.open()
     record_file.keep(core_vote_record.encode(types.VoteRecord((POISONED, OTHER))))
     open_store(tmp_path / "state" / "store").close()
@@ -51,7 +51,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def records(config: Path) -> tuple[Record, ...]:
-    return core_vote_record.decode(VoteRecord(config.parent / "state", "robot1").read().core).records
+    return core_vote_record.decode(VoteRecordFile(config.parent / "state", "robot1").read().core).records
 
 
 def test_it_tells_the_cost_and_changes_nothing_until_it_is_agreed_to(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -66,7 +66,7 @@ def test_it_lowers_the_one_record_and_leaves_no_vote_in_it(config: Path) -> None
     mended, other = records(config)
     assert (mended.epoch, mended.primary, mended.entrusted, mended.trusted, mended.spec) == (12, "", (), False, POISONED.spec)
     assert other == OTHER
-    assert VoteRecord(config.parent / "state", "robot1").open().boot == 2, "it was no life of the agent"
+    assert VoteRecordFile(config.parent / "state", "robot1").open().boot == 2, "it was no life of the agent"
 
 
 @pytest.mark.parametrize(

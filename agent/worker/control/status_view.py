@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import Struct, field
 from msgspec.structs import asdict
 
 from agent.config import Settings
@@ -16,7 +17,7 @@ from agent.guard.output_pump import HOLD_LIMIT
 from agent.main_loop.messages import Life, Told
 from agent.system import clock
 from agent.worker.control import fencing_status
-from agent.worker.network.replication_link import Link, LinkState
+from agent.worker.network.replication_link import LinkState, PeerConnection
 from checkpoint.device_rules import merged, missing
 from checkpoint.engine import COOPERATIVE, PTRACE
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
@@ -56,20 +57,30 @@ def version() -> str:
     return next((path.stem.partition("-")[2] for path in records), "unknown")
 
 
-def team_view(
-    settings: Settings,
-    life: Life,
-    told: Told,
-    supervisors: Mapping[str, Supervisor],
-    links: Mapping[str, Link],
-    notices: list[str],
-    interfaces: list[dict[str, object]],
-    store: Store | None,
-    memory: Memory | None = None,
-) -> dict[str, Any]:
+class WorkerView(Struct, frozen=True):
+    """What the worker knows beside the main loop's answer.
+
+    Attributes:
+        supervisors: by component; none at a witness.
+        links: the replication link to each peer.
+        notices: sentences.
+        interfaces: as the status shows them.
+        store: None at a witness.
+        memory: None at a witness.
+    """
+
+    links: Mapping[str, PeerConnection]
+    notices: list[str]
+    interfaces: list[dict[str, object]]
+    supervisors: Mapping[str, Supervisor] = field(default_factory=dict)
+    store: Store | None = None
+    memory: Memory | None = None
+
+
+def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
-    notes = [*life.notes, *notices, *told.troubles]
+    notes = [*life.notes, *ours.notices, *told.troubles]
     beats = told.beats
     return {
         "robot": settings.config.robot,
@@ -82,13 +93,15 @@ def team_view(
         "realtime": settings.config.realtime and not life.notes,
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
-        "memory": asdict(memory) if memory is not None else None,
+        "memory": asdict(ours.memory) if ours.memory is not None else None,
         "fencing": fencing_status.sentence(fencing_status.watchdog()),
         "healthy": view.healthy if view else False,
         "notes": notes,
-        "links": interfaces,
-        "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
-        "components": [_component(one, supervisors.get(one.name), settings, store) for one in (view.components if view else ())],
+        "links": ours.interfaces,
+        "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
+        "components": [
+            _component(one, ours.supervisors.get(one.name), settings, ours.store) for one in (view.components if view else ())
+        ],
         "beats": {
             "sent": beats.sent,
             "heard": beats.heard,
@@ -102,7 +115,7 @@ def team_view(
     }
 
 
-def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> dict[str, Any]:
+def _peer(peer: PeerView, link: PeerConnection | None, told: Told, settings: Settings) -> dict[str, Any]:
     reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread, *peer.refused))))
     return {
         "name": peer.robot,

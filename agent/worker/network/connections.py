@@ -16,7 +16,7 @@ from typing import Final
 from agent.config import Settings
 from agent.errors import LaneError
 from agent.worker.network.links import Links
-from agent.worker.network.replication_link import Keys, LinkState, ReplicationLink, Unread
+from agent.worker.network.replication_link import Callbacks, Keys, LinkState, ReplicationLink, Unread
 from failover.config.team import Robot, split_address
 from failover.core.wire.messages import Bulk
 
@@ -52,12 +52,12 @@ class Ways:
         self._all: list[ReplicationLink] = []
         name = settings.config.robot
         bulks = {peer: robot.bulk for peer, robot in settings.peers.items()}
-        hear, change = functools.partial(heard, BULK), functools.partial(changed, BULK)
-        self.bulk = ReplicationLink(name, settings.me.bulk, bulks, keys, hear, change, links, unread)
+        tell = Callbacks(functools.partial(heard, BULK), functools.partial(changed, BULK), unread)
+        self.bulk = ReplicationLink(name, settings.me.bulk, bulks, keys, tell, links)
         self._all.append(self.bulk)
         for way, (bind, peers) in enumerate(further_links(settings), start=1):
-            hear, change = functools.partial(heard, way), functools.partial(changed, way)
-            self._all.append(ReplicationLink(name, bind, peers, keys, hear, change, unread=unread))
+            tell = Callbacks(functools.partial(heard, way), functools.partial(changed, way), unread)
+            self._all.append(ReplicationLink(name, bind, peers, keys, tell))
 
     def open(self) -> None:
         """Listen on every link. A further link that cannot be had is done without, and said.

@@ -370,9 +370,10 @@ class ProcessRestore:
         system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
         sizes = {} if self._estate else restored_memory.anonymous_sizes(vmas)
         ours_alone = restored_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
-        inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
-        self._objects |= restored_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy, self._untouched)
-        self._objects |= inherited[0]
+        objects, anonymous = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
+        present = restored_memory.Present(objects, anonymous, self._legacy)
+        self._objects |= restored_memory.map_program(table, vmas, runs, brought, present, self._untouched)
+        self._objects |= objects
         for key, place in ours_alone.items():
             table.call("unmap shared memory, which is mapped elsewhere now", "munmap", place, sizes[key])
         self._executable = brought.pop(self._state.process.executable.path, None)

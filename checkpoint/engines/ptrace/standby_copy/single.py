@@ -31,6 +31,7 @@ from checkpoint.engine import Copy, RestoreOptions, pid_taken
 from checkpoint.engines.ptrace.restore import checks, memory, process_state, vdso
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
+from checkpoint.engines.ptrace.restore.memory import NOTHING_PRESENT, Present
 from checkpoint.engines.ptrace.restore.process import RSEQ_SECTION_OFFSET, Estate, LaterTables, ProcessRestore, options_for
 from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel
 from checkpoint.engines.ptrace.restore.restore import RestoredProgram
@@ -214,8 +215,8 @@ class ReadyCopy(ProcessRestore):
         brought = self._checked(replace(delta, vmas=tuple(change.fresh_files()))) if change.fresh_files() else Brought()
         table = CallTable(self._stub.base, descriptors=set(self._descriptors))
         run = self._open_with_our_rights(table, brought)
-        shared = (self._estate.objects, self._estate.anonymous) if self._estate else ()
-        change.add_calls(table, run, *shared)
+        present = Present(self._estate.objects, self._estate.anonymous) if self._estate else NOTHING_PRESENT
+        change.add_calls(table, run, present)
         for descriptor in run.values():
             table.close(descriptor)
         self._check_room(table)

@@ -12,7 +12,7 @@ import pytest
 
 from agent.errors import LaneError
 from agent.system import connection_quota
-from agent.worker.network.replication_link import MEND, Keys, LinkState, ReplicationLink, new_keys, shown
+from agent.worker.network.replication_link import MEND, Callbacks, Keys, LinkState, ReplicationLink, new_keys, shown
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
 
 PATIENCE_S = 20.0
@@ -49,7 +49,7 @@ class Pair:
             self.unread[name].append((sign[0], sign[1]))
 
         where = f"127.0.0.1:{self.ports[name]}"
-        return ReplicationLink(name, where, peers, keys, receive, lambda *_: None, unread=unread)
+        return ReplicationLink(name, where, peers, keys, Callbacks(receive, lambda *_: None, unread))
 
     def state(self, name: str) -> LinkState:
         other = next(peer for peer in self.ports if peer != name)
