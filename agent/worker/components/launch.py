@@ -35,6 +35,7 @@ from checkpoint.linux.spawn.inherited_limits import Inheritance
 from checkpoint.model import Snapshot
 from checkpoint.program import epoch_variable
 from checkpoint.segment.task_messages import Origin
+from checkpoint.sentences import copy_outdated
 from checkpoint.snapshot import format
 from checkpoint.snapshot.carried_files import paths_of
 from checkpoint.snapshot.credentials import Owner
@@ -280,7 +281,7 @@ async def lay(
 
 def stale(name: str) -> ChainError:
     """A ready copy does not lead to what the store holds now: a base has come."""
-    return ChainError(f"the ready copy of {name} must be built again: a new chain has begun")
+    return ChainError(copy_outdated("a new chain has begun", name))
 
 
 async def finish(component: Component, outline: Snapshot, places: Places, options: RestoreOptions) -> None:

@@ -40,6 +40,7 @@ from checkpoint.resources import other_holders
 from checkpoint.resources.ipc import standard_streams
 from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "terminals"
 
@@ -53,7 +54,7 @@ CAPABILITIES: Final = (
     refused(
         Area.TERMINALS,
         "a pseudo-terminal with data that waits to be read, or with a line discipline of another kind",
-        "wait: failover captures it as soon as the data is read; let the program use the ordinary line discipline",
+        f"wait: {AS_SOON_AS} the data is read; let the program use the ordinary line discipline",
         "with {} bytes that wait in it",
         "with line discipline",
     ),
@@ -211,10 +212,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     number, waiting, discipline = (number_of(seen.get(name, N_TTY)) for name in ("terminal", "waiting", "discipline"))
     if waiting:
-        return (
-            f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: "
-            "failover captures it as soon as the program has read them"
-        )
+        return f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: {AS_SOON_AS} the program has read them"
     if discipline != N_TTY:
         return f"{held.name} is a pseudo-terminal with line discipline {discipline}: only the ordinary one (N_TTY) is kept"
     if not seen["hung_up"] and (other := _other_opener(held, number)):

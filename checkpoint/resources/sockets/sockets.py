@@ -38,6 +38,7 @@ from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
+from checkpoint.sentences import AS_SOON_AS
 
 CAPABILITIES: Final = (
     refused(
@@ -244,7 +245,7 @@ def ends(kind: str, name: str, what: str, surroundings: Surroundings, more: str 
         more: what that means for the program.
     """
     if surroundings.terms.refuses_connections:
-        cure = "failover captures it as soon as the program has closed the connection"
+        cure = f"{AS_SOON_AS} the program has closed the connection"
         return Finding(kind, name, REFUSED, f'{what} by a restore, which connections = "refuse" rules out: {cure}')
     return Finding(kind, name, NOTED, f"{what} when the program comes back{more}")
 

@@ -37,6 +37,7 @@ from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Snapshot, Vma
 from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Words
+from checkpoint.sentences import copy_outdated
 
 MADV_DONTNEED: Final = 4
 MADV_REMOVE: Final = 9
@@ -185,7 +186,7 @@ def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
         same = page_set.intersection(before[key], extents)
         is_of_one = key[0] is True and key[2] is None
         if is_of_one and len(same) and len(page_set.difference(extents, before[key])):
-            raise RestoreError("the ready copy must be built again: its shared memory has grown in its place")
+            raise RestoreError(copy_outdated("its shared memory has grown in its place"))
         kept = page_set.union(kept, same)
     return page_set.difference(_extents(old), kept), page_set.difference(_extents(new), kept)
 

@@ -50,6 +50,7 @@ from checkpoint.pages.xor_delta import Rows
 from checkpoint.resources.process import seccomp
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import tcp_handover
+from checkpoint.sentences import copy_outdated
 from checkpoint.store import chain
 
 ROOM: Final = 16 << 20
@@ -192,7 +193,7 @@ class ReadyCopy(ProcessRestore):
         self._require_whole()
         chain.check_continues(self.position, delta)
         if delta.is_tree:
-            raise RestoreError(f"the ready copy of {delta.component} must be built again: it has several processes by now")
+            raise RestoreError(copy_outdated("it has several processes by now", delta.component))
         require_covered(delta)
         plan = self.planned(xor_delta.resolved(delta, self.rows_at))
         self.torn = True
@@ -311,7 +312,7 @@ class ReadyCopy(ProcessRestore):
             ("the address of failover's stub", not self._overlaps_stub(theirs)),
         )
         if changed := ", ".join(what for what, is_same in fixed if not is_same):
-            raise RestoreError(f"the ready copy of {ours.component} must be built again: these have changed: {changed}")
+            raise RestoreError(copy_outdated(f"these have changed: {changed}", ours.component))
 
     def _overlaps_stub(self, state: Snapshot) -> bool:
         start, end = self._stub.base, self._stub.base + self._area_size
@@ -329,7 +330,7 @@ class ReadyCopy(ProcessRestore):
         off_ns = self._clocks_ahead_ns(elapsed_ns)
         if off_ns is not None and (off_ns + elapsed_ns < 0 or off_ns > AHEAD_NS):
             where = f"{off_ns / 1e9:.1f} s ahead" if off_ns > 0 else f"{-off_ns / 1e9:.1f} s behind"
-            raise RestoreError(f"the ready copy of {self._state.component} must be built again: its clocks are {where}")
+            raise RestoreError(copy_outdated(f"its clocks are {where}", self._state.component))
 
     def _clocks_ahead_ns(self, elapsed_ns: int) -> int | None:
         """How far its monotonic time is ahead of the program's; None where it has this machine's, for nothing can be set then."""

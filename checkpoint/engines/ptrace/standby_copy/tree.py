@@ -51,6 +51,7 @@ from checkpoint.pages.source import PageSource
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.resources.process import shared_with_parent
 from checkpoint.resources.sockets import tcp_handover
+from checkpoint.sentences import copy_outdated
 from checkpoint.snapshot import process_tree
 from checkpoint.store import chain
 
@@ -266,15 +267,14 @@ class FamilyCopy(TreeRestore):
 
     def _require_same_shape(self, delta: Snapshot) -> None:
         if _shape_of(delta) != _shape_of(self._state):
-            raise RestoreError(f"the ready copy of {self._state.component} must be built again: its processes have changed")
+            raise RestoreError(copy_outdated("its processes have changed", self._state.component))
 
     def _require_same_objects(self, views: Sequence[Snapshot]) -> None:
         ours, theirs = self._objects, _objects_of(views)
         is_same = theirs.keys() <= ours.keys() and all(_fits(ours[key], theirs.get(key)) for key in ours)
         if not is_same:
-            raise RestoreError(
-                f"the ready copy of {self._state.component} must be built again: shared memory has come, gone, or changed in size"
-            )
+            changed = "shared memory has come, gone, or changed in size"
+            raise RestoreError(copy_outdated(changed, self._state.component))
 
     def _brought_for(self, view: Snapshot) -> Brought:
         reasons, run = checks.of_mapped_files(view, self._options)
