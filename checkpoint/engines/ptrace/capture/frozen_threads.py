@@ -27,8 +27,9 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptor_cache import TEXTS_KEPT
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.trace.bulk_reads import NO_FILE, Reading, Unread
-from checkpoint.linux.trace.remote_syscalls import SMALL, Answers, Batch, Desk, Guest
 from checkpoint.linux.trace.seccomp import FILTERED, FREE, Confinement
+from checkpoint.linux.trace.syscall_batch import SMALL, Answers, Batch
+from checkpoint.linux.trace.syscall_desk import Desk, Guest
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from checkpoint.model import Rseq
