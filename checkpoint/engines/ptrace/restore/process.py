@@ -29,14 +29,24 @@ from msgspec.structs import replace
 from checkpoint.arch import extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines.ptrace.facts import prctl_state
-from checkpoint.engines.ptrace.restore import checks, mapping_kinds, process_state, stopped_children, vdso_syscalls
+from checkpoint.engines.ptrace.restore import (
+    checks,
+    mapping_kinds,
+    process_state,
+    rights,
+    signals,
+    stopped_children,
+    timers,
+    vdso_syscalls,
+)
 from checkpoint.engines.ptrace.restore import memory as restored_memory
 from checkpoint.engines.ptrace.restore import threads as restored_threads
 from checkpoint.engines.ptrace.restore import vdso as restored_vdso
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
-from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel, pending_traps
+from checkpoint.engines.ptrace.restore.signals import pending_traps
 from checkpoint.engines.ptrace.restore.vdso_syscalls import VdsoCalls
+from checkpoint.engines.ptrace.restore.vessel import Vessel, look_at_vessel
 from checkpoint.errors import MismatchError, RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
@@ -356,7 +366,7 @@ class ProcessRestore:
         process_state.raise_limits(table, vessel)
         brought = self._open_brought(table)  # with our rights, from a place of ours
         if self._options.own_eyes:
-            process_state.own_eyes(table, self._state.process, vessel)
+            rights.own_eyes(table, self._state.process, vessel)
         self._make_directories(table)
         if self._estate is not None:
             process_state.begin_member(table)
@@ -404,14 +414,14 @@ class ProcessRestore:
         process_state.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
-        ours = process_state.our_eyes(table, process, vessel, self._options)  # its own file of /proc is root's by now
+        ours = rights.our_eyes(table, process, vessel, self._options)  # its own file of /proc is root's by now
         self.notes += audit_login.rebuild(table, self._state.resources, vessel.pid, ours)
         if self.has_table_of_parent:
             for number in set(self._objects.values()) - self._inherited():
                 table.close(number)
         else:
             self._rebuild_descriptors(table, vessel)
-        process_state.signal_actions(table, process.signal_actions)
+        signals.signal_actions(table, process.signal_actions)
         process_state.thread_marks(table, thread)
         process_state.enter_directory(table, process.working_directory, deleted_directory(self._state))
         process_state.surroundings(table, process)
@@ -436,11 +446,11 @@ class ProcessRestore:
         self.notes += process_state.limits(table, process, vessel)
         process_state.enter_root(table, process, vessel)
         self._confine(table, thread, process.credentials)
-        self.notes += process_state.rights(table, process, vessel, ordinary=self._options.own_eyes)
-        process_state.pending_signals(table, process, vessel.inner_pid)
-        process_state.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
-        process_state.posix_timers(table, process, state.threads, vessel, elapsed_ns)
-        process_state.interval_timers(table, process.interval_timers, elapsed_ns)
+        self.notes += rights.adopt(table, process, vessel, ordinary=self._options.own_eyes)
+        signals.pending_signals(table, process, vessel.inner_pid)
+        signals.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
+        timers.posix_timers(table, process, state.threads, vessel, elapsed_ns)
+        timers.interval_timers(table, process.interval_timers, elapsed_ns)
         process_state.last_marks(table, process)
         rebuild_last(table, self._state, vessel.inner_pid)
         prctl_state.set_again(table, process.switches)
@@ -456,9 +466,9 @@ class ProcessRestore:
         unshared_threads.enter(table, self._state.resources, thread.tid)
         unshared_threads.part(table, self._state.resources, thread.tid, open_here(self._state))
         self._confine(table, thread, credentials)
-        process_state.rights(table, replace(process, credentials=credentials), vessel, ordinary=self._options.own_eyes)
+        rights.adopt(table, replace(process, credentials=credentials), vessel, ordinary=self._options.own_eyes)
         parent_death_signals.rebuild(table, self._state.resources, thread.tid)
-        process_state.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
+        signals.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
         prctl_state.set_again(table, [switch for switch in process.switches if switch[0] in prctl_state.OF_THREADS])
         return table
 
@@ -482,8 +492,8 @@ class ProcessRestore:
     def become_program(self) -> None:
         """SIGTRAP's action, our area gone, then the program's own registers and masks."""
         tracee, calls, place = self._tracee, self._calls_of_vdso(), self._stub.base + abi.PAGE_SIZE
-        action = process_state.trap_action(self._state.process.signal_actions)
-        tracee.memory.write(place, process_state.packed_action(action))
+        action = signals.trap_action(self._state.process.signal_actions)
+        tracee.memory.write(place, signals.packed_action(action))
         calls.make("rt_sigaction", signal.SIGTRAP, place, 0, abi.SIGSET_SIZE)
         self._queue_traps(calls, place)
         for start, end in self._ours().tolist():

@@ -37,6 +37,7 @@ from checkpoint.engines.ptrace.restore import (
     forked_memory,
     memory,
     process_state,
+    rights,
     shared_files,
     stopped_children,
     threads,
@@ -45,7 +46,7 @@ from checkpoint.engines.ptrace.restore import (
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
 from checkpoint.engines.ptrace.restore.process import REFUGE_SIZE, Estate, ProcessRestore, options_for
-from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel
+from checkpoint.engines.ptrace.restore.vessel import Vessel, look_at_vessel
 from checkpoint.errors import CheckpointError, MismatchError, ProcessGoneError, RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import descendants, procfs
@@ -215,7 +216,7 @@ class TreeRestore:
         process_state.raise_limits(table, vessel)
         made = self._open_brought(table, resources) | left  # with our rights, from a place of ours
         if self._options.own_eyes:
-            process_state.own_eyes(table, self._state.process, vessel)
+            rights.own_eyes(table, self._state.process, vessel)
         for key, size in sizes.items():
             what, place = f"map {size >> 10} KiB of shared memory", estate.anonymous[key]
             flags = abi.MAP_SHARED | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE

@@ -28,13 +28,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.engine import Copy, RestoreOptions, pid_taken
-from checkpoint.engines.ptrace.restore import checks, memory, process_state, vdso
+from checkpoint.engines.ptrace.restore import checks, memory, rights, vdso
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
 from checkpoint.engines.ptrace.restore.memory import NOTHING_PRESENT, Present
 from checkpoint.engines.ptrace.restore.process import RSEQ_SECTION_OFFSET, Estate, LaterTables, ProcessRestore, options_for
-from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel
 from checkpoint.engines.ptrace.restore.restore import RestoredProgram
+from checkpoint.engines.ptrace.restore.vessel import Vessel, look_at_vessel
 from checkpoint.engines.ptrace.standby_copy.eligibility import require_covered
 from checkpoint.engines.ptrace.standby_copy.mappings import Change
 from checkpoint.errors import ChainError, CheckpointError, MismatchError, RestoreError, UnsupportedError
@@ -284,7 +284,7 @@ class ReadyCopy(ProcessRestore):
     def _make_directories(self, table: CallTable) -> None:
         """Not before the takeover: they are seen."""
 
-    def _state_table(self, table: CallTable, vessel: process_state.Vessel) -> CallTable:
+    def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         lacking = {path: content for path, content in self._brought.opened.items() if not self._is_open(path)}
         self._open_with_our_rights(table, Brought(opened=lacking))
         super()._make_directories(table)
@@ -373,7 +373,7 @@ class ReadyCopy(ProcessRestore):
         if not brought.run and not brought.opened:
             return {}
         self._brought = brought
-        with process_state.our_eyes(table, self._state.process, self._vessel, self._options):
+        with rights.our_eyes(table, self._state.process, self._vessel, self._options):
             return self._open_brought(table)
 
     def _is_open(self, path: str) -> bool:

@@ -29,14 +29,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines.ptrace.restore import checks, memory, process_state, shared_files
+from checkpoint.engines.ptrace.restore import checks, memory, rights, shared_files
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
 from checkpoint.engines.ptrace.restore.memory import Object
 from checkpoint.engines.ptrace.restore.process import Estate
-from checkpoint.engines.ptrace.restore.process_state import look_at_vessel
 from checkpoint.engines.ptrace.restore.restore import RestoredProgram
 from checkpoint.engines.ptrace.restore.tree import TreeRestore, first_told
+from checkpoint.engines.ptrace.restore.vessel import look_at_vessel
 from checkpoint.engines.ptrace.standby_copy.eligibility import require_covered
 from checkpoint.engines.ptrace.standby_copy.mappings import MADV_REMOVE, held_of_objects
 from checkpoint.engines.ptrace.standby_copy.single import ReadyCopy, ended_on_error, paths_open_in
@@ -251,7 +251,7 @@ class FamilyCopy(TreeRestore):
         )
         vessel = self._copies[0].vessel
         table = CallTable(estate.base, descriptors=set(self._descriptors))
-        with process_state.our_eyes(table, self._state.process, vessel, self._options):
+        with rights.our_eyes(table, self._state.process, vessel, self._options):
             brought = self._open_brought(table, resources)
         self._make_nameless(table, vessel, estate, brought | dict(self._estate.objects), resources)
         if table.end - table.base > AREA_SIZE:
