@@ -72,7 +72,7 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
 
 
 def _mended(record: Record, epoch: int, *, has_left: bool) -> Record:
-    """What is left of the record: the program and its owner, but no vote, no primary, and nobody entrusted."""
+    """What is left of the record: the program and its owner, but no vote, no primary, and no robot entrusted."""
     state = State.STANDBY if has_left else State.ABSENT
     return Record(record.name, epoch, state=state, spec=record.spec, begun=record.begun or has_left)
 

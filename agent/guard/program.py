@@ -93,7 +93,7 @@ class GuardedProgram(Struct):
         environment = dict(os.fsdecode(item).split("=", 1) for item in order.environment if b"=" in item)
         directory = os.fsdecode(order.working_directory)
 
-        environment.pop(VARIABLE, None)  # of whoever gave the order: he may be a component himself
+        environment.pop(VARIABLE, None)  # of the process that gave the order: it may be a component itself
         task = _task_end(order, segment) if order.task is not None else None
 
         def give_birth(birth: Birth) -> Born:
@@ -126,7 +126,7 @@ class GuardedProgram(Struct):
 
     @classmethod
     def watch(cls, order: Watch, pidfd: int) -> GuardedProgram:
-        """Look after somebody else's child.
+        """Look after a process that is another one's child.
 
         Args:
             pidfd: of it; stays the caller's.
@@ -355,7 +355,7 @@ class GuardedProgram(Struct):
         return just_ended
 
     def watched_end(self) -> None:
-        """The pidfd of somebody else's child says that it has ended."""
+        """The pidfd of a program that is not our child says that it has ended."""
         self._end(None)
 
     def _end(self, status: int | None) -> None:

@@ -118,7 +118,7 @@ class Guard:
         """Serve until there is nothing left to guard."""
         while not self._over:
             ready = self._wait()
-            if self._program is not None and self._program.lapse(now_ns()):  # first: a lease waits for nobody
+            if self._program is not None and self._program.lapse(now_ns()):  # first: a lease does not wait
                 self._tell(FrozenByLease())
             for act in ready:
                 act()
@@ -208,7 +208,7 @@ class Guard:
         if not program.committed:
             program.abandon()
             self._is_unfinished = True  # its end is no component's: the next agent must not find it
-            self._ends_with_program = self._agent is None  # nobody is left to be told
+            self._ends_with_program = self._agent is None  # no agent is left to be told
 
     def _drop_keeper(self) -> None:
         if self._keeper is not None:
@@ -372,7 +372,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _listen(path: str) -> socket.socket:
-    """Listen at a path that nobody else listens at; 0600 from its first instant."""
+    """Listen at a path at which no other process listens; 0600 from its first instant."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     before = os.umask(0o177)
     try:
@@ -389,7 +389,7 @@ def _settle() -> tuple[str, ...]:
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)  # it ends when its program has ended, however the system shuts down
     syscalls.become_subreaper()
-    with contextlib.suppress(PermissionError):  # it leads a session already: whoever started it saw to that
+    with contextlib.suppress(PermissionError):  # it leads a session already: its parent saw to that
         os.setsid()
     notes = []
     syscalls.small_stacks()

@@ -52,7 +52,7 @@ class WorkerProcess:
         self._wanted = self._begun = 0
         self._is_doomed = False
         self._successor = threading.Thread(target=self._succeed, name="successor", daemon=True)
-        self._successor.start()  # now, while nobody minds: a main loop would wait for the birth of a thread at ordinary priority
+        self._successor.start()  # now: later the main loop would wait for the birth of a thread at ordinary priority
         self._channel: Channel[ToMainLoop] | None = None
         self._waiting: deque[ToWorker] = deque()
         self._expected: dict[tuple[str, str], Act] = {}

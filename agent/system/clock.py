@@ -22,7 +22,7 @@ MAIN_LOOP_PRIORITY: Final = 60
 
 
 class Laps(Struct):
-    """How long each stage of something took: for the log, and for whoever wants to shorten it."""
+    """How long each stage of something took: for the log, and for an engineer who wants to shorten it."""
 
     last_ns: int = field(default_factory=time.monotonic_ns)
     stages: list[tuple[str, int]] = field(default_factory=list)
@@ -48,7 +48,7 @@ def wall_ns(instant_ns: int) -> int:
 
 
 def of_wall_ns(wall_ns: int) -> int:
-    """An instant of this machine's calendar by our clock; only for one so young that nobody can have set the calendar since."""
+    """An instant of this machine's calendar by our clock; only for one so young that the calendar cannot have been set since."""
     return now_ns() - (time.time_ns() - wall_ns)
 
 

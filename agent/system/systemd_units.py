@@ -63,7 +63,7 @@ def in_a_unit(program: str, kind: Kind, name: str) -> list[str]:
 
 def own_service(cgroups: str) -> str:
     """The systemd service that a process belongs to, by its /proc/PID/cgroup; "" if none."""
-    for line in filter(None, cgroups.split("\n")):  # whoever names a group may have others in it
+    for line in filter(None, cgroups.split("\n")):  # a group that a user named may hold other processes
         controllers, path = line.split(":", 2)[1:]
         if controllers in ("", "name=systemd"):
             units = [part for part in path.split("/") if part.endswith(".service")]

@@ -123,7 +123,7 @@ class Switchboard:
         """Give up what is under way, while the connections still stand."""
 
     async def close(self) -> None:
-        """Give back what is left, when nobody can ask for anything any more."""
+        """Give back what is left, when no client can ask for anything any more."""
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
         """A word about a snapshot on the replication link."""
@@ -267,7 +267,7 @@ class Switchboard:
             self.errands.lost(peer)
 
     def _unread(self, peer: str, why: str) -> None:
-        """Something came from a peer, or from nobody known (""), that does not prove whose it is."""
+        """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""
         now_s = asyncio.get_running_loop().time()
         sign = (peer, why if peer else "")
         if len(self._signs) > SIGNS_MAX:
@@ -326,7 +326,7 @@ class Switchboard:
         self._incompatible.pop(peer, None)
         self._say(HearKey(peer, hello.beat_key))
         if self._ways.is_new_key(way, peer, hello.beat_key) and self._ways.present_key(peer):
-            # Whoever lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
+            # A robot that lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
             self._greet(way, peer, self._ways.present_key(peer), again=True)
 
     def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:

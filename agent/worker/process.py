@@ -57,7 +57,7 @@ from failover.core.wire.messages import Belongings, Bulk, Cancel, Chunk, Content
 
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
-"""Between two looks for brought files that nobody needs any more."""
+"""Between two looks for brought files that no snapshot needs any more."""
 
 GIVE_BACK_S: Final = 20.0
 """Between two times that free memory goes back to the kernel: a few milliseconds in a thread of its own."""

@@ -41,7 +41,7 @@ class Witness(Switchboard):
             log.debug("a witness does not do %s", type(act).__name__)
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """Nobody should offer one."""
+        """A witness is offered none."""
         if isinstance(message, Offer):
             self._replication_link.say(
                 peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots")

@@ -260,7 +260,7 @@ class Store:
 
     @contextmanager
     def _change_of(self, component: str) -> Iterator[None]:
-        """Nobody else changes what is held of a component during the body; everybody may read it."""
+        """No other thread changes what is held of a component during the body; all may read it."""
         with self._lock:
             changing = self._changing.setdefault(component, threading.RLock())
         with changing:
@@ -464,7 +464,7 @@ class Store:
         """Remove files, the youngest first: what is left at any instant is whole chains.
 
         Args:
-            taken: whether somebody else has taken a whole checkpoint's file to keep it.
+            taken: whether a whole checkpoint's file has been taken, to be kept elsewhere.
         """
         with disk_trouble(f"remove snapshots of {component}"):
             for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
@@ -479,7 +479,7 @@ class Store:
             self._files.remove_damaged(self._root / folder_name(component), is_old)
 
     def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
-        """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
+        """Never offer this file again; it stays where it is for inspection, until it is pruned."""
         with self._lock:
             shelf = self._shelf(component)
             if entry in shelf.entries:

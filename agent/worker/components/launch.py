@@ -382,7 +382,7 @@ async def start_to_wait(name: str, program: Program, places: Places, owner: int)
     """Start a program that keeps its state in advance: it waits for `begin_again`, and ends with this agent until then.
 
     Raises:
-        checkpoint.errors.MismatchError: it would run as somebody else than its owner.
+        checkpoint.errors.MismatchError: it would run as another user than its owner.
         GuardError: it could not be started; nothing is left of it.
     """
     _check_owner(name, program, owner)
@@ -392,7 +392,7 @@ async def start_to_wait(name: str, program: Program, places: Places, owner: int)
 
 
 def _check_owner(name: str, program: Program, owner: int) -> None:
-    """Raises MismatchError: a program of this owner's would run as somebody else."""
+    """Raises MismatchError: a program of this owner's would run as another user."""
     inherited = program.inheritance.uid if program.inheritance is not None else os.geteuid()
     if owner not in (ROOT, inherited):
         reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
@@ -403,7 +403,7 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     """Find a component again after the agent was restarted.
 
     Raises:
-        GuardLostError: nobody listens there any more; the left-over socket has been removed.
+        GuardLostError: no guard listens there any more; the left-over socket has been removed.
     """
     try:
         guard = connect(socket_path)

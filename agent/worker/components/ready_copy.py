@@ -79,7 +79,7 @@ class ReadyCopy:
         self._news.set()
 
     def drop(self) -> None:
-        """None is wanted any more; what there is ends, and nobody waits for that."""
+        """None is wanted any more; what there is ends; its end is not awaited."""
         work, self._work = self._work, None
         ready, self._ready = self._ready, None
         self._figures.copy = CopyFigures()
@@ -114,7 +114,7 @@ class ReadyCopy:
         await asyncio.gather(*self._ending, return_exceptions=True)
 
     def _undone(self, ready: Ready) -> asyncio.Task[None]:
-        """End it; whoever waits for that may be cancelled: a guard that is left in the middle would be found as a component."""
+        """End it, also where the waiting task is cancelled: a guard that is left in the middle would be found as a component."""
         return self._task(ready.component.undo())
 
     def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:

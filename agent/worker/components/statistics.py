@@ -57,7 +57,7 @@ class Commits(Struct):
         return self.number > 0 and now_ns - self.newest_ns > limit_ns
 
     def remark(self, now_ns: int) -> str:
-        """What to say of a program that is overdue, for somebody who looks at ``failover status`` for the first time."""
+        """What to say of a program that is overdue, for a user who looks at ``failover status`` for the first time."""
         used = "its only one" if self.usual_ns is None else f"before that there was one every {seconds(self.usual_ns)}"
         return (
             f"last commit {seconds(now_ns - self.newest_ns)} ago, {used}: it commits no more, or it hangs; "

@@ -84,7 +84,7 @@ class Supervisor:
     _to_prune: acts.Prune | None = None
     _pruning: asyncio.Task[None] | None = None
     _not_let_go: Exception | None = None
-    """Why the order to let it go was in vain; None: it was not, or somebody has been told."""
+    """Why the order to let it go was in vain; None: it was not, or a caller has been told."""
 
     def __post_init__(self) -> None:
         self._cleared.set()

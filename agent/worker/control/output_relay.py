@@ -23,7 +23,7 @@ from checkpoint.model import OutputPiece
 from failover.core.types import ENDED, ComponentView, PeerView, State
 
 POLL_S: Final = 0.02
-"""How soon new output is passed on to whoever watches."""
+"""How soon new output is passed on to a client that watches."""
 
 PIECE_SIZE: Final = 128 << 10
 """Bytes read from another robot at a time: less than the replication link's largest message."""

@@ -98,7 +98,7 @@ class ControlServer:
             raise AgentError(f"cannot listen on {self._path}: {error.strerror}; name another runtime_directory") from error
 
     async def close(self) -> None:
-        """Hang up on everybody and remove the socket."""
+        """Hang up on all clients and remove the socket."""
         if self._server is not None:
             self._server.close()
         for task in self._clients:

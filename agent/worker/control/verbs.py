@@ -98,7 +98,7 @@ class Verbs(Questions):
         return {name: functools.partial(self._permitted, act) for name, act in found.items()}
 
     async def _permitted(self, order: Order, arguments: dict[str, Any], by: int) -> dict[str, Any]:
-        """Carry an order out here, if whoever gives it may give it."""
+        """Carry an order out here, if its user may give it."""
         name = await self._known(str(arguments.get("name", "")))
         await self._check_right(by, name)
         return await order({**arguments, "name": name}, by)
@@ -285,7 +285,7 @@ class Verbs(Questions):
         return {"name": name, "robot": wanted.robot}
 
     async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Have a robot run what nobody is heard to run; or, unless it is ``sure``, tell what that would risk."""
+        """Have a robot run what no robot is heard to run; or, unless it is ``sure``, tell what that would risk."""
         wanted = arguments_of(PromoteArguments, "promote", arguments)
         name, me = await self._known(wanted.name), self._worker.settings.config.robot
         robot = wanted.robot or await self._newest_at(name)
@@ -411,14 +411,14 @@ class Verbs(Questions):
         return answer
 
     async def _check_right(self, uid: int, name: str) -> None:
-        """Raises RefusedError: the component is somebody else's."""
+        """Raises RefusedError: the component is another user's."""
         check_right(uid, name, (await self._view(name)).get("owner"))
 
     async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
         """A name for something new: as given, under this robot's own path, or made from the command.
 
         Raises:
-            RefusedError: it is no name, or one that somebody else has used and not released; or this user has too many.
+            RefusedError: it is no name, or one that another user has used and not released; or this user has too many.
         """
         own = f"/{self._worker.settings.team.team}/{self._worker.settings.config.robot}/"
         told = await self._worker.ask("status")

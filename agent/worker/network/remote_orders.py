@@ -89,7 +89,7 @@ class Errands:
             waiting.set_result(message)
 
     def lost(self, peer: str) -> None:
-        """The connection has gone: nobody knows whether the order arrived."""
+        """The connection has gone: it is not known whether the order arrived."""
         for (robot, number), waiting in self._waiting.items():
             if robot == peer and not waiting.done():
                 sentence = "the connection was lost before its answer; failover status tells whether it was done"

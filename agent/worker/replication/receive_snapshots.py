@@ -81,7 +81,7 @@ class Deposit:
         self._places.process_pool.expect(sum(bool(known.sender) for known in self._admitted.values()))
 
     def last_sender(self, component: str) -> str:
-        """From whom its snapshots come, or came until this robot claimed it; "" from nobody."""
+        """From whom its snapshots come, or came until this robot claimed it; "" for none."""
         return self._senders.get(component, "")
 
     def admits(self, peer: str, offer: Offer) -> None:
@@ -168,7 +168,7 @@ class Deposit:
         """Have the logs hold all up to a position.
 
         Args:
-            is_elsewhere: another robot is known to hold it, whoever took it in.
+            is_elsewhere: another robot is known to hold it, also where this one took it in.
         """
         unshown = self._unshown.setdefault(component, deque())
         directory = log_directory(component, self._places)

@@ -169,7 +169,7 @@ class Shipper:
 
 
 class Pace:
-    """A cap on a flow: whoever is ahead of it waits."""
+    """A cap on a flow: a sender that is ahead of it waits."""
 
     def __init__(self, bytes_a_second: float) -> None:
         self._rate = bytes_a_second
@@ -206,7 +206,7 @@ class Desk(Protocol[Kind]):
         """All bytes are in the file and their digest is right. The descriptor is closed afterwards.
 
         Raises:
-            StoreError: the disk does not take a content; whoever sent it is told.
+            StoreError: the disk does not take a content; its sender is told.
         """
 
     async def make_room(self, size: int) -> None:

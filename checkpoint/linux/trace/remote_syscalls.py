@@ -211,7 +211,7 @@ class BorrowedPages:
                 )
 
     def _take_back(self, errand: Errand, places: Sequence[tuple[Desk, Guest]]) -> None:
-        """As `give_back`, for many: nobody waits for another one's stop, and one that is gone spoils nothing for the others.
+        """As `give_back`, for many: no thread waits for another one's stop, and one that is gone spoils nothing for the others.
 
         Raises:
             ProcessGoneError, CaptureError: of the first of those that could not be given back.
@@ -266,7 +266,7 @@ class Errand:
 
     Attributes:
         answers: what they brought back.
-        asked: who takes it that they were asked to stop; None: nobody was.
+        asked: who takes it that they were asked to stop; None: none was.
     """
 
     def __init__(self, memory: Memory, sent: Round, places: Sequence[tuple[Desk, Batch, Guest]]) -> None:

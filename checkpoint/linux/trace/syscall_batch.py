@@ -132,7 +132,7 @@ class Batch:
 
 
 class Answers:
-    """What a batch brought back: a desk's table, read when somebody wants to know.
+    """What a batch brought back: a desk's table, read when an answer is asked for.
 
     Args:
         address: of the table.

@@ -100,7 +100,7 @@ def _pid_in(one: Descriptor) -> int:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Why a pidfd cannot be kept: it stands for somebody else."""
+    """Why a pidfd cannot be kept: it stands for another process."""
     if held.first.target != TARGET:
         return None
     pid = _target(held)

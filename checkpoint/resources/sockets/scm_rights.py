@@ -74,7 +74,7 @@ def _taken_along(opened: Opened, ours: int) -> int:
 
 
 def unnoted(number: int, before: int) -> AbstractContextManager[None]:
-    """Like `checkpoint.resources.sockets.sockets.Noted`, of what the program has no descriptor of: nobody could put it back."""
+    """Like `checkpoint.resources.sockets.sockets.Noted`, of what the program has no descriptor of: it could not be put back."""
     return contextlib.nullcontext()
 
 

@@ -164,7 +164,7 @@ Identify = Callable[[int], int]
 """Given a descriptor of ours that was on its way to the program: which of its own is the same, else `UNKNOWN`."""
 
 Noted = Callable[[int, int], AbstractContextManager[None]]
-"""Given a descriptor of the program and its socket's SO_PEEK_OFF: writes both down for the body, for whoever comes after us if we
+"""Given a descriptor of the program and its socket's SO_PEEK_OFF: writes both down for the body, and for the next keeper if we
 die in it."""
 
 

@@ -236,7 +236,7 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
 
 
 def note(held: Resource) -> str | None:
-    """What becomes of a connection whose other end is somebody else's; None of one that had ended, or is asked for anew."""
+    """What becomes of a connection whose other end is another program's; None of one that had ended, or is asked for anew."""
     if held.facts["state"] in (CLOSED, SYN_SENT) and not _number(held, "unread"):
         return None
     why = f" ({reason})" if isinstance(reason := held.facts.get(LEFT), str) else ""

@@ -202,7 +202,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return f"{what} in which an out-of-band byte waits (MSG_OOB): {AS_SOON_AS} the program has read that"
     if seen["too_long"]:
         return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: {AS_SOON_AS} the program has read them"
-    ends = _is_lost(seen) and bool(seen["peer"])  # whoever holds it too keeps what the program loses
+    ends = _is_lost(seen) and bool(seen["peer"])  # another holder keeps what the program loses
     of_others = None if ends else other_holders.refuse(held, "a unix socket")
     return unix_names.refuse(held) or sockets.refuse_filter(held) or of_others
 

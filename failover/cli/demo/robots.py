@@ -381,7 +381,7 @@ def run(command: list[str]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of the loopback that nobody uses now, as TCP and as UDP, and that the system does not lend to whoever asks for any.
+    """Ports of the loopback that are free now, as TCP and as UDP, and that the system does not lend to whoever asks for any.
 
     So a robot that was away for a while finds its own free when it comes back.
     """

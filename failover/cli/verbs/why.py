@@ -16,7 +16,7 @@ LATE_TOLD_MS: Final = 5.0
 """An own lateness below this has delayed nothing."""
 
 SHOWN_MAX: Final = 100
-"""Decisions that are told where nobody said how far back: the last ones."""
+"""Decisions that are told where --since is not given: the last ones."""
 
 NEAR_MS: Final = 1.0
 """Clocks that are closer together need no word."""

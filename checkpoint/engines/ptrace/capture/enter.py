@@ -73,7 +73,7 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
     """Enter once, by the first thread; None while the program still stands in the code of a tracer that died.
 
     Args:
-        last: waiting has helped nothing: pages that somebody was in are left to the program.
+        last: waiting has helped nothing: pages that a thread was in are left to the program.
     """
     modes = seccomp.modes(threads.pid)
     with stopped(threads):

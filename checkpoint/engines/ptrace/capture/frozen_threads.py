@@ -162,7 +162,7 @@ class ThreadQuestions:
         return address, flags, size
 
     def clear_tid_in(self, answers: Answers) -> int:
-        """The address that the kernel clears when the thread ends: whoever joins it waits there.
+        """The address that the kernel clears when the thread ends: a thread that joins it waits there.
 
         Raises:
             UnsupportedError: this kernel does not tell.
@@ -232,7 +232,7 @@ class ThreadOnlooker:
                     continue  # it has ended
 
     def _settle(self) -> None:
-        """Note where threads stood at the last look, also if nobody wanted to know: the kernel forgets which call that was."""
+        """Note where threads stood at the last look, also where that is not asked for: the kernel forgets which call that was."""
         asked, self._asked = self._asked, ()
         for standing in asked:
             standing.settle()

@@ -325,7 +325,7 @@ class PtraceSession:
         return copied
 
     def _enough(self) -> int:
-        """Pages that each process may leave for the freeze; 0 where nobody has set a budget."""
+        """Pages that each process may leave for the freeze; 0 where no budget is set."""
         return max(1, self._budget.page_count // (1 + len(self._tree.processes()))) if self._budget else 0
 
     def _look_from_outside(self) -> None:
@@ -393,7 +393,7 @@ class PtraceSession:
         return Frozen(first, others, self._standstill.note(began, ended), seen, self._standstill.departing, segments)
 
     def _segments(self, others: SeenOthers | None) -> dict[int, Segment]:
-        """The System V shared memory of this machine, where any of them has some: whoever runs may attach it, and be born."""
+        """The System V shared memory of this machine, where any of them has some: others may attach it, and be born."""
         looked_at = (self._first, *(process for process, _ in others.looks())) if others else (self._first,)
         return system_v_ipc.segments() if any(process.memory.has_segments for process in looked_at) else {}
 

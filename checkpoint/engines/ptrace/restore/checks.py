@@ -297,7 +297,7 @@ def _of_threads(state: Snapshot) -> Iterator[str]:
 
 
 def xstate_layouts(state: Snapshot) -> tuple[extended.Layout, extended.Layout]:
-    """Where the components of the threads' extended states lie there, and here; the same where nobody has told."""
+    """Where the components of the threads' extended states lie there, and here; the same where it is not told."""
     ours = cpuid.xstate_layout()
     told = state.threads[0].registers.get("xstate_layout", b"") if state.threads else b""
     theirs = extended.decode_layout(told)

@@ -269,7 +269,7 @@ def is_file_mapping(vma: Vma) -> bool:
 
 
 def is_only_read(vma: Vma) -> bool:
-    """Whether it is a mapping of a file with a name that nobody can write through: the C library has such ones."""
+    """Whether it is a mapping of a file with a name that cannot be written through: the C library has such ones."""
     return is_file_mapping(vma) and not vma.protection & abi.PROT_WRITE and vm_flags.MAY_WRITE not in vma.flags
 
 

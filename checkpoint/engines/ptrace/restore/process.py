@@ -101,7 +101,7 @@ class Estate(Struct, frozen=True):
         descriptions: open files by their number in the snapshot: a descriptor of each.
         objects: files without a name, by (device, inode): a descriptor of each.
         anonymous: shared memory without a file, by the same: its address.
-        segments: System V shared memory, which whoever comes first makes.
+        segments: System V shared memory, which the first process makes.
     """
 
     base: int
@@ -113,7 +113,7 @@ class Estate(Struct, frozen=True):
 
 
 def options_for(state: Snapshot) -> int:
-    """Those with which a vessel is traced; whoever is born of it is traced with the same."""
+    """Those with which a vessel is traced; its children are traced with the same."""
     confined = any(seccomp.is_confined(one.resources) for one in state.processes)
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
@@ -277,7 +277,7 @@ class ProcessRestore:
         return self._state.runs
 
     def _choose_place(self, mappings: tuple[procfs.MapsLine, ...]) -> int:
-        """Where the stub and its tables may lie; what the program shares with nobody by name is made."""
+        """Where the stub and its tables may lie; what the program shares by no name is made."""
         state = self._state
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
         self._segments.make(state.resources)
@@ -354,7 +354,7 @@ class ProcessRestore:
         return {0, 1, 2} | shared
 
     def _leave_old_vdso(self) -> None:
-        """Lead whatever thread stands in the middle of another kernel's vdso out of it."""
+        """Lead each thread that stands in the middle of another kernel's vdso out of it."""
         if not self._foreign:
             return
         threads = restored_vdso.led_out(self._tracee, self._calls_of_vdso(), self._foreign, self._state.threads)
@@ -473,7 +473,7 @@ class ProcessRestore:
         return table
 
     def _confine(self, table: CallTable, thread: ThreadState, credentials: Credentials) -> None:
-        """Before it gives up its rights; suspended until it is let go."""
+        """Before it gives up its rights; suspended until it runs."""
         found = seccomp.of_thread(self._state.resources, thread.tid)
         seccomp.confine(table, found, len(self._filters_of_all), credentials)
 

@@ -66,7 +66,7 @@ def _see_as(table: CallTable, process: ProcessState) -> None:
 
 @contextmanager
 def our_eyes(table: CallTable, process: ProcessState, vessel: Vessel, options: RestoreOptions) -> Iterator[None]:
-    """After `own_eyes`, have the calls that the body adds open files as the vessel again: what nobody can put another one for."""
+    """After `own_eyes`, have the calls that the body adds open files as the vessel again: files that no user can replace."""
     is_switched = options.own_eyes and vessel.may(CAP_SETUID) and vessel.may(CAP_SETGID)
     if is_switched:
         table.call("set the filesystem's uid to ours", "setfsuid", vessel.credentials.uids[3])

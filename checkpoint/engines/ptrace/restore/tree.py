@@ -71,10 +71,10 @@ STOPPED_BY: Final = 0x7F
 
 
 class TreeRestore:
-    """One restore, from the seizing of the vessel to everybody's own registers."""
+    """One restore, from the seizing of the vessel to all processes' own registers."""
 
     _born_with = 0
-    """Flags of clone(2) for everybody."""
+    """Flags of clone(2) for all processes."""
 
     def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
         self._state = state
@@ -92,7 +92,7 @@ class TreeRestore:
         self._terminals: dict[int, pseudo_terminals.Controlling] = {}
 
     def end(self) -> None:
-        """Kill everybody; who was born here is reaped for its parent, who may have ended before."""
+        """Kill all processes; one that was born here is reaped for its parent, who may have ended before."""
         for restoring in self._restoring[1:]:
             restoring.end()
         for tracee in reversed(self._born.values()):
@@ -117,7 +117,7 @@ class TreeRestore:
         return tuple(dict.fromkeys(note for notes in (self._notes, *(one.notes for one in self._restoring)) for note in notes))
 
     def run(self) -> None:
-        """All of it, up to the registers; everybody stands still."""
+        """All of it, up to the registers; all processes stand still."""
         vessel = self._begin()
         estate = self._make_estate(vessel, first_told(self._views))
         self._bear_all(estate.base)
@@ -142,7 +142,7 @@ class TreeRestore:
         return vessel
 
     def _bear_all(self, base: int) -> None:
-        """Have everybody born, and those end, or be stopped, that had."""
+        """Have all processes born, and those end, or be stopped, that had."""
         self._instruction = base + stubs.CALL_LOOP.index(cpu.SYSCALL)
         self._come_to_session()
         self._take_terminal(self._state.process.pid)
@@ -330,7 +330,7 @@ class TreeRestore:
 
     @contextlib.contextmanager
     def _opened(self, pid: int, found: pseudo_terminals.Controlling) -> Iterator[int]:
-        """A descriptor of a terminal, in a process; nobody may have it open any more."""
+        """A descriptor of a terminal, in a process; it may be open nowhere any more."""
         if found.slave is not None:
             yield found.slave
             return

@@ -163,7 +163,7 @@ class FamilyCopy(TreeRestore):
     # --- The three steps ---
 
     def lay(self) -> None:
-        """Seize the vessel, have everybody born, map and fill everything.
+        """Seize the vessel, have all processes born, map and fill everything.
 
         Raises:
             MismatchError: this machine lacks a file that is mapped, or their pids cannot be had.
@@ -336,7 +336,7 @@ def _shape_of(state: Snapshot) -> tuple[object, ...]:
 
 
 def _objects_of(views: Iterable[Snapshot]) -> dict[Object, tuple[int, int]]:
-    """How long shared memory is, by object, and the mode of its file (0 where there is none, or nobody told)."""
+    """How long shared memory is, by object, and the mode of its file (0 where there is none, or it is not told)."""
     found: dict[Object, tuple[int, int]] = {}
     for vma in (vma for view in views for vma in view.vmas):
         if memory.is_anonymous_object(vma) or memory.is_object_mapping(vma):
