@@ -80,7 +80,7 @@ class SnapshotBuilder:
         self._table = PageTable.empty(abi.PAGE_SIZE)
         self._totals_at: dict[Position, Totals] = {}
 
-    def forget_unneeded(self, known: Collection[Position]) -> None:
+    def forget_unneeded(self, known: Collection[Position | None]) -> None:
         """Forget the totals and carried files of positions that no delta can be relative to any more.
 
         Args:
