@@ -31,7 +31,7 @@ SENTENCE_MAX: Final = 2_000
 """Characters of one sentence; a program's own error message may be in it."""
 
 
-class Scribe:
+class EventLogWriter:
     """One life's lines. `note` and `unwritten` belong to the main loop, and no lock of the thread's can make them wait.
 
     Attributes:

@@ -24,7 +24,7 @@ from agent.errors import AgentError
 from agent.main_loop import messages, starvation, vote_record
 from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
 from agent.main_loop.duplicate_beats import Copies
-from agent.main_loop.event_log_writer import Scribe
+from agent.main_loop.event_log_writer import EventLogWriter
 from agent.main_loop.messages import (
     Alive,
     BeatCounts,
@@ -40,7 +40,7 @@ from agent.main_loop.messages import (
 )
 from agent.main_loop.outbox import Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
-from agent.main_loop.vote_record_writer import Persister
+from agent.main_loop.vote_record_writer import VoteRecordWriter
 from agent.main_loop.worker_process import WorkerProcess
 from agent.system import clock, syscalls
 from agent.system.sd_notify import Notifier, watchdog_period_ns
@@ -108,8 +108,8 @@ class MainLoop:
         self._node: Node | None = None
         durable = core_vote_record.decode(record_file.record.core)
         self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
-        self._persister = Persister(lambda wanted: record_file.keep(core_vote_record.encode(wanted)))
-        self._scribe = Scribe(Path(settings.config.state_directory), self._me, record_file.record.boot)
+        self._persister = VoteRecordWriter(lambda wanted: record_file.keep(core_vote_record.encode(wanted)))
+        self._event_log = EventLogWriter(Path(settings.config.state_directory), self._me, record_file.record.boot)
         self._poll = select.epoll()
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
@@ -253,7 +253,7 @@ class MainLoop:
             ready = self._node.step(event, now_ns)
             self._obey(self._outbox.take(ready, now_ns))
             if ready.told:
-                self._scribe.note(ready.told)
+                self._event_log.note(ready.told)
 
     def _hear(self) -> None:
         self._read_ns = clock.now_ns()
@@ -392,9 +392,9 @@ class MainLoop:
             self._gaps,
             dict(self._lost),
         )
-        troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble)))
+        troubles = tuple(filter(None, (self._persister.trouble, self._event_log.trouble)))
         if question.what == "why":
-            return Told(question.number, now_ns, unwritten=self._scribe.unwritten(), beats=counts, troubles=troubles)
+            return Told(question.number, now_ns, unwritten=self._event_log.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
 
@@ -402,7 +402,7 @@ class MainLoop:
         self._worker.send(Farewell())
         self._worker.flush()
         self._persister.close(PERSIST_PATIENCE_S)
-        self._scribe.close(PERSIST_PATIENCE_S)
+        self._event_log.close(PERSIST_PATIENCE_S)
         self._worker.wait()
         self._beats.close()
         self._poll.close()

@@ -16,7 +16,7 @@ RETRY_S: Final = 0.5
 """Pause before another try after the disk refused."""
 
 
-class Persister:
+class VoteRecordWriter:
     """Newest first: a vote record that waits is replaced by a later one, which holds all that it held.
 
     Attributes:

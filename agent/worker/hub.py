@@ -28,7 +28,7 @@ from agent.system import syscalls
 from agent.system.log_setup import set_up_log
 from agent.worker.control.queries import QUESTIONS, Questions
 from agent.worker.control.server import ControlServer
-from agent.worker.network.connections import BULK, Ways
+from agent.worker.network.connections import BULK, AllConnections
 from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Links
 from agent.worker.network.remote_orders import Errands
@@ -97,13 +97,13 @@ class Switchboard:
         facts = Facts(frozenset(config.wireless))
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
         self._wires = Wires(self._links, self._links_changed)
-        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links, self._unread)
-        self._replication_link = self._ways.bulk
+        self._connections = AllConnections(settings, keys, self._hear, self._way_changed, self._links, self._unread)
+        self._replication_link = self._connections.bulk
 
     def connect(self, verbs: Questions) -> None:
         """Have the orders of people and robots carried out by these."""
         self.verbs = verbs
-        self.errands = Errands(self._ways.say, self.hindrance, verbs.errands())
+        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands())
 
     # --- what builds on it ---
 
@@ -148,7 +148,7 @@ class Switchboard:
         self._life = await self._begun
         self._say(await self.prepare())
         self._wires.watch()
-        self._ways.open()
+        self._connections.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.table())
         await server.open()
         syscalls.give_back()  # what the start has left
@@ -160,7 +160,7 @@ class Switchboard:
             self._wires.close()
             await self.errands.close()
             await self.stop_work()
-            await self._ways.close()
+            await self._connections.close()
             await self.close()
             speaking.cancel()
             living.cancel()
@@ -255,9 +255,9 @@ class Switchboard:
         """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
         link = "replication link" if way == BULK else f"link {way}"
         log.info("%s to %s: %s%s", link, peer, state, f": {reason}" if reason else "")
-        had_words = self._ways.carried_words(way, peer, state)
+        had_words = self._connections.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
-            key = self._ways.beat_key(peer)
+            key = self._connections.beat_key(peer)
             self._greet(way, peer, key)
             self._say(SpeakKey(peer, key))
             return
@@ -288,18 +288,20 @@ class Switchboard:
 
     def hindrance(self, peer: str) -> str:
         """Why nothing can be said to a peer now; "" when it can."""
-        return self._ways.hindrance(peer)
+        return self._connections.hindrance(peer)
 
     def _hear(self, way: int, peer: str, message: Bulk) -> None:
         match message:
             case Hello():
                 self._greeted(way, peer, message)
             case Goodbye(reason):
-                self._ways.refuse(way, peer, reason)
+                self._connections.refuse(way, peer, reason)
             case _ if peer in self._incompatible:
                 return
             case Errand(verb=verb) if verb not in QUESTIONS and self.votes_only(peer):
-                self._ways.say(peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders"))
+                self._connections.say(
+                    peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders")
+                )
             case Errand():
                 self.errands.received(peer, message)
             case ErrandDone():
@@ -320,18 +322,18 @@ class Switchboard:
         if reason:
             self._incompatible[peer] = reason
             self._unread(peer, reason)
-            self._ways.answer(way, peer, Goodbye(reason))
+            self._connections.answer(way, peer, Goodbye(reason))
             log.warning("%s", reason)
             return
         self._incompatible.pop(peer, None)
         self._say(HearKey(peer, hello.beat_key))
-        if self._ways.is_new_key(way, peer, hello.beat_key) and self._ways.present_key(peer):
+        if self._connections.is_new_key(way, peer, hello.beat_key) and self._connections.present_key(peer):
             # A robot that lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
-            self._greet(way, peer, self._ways.present_key(peer), again=True)
+            self._greet(way, peer, self._connections.present_key(peer), again=True)
 
     def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
         config = self.settings.config
-        self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
+        self._connections.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
 
     def votes_only(self, peer: str) -> bool:
         """Whether nothing that this peer says may start, end or overwrite anything."""
@@ -343,7 +345,7 @@ class Switchboard:
             *self._own_troubles,
             *self._incompatible.values(),
             *self._replication_link.troubles(),
-            *self._ways.troubles,
+            *self._connections.troubles,
             *self._links.notes(),
         ]
 

@@ -42,7 +42,7 @@ class Worker(Protocol):
     async def ask(self, what: Any) -> Told: ...
 
 
-class Outflow:
+class OutputRelay:
     """Reads streams, here or elsewhere."""
 
     def __init__(self, worker: Worker) -> None:

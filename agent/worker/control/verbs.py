@@ -31,7 +31,7 @@ from agent.worker.control.arguments import (
     StopArguments,
     arguments_of,
 )
-from agent.worker.control.output_relay import Outflow
+from agent.worker.control.output_relay import OutputRelay
 from agent.worker.control.queries import Lines, Questions
 from agent.worker.control.quotas import check_components
 from agent.worker.control.server import Conversation, Verb
@@ -68,7 +68,7 @@ class Verbs(Questions):
     def __init__(self, worker: Worker) -> None:
         super().__init__(worker)
         self._worker = worker
-        self._outflow = Outflow(worker)
+        self._output_relay = OutputRelay(worker)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -84,7 +84,13 @@ class Verbs(Questions):
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: the orders, and how things stand here."""
         promoted = functools.partial(self._permitted, self._promoted)
-        return {**super().errands(), **self.orders(), "piece": self._outflow.piece, "promoted": promoted, "lacks": self.lacks}
+        return {
+            **super().errands(),
+            **self.orders(),
+            "piece": self._output_relay.piece,
+            "promoted": promoted,
+            "lacks": self.lacks,
+        }
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
@@ -151,7 +157,7 @@ class Verbs(Questions):
         if not wanted.wait:
             return started
         await say.update({"started": started})
-        await self._outflow.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
+        await self._output_relay.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
         if supervisor.ended is not None and supervisor.ended.done():
             report = supervisor.ended.result()
             return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
@@ -322,7 +328,7 @@ class Verbs(Questions):
         wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
         await self._check_right(say.caller.uid, name)
-        totals = await self._outflow.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
+        totals = await self._output_relay.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 

@@ -34,7 +34,7 @@ Changed = Callable[[int, str, LinkState, str], None]
 log = logging.getLogger("failover.lane")
 
 
-class Ways:
+class AllConnections:
     """The connections of one robot. Lives in one asyncio loop.
 
     Attributes:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from agent import event_log
 from agent.event_log import StoryFile, packed, read, unpacked
 from agent.main_loop import event_log_writer
-from agent.main_loop.event_log_writer import REPEAT_NS, WAITING_MAX, Scribe
+from agent.main_loop.event_log_writer import REPEAT_NS, WAITING_MAX, EventLogWriter
 from failover.core.event_log.decisions import Decision, Facts, Line, Sighting
 
 PATIENCE_S = 20.0
@@ -86,10 +86,10 @@ def test_the_two_halves_stay_bounded_and_hold_the_newest(tmp_path: Path, monkeyp
 
 
 def test_what_a_scribe_was_told_is_read_in_order_by_the_next_life(tmp_path: Path) -> None:
-    scribe = Scribe(tmp_path, "robot1", 7)
+    writer = EventLogWriter(tmp_path, "robot1", 7)
     for number in range(40):
-        scribe.note([Decision(number, "/lab/x", f"number {number}")])
-    scribe.close(PATIENCE_S)
+        writer.note([Decision(number, "/lab/x", f"number {number}")])
+    writer.close(PATIENCE_S)
     assert sentences(tmp_path) == [f"number {number}" for number in range(40)]
     assert {(one.robot, one.life) for one in read(tmp_path).lines} == {("robot1", 7)}
 
@@ -103,16 +103,16 @@ def test_a_disk_that_hangs_delays_nobody_and_is_said(tmp_path: Path, monkeypatch
         os.read(reader, 1)
 
     monkeypatch.setattr(os, "fdatasync", hang)
-    scribe = Scribe(tmp_path, "robot1", 1)
-    scribe.note([Decision(0, "/lab/x", "the first")])
+    writer = EventLogWriter(tmp_path, "robot1", 1)
+    writer.note([Decision(0, "/lab/x", "the first")])
     assert hangs.wait(PATIENCE_S)
     for number in range(WAITING_MAX + 100):
-        scribe.note([Decision(number, "/lab/x", f"number {number}")])
-    waiting = scribe.unwritten()
+        writer.note([Decision(number, "/lab/x", f"number {number}")])
+    waiting = writer.unwritten()
     assert len(waiting) == WAITING_MAX and waiting[-1].decision.sentence == f"number {WAITING_MAX + 99}"
     os.write(writer, bytes(100))
-    until(lambda: scribe.trouble.startswith("100 decisions are missing"), "the missing ones to be said")
-    scribe.close(PATIENCE_S)
+    until(lambda: writer.trouble.startswith("100 decisions are missing"), "the missing ones to be said")
+    writer.close(PATIENCE_S)
     os.close(writer)
     os.close(reader)
 
@@ -128,23 +128,23 @@ def test_a_full_disk_is_said_and_once_there_is_room_nothing_is_missing(tmp_path:
         written(file, lines)
 
     monkeypatch.setattr(StoryFile, "append", append)
-    scribe = Scribe(tmp_path, "robot1", 1)
-    scribe.note([Decision(1, "/lab/x", "a takeover")])
-    until(lambda: "No space left" in scribe.trouble, "the trouble to be said")
-    assert [one.decision.sentence for one in scribe.unwritten()] == ["a takeover"]
+    writer = EventLogWriter(tmp_path, "robot1", 1)
+    writer.note([Decision(1, "/lab/x", "a takeover")])
+    until(lambda: "No space left" in writer.trouble, "the trouble to be said")
+    assert [one.decision.sentence for one in writer.unwritten()] == ["a takeover"]
     full[0] = False
-    until(lambda: not scribe.unwritten(), "the disk to take it")
-    scribe.close(PATIENCE_S)
-    assert sentences(tmp_path) == ["a takeover"] and scribe.trouble == ""
+    until(lambda: not writer.unwritten(), "the disk to take it")
+    writer.close(PATIENCE_S)
+    assert sentences(tmp_path) == ["a takeover"] and writer.trouble == ""
 
 
 def test_the_same_sentence_again_and_again_is_counted_and_not_written(tmp_path: Path) -> None:
-    scribe = Scribe(tmp_path, "robot1", 1)
+    writer = EventLogWriter(tmp_path, "robot1", 1)
     same = Decision(0, "/lab/x", "a snapshot did not arrive")
     for second in range(30):
-        scribe.note([replace(same, at_ns=second * 10**9)])
-        scribe.note([Decision(second, "/lab/y", "something else about another")] if second == 3 else [])
-    scribe.note([replace(same, at_ns=REPEAT_NS)])
-    scribe.close(PATIENCE_S)
+        writer.note([replace(same, at_ns=second * 10**9)])
+        writer.note([Decision(second, "/lab/y", "something else about another")] if second == 3 else [])
+    writer.note([replace(same, at_ns=REPEAT_NS)])
+    writer.close(PATIENCE_S)
     kept = [(one.decision.component, one.repeats) for one in read(tmp_path).lines]
     assert kept == [("/lab/x", 0), ("/lab/y", 0), ("/lab/x", 29)]

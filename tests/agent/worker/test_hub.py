@@ -45,7 +45,7 @@ def heard(settings: configuration.Settings, peer: str, message: Any, monkeypatch
         with ours, theirs:
             worker = Worker(settings, Channel(ours, ToWorker))
             said: list[Any] = []
-            monkeypatch.setattr(worker._ways, "say", lambda _peer, answer: said.append(answer))
+            monkeypatch.setattr(worker._connections, "say", lambda _peer, answer: said.append(answer))
             monkeypatch.setattr(worker._replication_link, "say", lambda _peer, answer: said.append(answer))
             monkeypatch.setattr(worker.errands, "received", lambda _peer, errand: said.append(errand))
             worker._hear(BULK, peer, message)
