@@ -75,7 +75,7 @@ class Disk:
 
 
 class DiskFile:
-    """A file being written through the door: what ``format.encode`` needs of a file."""
+    """A file that a `Disk` writes: what ``format.encode`` needs of a file."""
 
     def __init__(self, disk: Disk, descriptor: int) -> None:
         self._disk = disk
