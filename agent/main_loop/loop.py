@@ -352,7 +352,7 @@ class MainLoop:
         """Start another worker; one that never gets as far as an inventory is not tried for ever.
 
         Raises:
-            AgentError: `LANES_TRIES` of them died at once.
+            AgentError: `WORKER_TRIES` of them died at once.
         """
         self._worker_deaths += 1
         if self._worker_deaths > WORKER_TRIES:

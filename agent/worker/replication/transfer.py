@@ -56,7 +56,7 @@ INCOMING_LIMIT: Final = 64
 
 
 class Link(Protocol):
-    """What of `agent.worker.network.replication_link.BulkLane` is needed here."""
+    """What of `agent.worker.network.replication_link.ReplicationLink` is needed here."""
 
     def say(self, peer: str, message: Bulk) -> bool: ...
     async def ship(self, peer: str, chunk: Chunk) -> None: ...
