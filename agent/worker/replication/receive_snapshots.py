@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from agent.config import ComponentConfig
 from agent.guard.output_logs import STREAMS, logs_of
+from agent.system.threads import to_its_end
 from agent.worker.components.paths import Places, complete_logs, log_directory
 from agent.worker.replication.transfer import Refusal
 from checkpoint.engine import COOPERATIVE
@@ -118,7 +119,7 @@ class Deposit:
         async with self._turns.setdefault(offer.component, asyncio.Lock()):
             try:
                 self.admits(peer, offer)
-                snapshot = await asyncio.to_thread(self._put, offer, descriptor)
+                snapshot = await to_its_end(self._put, offer, descriptor)
             except Refusal as refusal:
                 log.info("dropped a snapshot of %s from %s: %s", offer.component, peer, refusal)
                 return

@@ -19,6 +19,7 @@ from typing import Final
 from msgspec import Struct, field
 
 from agent.errors import LaneError
+from agent.system.threads import to_its_end
 from agent.worker.replication.receive_files import is_in_place, is_plausible, named, size_told
 from agent.worker.replication.transfer import Shipper
 from checkpoint.errors import CheckpointError
@@ -238,7 +239,7 @@ class Sources:
                 continue
             descriptor = await self._from_keeper(component, need)
             try:
-                await asyncio.to_thread(self._store.contents.put, descriptor, need.digest)
+                await to_its_end(self._store.contents.put, descriptor, need.digest)
             finally:
                 os.close(descriptor)
             log.info("%s: kept %s as the program has it; its path leads to it no more", component, need.path)

@@ -21,7 +21,9 @@ from msgspec import Struct, field
 
 from agent.errors import LaneError
 from agent.system.crash import end_worker_on_mistake
+from agent.system.threads import to_its_end
 from checkpoint.errors import StoreError
+from checkpoint.store.disk import Writeback
 from failover.core.wire.messages import (
     CHUNK_SIZE_MAX,
     SNAPSHOT_SIZE_MAX,
@@ -221,6 +223,7 @@ class _Incoming(Struct):
 
     offer: Offered
     chunks: asyncio.Queue[Chunk]
+    credit: int = WINDOW
     task: asyncio.Task[None] | None = None
 
 
@@ -293,17 +296,15 @@ class Receiver:
         try:
             await self._desk.make_room(offer.size)
             descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+            signs = asyncio.create_task(self._repeat_credit(peer, transfer))
             try:
                 await self._fill(peer, transfer, descriptor)
                 if isinstance(offer, Offer):
                     self._incoming.pop((peer, offer.transfer), None)  # a newer one does not end what is whole
-                signs = asyncio.create_task(self._show_that_it_is_stored(peer, offer))
-                try:
-                    await self._desk.take(peer, offer, descriptor)
-                finally:
-                    signs.cancel()
+                await self._desk.take(peer, offer, descriptor)
                 self._link.say(peer, Taken(offer.transfer))
             finally:
+                signs.cancel()
                 os.close(descriptor)
         except OSError as error:
             why = f"cannot write it there: {error.strerror}"
@@ -316,16 +317,17 @@ class Receiver:
         finally:
             self._incoming.pop((peer, offer.transfer), None)
 
-    async def _show_that_it_is_stored(self, peer: str, offer: Offered) -> None:
-        """Repeat the last credit, so that the sender knows that this robot has not forgotten it."""
+    async def _repeat_credit(self, peer: str, transfer: _Incoming) -> None:
+        """So that the sender knows that this robot has not forgotten it, however slow the disk is."""
         while True:
             await asyncio.sleep(SIGN_S)
-            self._link.say(peer, Credit(offer.transfer, offer.size + WINDOW))
+            self._link.say(peer, Credit(transfer.offer.transfer, transfer.credit))
 
     async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
         offer, digest, end = transfer.offer, blake3(), 0
         what = SNAPSHOT if isinstance(offer, Offer) else FILE
-        self._link.say(peer, Credit(offer.transfer, WINDOW))
+        writeback = Writeback(descriptor)
+        self._link.say(peer, Credit(offer.transfer, transfer.credit))
         while end < offer.size:
             try:
                 async with asyncio.timeout(PATIENCE_S):
@@ -334,9 +336,10 @@ class Receiver:
                 raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
             if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
                 raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
-            await asyncio.to_thread(_keep, descriptor, chunk, digest)
+            await to_its_end(_keep, descriptor, chunk, digest, writeback)
             end += len(chunk.content)
-            self._link.say(peer, Credit(offer.transfer, end + WINDOW))
+            transfer.credit = end + WINDOW
+            self._link.say(peer, Credit(offer.transfer, transfer.credit))
         if digest.digest() != offer.digest:
             raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
 
@@ -352,9 +355,10 @@ def _named(offer: Offered) -> str:
     return f"a file of {offer.size} bytes ({offer.digest.hex()[:16]}…)"
 
 
-def _keep(descriptor: int, chunk: Chunk, digest: blake3) -> None:
+def _keep(descriptor: int, chunk: Chunk, digest: blake3, writeback: Writeback) -> None:
     os.pwrite(descriptor, chunk.content, chunk.offset)
     digest.update(chunk.content)
+    writeback.grown_to(chunk.offset + len(chunk.content))
 
 
 def digest_of(descriptor: int, size: int) -> bytes:
