@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from typing import Final
+
+AS_SOON_AS: Final = "failover captures it as soon as"
+"""Begins the cure of what is refused for a moment only: that moment's end follows."""
 
 
 def in_words(error: BaseException) -> str:
@@ -14,6 +18,11 @@ def in_words(error: BaseException) -> str:
         name if isinstance(name, int) else os.fsdecode(name) for name in (error.filename, error.filename2) if name is not None
     ]
     return error.strerror + (f" ({', '.join(map(str, named))})" if named else "")
+
+
+def copy_outdated(why: str, component: str = "") -> str:
+    """Why the ready copy of a component cannot be brought on, and what to do."""
+    return f"the ready copy{f' of {component}' if component else ''} must be built again: {why}"
 
 
 def near(said: str, choices: Iterable[str]) -> str:

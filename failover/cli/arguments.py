@@ -346,10 +346,10 @@ def team(room: argparse.ArgumentParser) -> None:
         "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
     )
     _json(shared)
-    create = _act(acts, "create", shared, "begin a team", CREATE_STORY)
+    create = _act(acts, "create", shared, "begin a team", CREATE_DESCRIPTION)
     create.add_argument("name", metavar="TEAM", help="the team's name")
     create.set_defaults(function="failover.cli.verbs.team:create")
-    enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_STORY)
+    enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_DESCRIPTION)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
         "address",
@@ -372,13 +372,13 @@ def team(room: argparse.ArgumentParser) -> None:
     show.set_defaults(function="failover.cli.verbs.team:show")
 
 
-CREATE_STORY: Final = """
+CREATE_DESCRIPTION: Final = """
     Make the team directory with an empty team file. Do this once, anywhere; failover team enrol adds the robots.
 
       failover team create lab
     """
 
-ENROL_STORY: Final = """
+ENROL_DESCRIPTION: Final = """
     Add a robot to the team file and make its key pair. The team file then goes to every robot. The secret key (keys/ROBOT.secret)
     belongs to that robot alone: enrolled on another machine, copy it to the robot and remove it here. Or make the pair on the
     robot (failover-agent keypair), so that the secret never travels, and enrol its public half. Agents read the team file when
@@ -391,13 +391,13 @@ ENROL_STORY: Final = """
     """
 
 
-def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, story: str) -> argparse.ArgumentParser:
+def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, description: str) -> argparse.ArgumentParser:
     """One act of ``failover team``."""
     room: argparse.ArgumentParser = acts.add_parser(
         name,
         parents=[shared],
         help=summary,
-        description=dedent(story).strip(),
+        description=dedent(description).strip(),
         epilog=EXIT_STATUSES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

@@ -126,7 +126,7 @@ def test_components_outlive_a_killed_service_and_systemd_starts_it_anew(machine:
     expect_it_to_count_on(machine, "killed", pid)
 
 
-def test_a_heart_that_stands_still_is_found_by_the_watchdog(machine: Machine) -> None:
+def test_a_main_loop_that_stands_still_is_found_by_the_watchdog(machine: Machine) -> None:
     pid = started(machine, "watched")
     first = main_pid(machine)
     os.kill(machine.outer(first), signal.SIGSTOP)

@@ -117,7 +117,7 @@ class Stock:
         return ""
 
     def lost(self, peer: str) -> None:
-        """The lane to a peer is gone; it will ask again."""
+        """The link to a peer is gone; it will ask again."""
         self._awaited.pop(peer, None)
         self._named = {key: named for key, named in self._named.items() if key[0] != peer}
 

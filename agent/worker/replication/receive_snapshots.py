@@ -79,10 +79,10 @@ class Deposit:
         self._admitted[act.component] = act
         if act.sender:
             self._senders[act.component] = act.sender
-        self._places.nursery.expect(sum(bool(known.sender) for known in self._admitted.values()))
+        self._places.process_pool.expect(sum(bool(known.sender) for known in self._admitted.values()))
 
     def last_sender(self, component: str) -> str:
-        """From whom its snapshots come, or came until this robot claimed it; "" from nobody."""
+        """From whom its snapshots come, or came until this robot claimed it; "" for none."""
         return self._senders.get(component, "")
 
     def admits(self, peer: str, offer: Offer) -> None:
@@ -141,7 +141,7 @@ class Deposit:
     def accept(self, act: Accept) -> None:
         """It counts as held here: the ready copy and the status follow; its output waits for `show`."""
         offer, snapshot = self._stored.pop((act.component, act.position), (None, None))
-        if offer is None or snapshot is None:  # stored by an earlier life of these lanes
+        if offer is None or snapshot is None:  # an earlier worker stored it
             return
         unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
         unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED, offer.spec.owner))
@@ -169,7 +169,7 @@ class Deposit:
         """Have the logs hold all up to a position.
 
         Args:
-            is_elsewhere: another robot is known to hold it, whoever took it in.
+            is_elsewhere: another robot is known to hold it, also where this one took it in.
         """
         unshown = self._unshown.setdefault(component, deque())
         directory = log_directory(component, self._places)
@@ -186,13 +186,13 @@ class Deposit:
                 logs.apply(one.output, is_safe=True)
         finally:
             logs.close()
-        if is_gap:  # what came before was taken in by an earlier life of these lanes
+        if is_gap:  # an earlier worker took in what came before
             self._complete(component, directory, position, is_safe=True)
         while unshown and unshown[0].position <= position:
             unshown.popleft()
 
     def _complete(self, component: str, directory: Path, position: Position, *, is_safe: bool) -> None:
-        """An earlier life of these lanes took it in, or too many wait: read it from the files."""
+        """An earlier worker took it in, or too many wait: read it from the files."""
         descriptors = self._store.open_chain(component, position)
         try:
             complete_logs(directory, descriptors, is_safe=is_safe)
