@@ -241,7 +241,7 @@ class MemoryCapture:
         for scan in copied.late:
             copied.spoil(scan)
         copied.late.clear()
-        last = 0
+        last = page_set.total_size(copied.valid)
         for turn in range(BUDGET_PASS_LIMIT if enough or is_again else PASS_LIMIT):
             if not self._is_behind(copied, enough or (LARGE_COUNT if turn or base else WORTH_COUNT), base=base):
                 break
@@ -251,7 +251,7 @@ class MemoryCapture:
             self._refresh_if_moved()
             self._maps.prepare()
             last, before = page_set.total_size(missing), last
-            if turn >= PASS_LIMIT and last >= CATCHING_UP * before:
+            if (turn >= PASS_LIMIT or (before and self.budget.is_long)) and last >= CATCHING_UP * before:
                 break
         copied.owed = page_set.difference(self._since_acknowledged(base=base)[0], copied.valid)
         return copied

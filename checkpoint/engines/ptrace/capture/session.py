@@ -270,6 +270,7 @@ class PtraceSession:
         self._standstill.longest_us = 0
         copied: RunningCopy | None = None
         given_up = 0
+        self._budget.begin_capture()
         while True:
             try:
                 self._tree.admit(held=self._standstill.is_held)

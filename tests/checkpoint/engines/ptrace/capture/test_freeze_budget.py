@@ -146,6 +146,23 @@ def test_a_freeze_that_would_take_too_long_is_given_up_and_the_next_ones_copy_le
 
 
 @pytest.mark.root
+def test_a_capture_that_takes_long_makes_no_pass_in_vain_and_ends_with_its_next_freeze(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On an overloaded robot: else a program that writes fast has no checkpoint for minutes."""
+    monkeypatch.setattr(freeze_budget, "LONG_CAPTURE_NS", 0)
+    monkeypatch.setattr(freeze_budget, "LONG_COPY_NS", 2_000 * FIRST_PAGE_NS)
+    with obedient(tmp_path, 0) as one:
+        one.write(8_000)
+        passes = _followed_by_writes(monkeypatch, one, lambda _: 8_000)
+        snapshot = one.session.capture(CaptureOrder(base=False, sequence=2))
+        one.program.kill()
+    assert len(passes) == 2, "the second one copied as much as the first"
+    assert len(snapshot.contents) >= 8_000 * PAGE
+    assert one.session.frozen_size >= 8_000 * PAGE
+
+
+@pytest.mark.root
 def test_no_capture_takes_longer_than_its_budget_but_by_the_rule_and_what_it_copied_is_right(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
