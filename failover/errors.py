@@ -45,6 +45,22 @@ class RulesError(FailoverError):
     """A setting contradicts another one or leaves its range; the message names the setting and the cure."""
 
 
+class ItemError(FailoverError):
+    """An item of the board is declared in a way that cannot work; nothing was changed.
+
+    Attributes:
+        key: the key of the declaration that is wrong ("type", "period" …); "" for the declaration as a whole.
+    """
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
+
+
+class ValueMisfitError(FailoverError):
+    """A value does not fit the declared type of its item; the item keeps the value that it has."""
+
+
 class NameFormatError(FailoverError):
     """A name of a robot, a team or a component is not of the documented form."""
 
