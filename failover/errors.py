@@ -63,6 +63,20 @@ class OvertakenError(BoardError):
 
 class WriterTakenError(BoardError):
     """Another process writes this item; the message names its pid."""
+class ItemError(FailoverError):
+    """An item of the board is declared in a way that cannot work; nothing was changed.
+
+    Attributes:
+        key: the key of the declaration that is wrong ("type", "period" …); "" for the declaration as a whole.
+    """
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
+
+
+class ValueMisfitError(FailoverError):
+    """A value does not fit the declared type of its item; the item keeps the value that it has."""
 
 
 class NameFormatError(FailoverError):

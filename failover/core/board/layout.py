@@ -14,6 +14,8 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import astuple
 
+from failover.core.board.item_types import ITEM_SIZE_MAX, OPAQUE
+from failover.core.board.items import BANKS_MAX, BANKS_MIN, BLOCK_SIZE_MAX, ITEMS_MAX, NAME_SIZE_MAX, Item
 from failover.errors import BoardError, BoardGoneError
 
 Buffer = bytes | bytearray | memoryview
@@ -39,16 +41,8 @@ NOT, INSERT, RUN, REMOVE = range(4)
 STATES: Final = ("not", "insert", "run", "remove")
 """States of a robot, as the header has them and as people read them."""
 
-ITEMS_MAX: Final = 1024
-"""Records of a file: their ids below this are the team file's."""
-ITEM_SIZE_MAX: Final = 64 << 10
-"""Bytes of a value: a get copies it whole, and two to eight banks of it lie in the file."""
-FILE_SIZE_MAX: Final = 16 << 20
-"""Of one robot's items: 64 robots take 1 GiB at the very most."""
 USERS_MAX: Final = 256
-BANKS_MIN: Final = 2
-BANKS_MAX: Final = 8
-NAME_SIZE_MAX: Final = 255
+"""Processes of one robot that have its board open: their rows lie between the header and the records."""
 TEXT_SIZE_MAX: Final = 0xFFFF
 """Bytes of a declaration's text: its length has two bytes."""
 NO_ERROR_BOUND: Final = 2**32 - 1
@@ -61,6 +55,7 @@ URGENT: Final = 1
 NOT_SENT: Final = 2
 KEPT: Final = 4
 ADDED: Final = 8
+FINITE: Final = 16
 """Flags of a record."""
 
 USER_LOCKS: Final = 1 << 40
@@ -212,8 +207,8 @@ def read_header(view: Buffer) -> Header:
         raise BoardError(f"damaged: room for {capacity} records in {len(view)} bytes")
     if count > capacity:
         raise BoardError(f"damaged: {count} records where there is room for {capacity}")
-    if not names_at(capacity) <= size <= FILE_SIZE_MAX:
-        raise BoardError(f"damaged: it says that it has {size} bytes; {names_at(capacity)} to {FILE_SIZE_MAX} are possible")
+    if not names_at(capacity) <= size <= BLOCK_SIZE_MAX:
+        raise BoardError(f"damaged: it says that it has {size} bytes; {names_at(capacity)} to {BLOCK_SIZE_MAX} are possible")
     if state >= len(STATES):
         raise BoardError(f"damaged: the robot's state is {state}; 0 to {len(STATES) - 1} are possible")
     name = _text(robot.rstrip(b"\0"), "the robot's name")
@@ -341,8 +336,8 @@ def addition(header: Header, wanted: Wanted) -> Addition:
     named = LENGTH.pack(len(name)) + name + LENGTH.pack(len(text)) + text
     offset, stride = aligned(name_offset + len(named)), aligned(BANK_HEAD + wanted.size)
     size = offset + wanted.banks * stride
-    if size > FILE_SIZE_MAX:
-        raise BoardError(f"{what}: the file would have {size} bytes; {FILE_SIZE_MAX} are possible: fewer or smaller items")
+    if size > BLOCK_SIZE_MAX:
+        raise BoardError(f"{what}: the file would have {size} bytes; {BLOCK_SIZE_MAX} are possible: fewer or smaller items")
     declaration = DECLARATION.pack(
         *(wanted.id, wanted.kind, wanted.banks, offset, wanted.size, stride, wanted.period, wanted.phase),
         *(wanted.digest, name_offset, wanted.bound_ns, wanted.flags),

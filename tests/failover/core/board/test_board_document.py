@@ -59,7 +59,7 @@ def test_our_layout_reads_the_sample() -> None:
 
 def test_the_limits_in_the_document_are_those_of_the_code() -> None:
     assert bytes.fromhex(re.search(r"magic `([0-9A-F ]+)`", DOCUMENT)[1]) == layout.MAGIC  # type: ignore[index]
-    assert (layout.ITEMS_MAX, layout.ITEM_SIZE_MAX, layout.FILE_SIZE_MAX, layout.USERS_MAX) == (1024, 65536, 16 << 20, 256)
+    assert (layout.ITEMS_MAX, layout.ITEM_SIZE_MAX, layout.BLOCK_SIZE_MAX, layout.USERS_MAX) == (1024, 65536, 16 << 20, 256)
     assert "capacity: records for which there is room, 1 to 1024" in DOCUMENT and "at most 16 MiB" in DOCUMENT
     assert "most bytes of a value, 1 to 65536" in DOCUMENT and "banks, 2 to 8" in DOCUMENT
     fields = dict(re.findall(r"^\| (\d+) \| \d \| (.+?)[;:,.(]? ", DOCUMENT, flags=re.MULTILINE))

@@ -45,8 +45,8 @@ def test_a_removed_item_is_a_hole_whose_number_does_not_come_again() -> None:
     ("wanted", "why"),
     [
         (Wanted(id=1, name="big", size=layout.ITEM_SIZE_MAX + 1), "65537 bytes"),
-        (Wanted(id=1, name="", size=1), "1 to 255"),
-        (Wanted(id=1, name="n" * 256, size=1), "1 to 255"),
+        (Wanted(id=1, name="", size=1), "1 to 63"),
+        (Wanted(id=1, name="n" * 256, size=1), "1 to 63"),
         (Wanted(id=1, name="b", size=1, banks=9), "9 banks"),
         (Wanted(id=1, name="p", size=1, period=3, phase=3), "phase 3"),
     ],
