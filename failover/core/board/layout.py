@@ -14,7 +14,7 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import astuple
 
-from failover.core.board.item_types import ITEM_SIZE_MAX, OPAQUE
+from failover.core.board.item_types import ITEM_SIZE_MAX, Opaque, canonical
 from failover.core.board.items import BANKS_MAX, BANKS_MIN, BLOCK_SIZE_MAX, ITEMS_MAX, NAME_SIZE_MAX, Item
 from failover.errors import BoardError, BoardGoneError
 
@@ -45,8 +45,6 @@ USERS_MAX: Final = 256
 """Processes of one robot that have its board open: their rows lie between the header and the records."""
 TEXT_SIZE_MAX: Final = 0xFFFF
 """Bytes of a declaration's text: its length has two bytes."""
-NO_ERROR_BOUND: Final = 2**32 - 1
-"""In a bank: nothing is known about how much older the value may be."""
 
 BYTES, STRUCT, MSGPACK, JSON = range(4)
 KINDS: Final = ("bytes", "struct", "msgpack", "json")
@@ -142,6 +140,16 @@ class Wanted(Struct, frozen=True):
     bound_ns: int = 0
     flags: int = 0
     text: str = ""
+
+
+def wanted_of(item: Item, id_: int, flags: int = 0) -> Wanted:
+    """A declaration as a table has it; ``flags``: besides those that it says itself."""
+    kind = KINDS.index(item.type.kind) if isinstance(item.type, Opaque) else STRUCT
+    said = {URGENT: item.urgent, NOT_SENT: not item.transmit, KEPT: item.keep, FINITE: item.finite}
+    flags |= sum(flag for flag, is_said in said.items() if is_said)
+    bound_ns = round(item.bound_ms * 1_000_000)
+    numbers = (item.size, kind, item.banks, item.period, item.phase, item.type_digest, bound_ns, flags)
+    return Wanted(id_, item.name, *numbers, canonical(item.type))
 
 
 class Record(Wanted, frozen=True):
