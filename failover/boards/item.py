@@ -321,7 +321,7 @@ class Item:
         unpack = None if record.kind == layout.BYTES else source.values.unpack
         is_own = robot == board.robot
         slow: Get = self._slow_own if is_own else partial(self._slow_peer, robot)
-        get, remember = reader_of(source.place, boottime.CLOCK, board.skew_ns, robot, unpack, record.bound_ns, slow)
+        get, remember = reader_of(source.place, boottime.CLOCK, board.skew_ns, robot, unpack, record.bound_ns, not is_own, slow)
         source.use(get, remember)
         self._sources[robot] = source
         self._gets[robot] = get
