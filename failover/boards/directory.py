@@ -16,7 +16,8 @@ from failover.boards import boottime, locks
 from failover.boards.mapping import GENERATION, MappedFile
 from failover.client.control import socket_path
 from failover.core.board import layout
-from failover.core.board.layout import ALONE, GONE, ITEMS_MAX, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
+from failover.core.board.items import ITEMS_MAX
+from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
 from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError
 
@@ -53,8 +54,16 @@ def this_robot() -> str:
 
 
 def make_file(
-    path: Path, flags: int, robot: str, *, capacity: int = ITEMS_MAX, rank: int = 0, state: int = layout.RUN, roster_digest: int = 0,
-    mode: int = 0o600, hold: bool = False,
+    path: Path,
+    flags: int,
+    robot: str,
+    *,
+    capacity: int = ITEMS_MAX,
+    rank: int = 0,
+    state: int = layout.RUN,
+    roster_digest: int = 0,
+    mode: int = 0o600,
+    hold: bool = False,
 ) -> int:
     """Make one file of a board, without items, whole at its place.
 
@@ -175,7 +184,7 @@ def _made(directory: Path, name: str) -> tuple[MappedFile, int] | None:
 def _examine(directory: Path) -> None:
     """Refuse a directory below /dev/shm that another user has put there."""
     found = directory.lstat()
-    if VARIABLE in os.environ or found.st_uid in (0, os.geteuid()) and stat.S_ISDIR(found.st_mode):
+    if VARIABLE in os.environ or (found.st_uid in (0, os.geteuid()) and stat.S_ISDIR(found.st_mode)):
         return
     raise BoardError(
         f"cannot make the board {directory}: it belongs to uid {found.st_uid}; remove it, or name another place in {VARIABLE}"

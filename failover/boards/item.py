@@ -1,7 +1,7 @@
 """An item of a board in a program's hands: put, get, wait.
 
-`put` and `get` are closures of `failover.core.board.banks`, made for the place where the item lies. They go the slow way, which is
-written here, whenever something is not as it was: the table changed, the board was made anew, a robot was named, a process was
+`put` and `get` are closures of `failover.core.board.banks`, made for the place where the item lies. They go the slow way, which
+is written here, whenever something is not as it was: the table changed, the board was made anew, a robot was named, a process was
 forked. So this file may take its time, and the closures need none.
 """
 
@@ -12,9 +12,10 @@ import os
 import sys
 import time
 import weakref
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 from failover.boards import boottime, futex
@@ -27,7 +28,15 @@ from failover.core.board.banks import writer as writer_of
 from failover.core.board.item_types import OPAQUE, Opaque, canonical, parse
 from failover.core.board.item_values import Values, values_of
 from failover.core.board.layout import Record
-from failover.errors import BoardError, BoardGoneError, ItemError, NeverWrittenError, OvertakenError, ValueMisfitError, WriterTakenError
+from failover.errors import (
+    BoardError,
+    BoardGoneError,
+    ItemError,
+    NeverWrittenError,
+    OvertakenError,
+    ValueMisfitError,
+    WriterTakenError,
+)
 from failover.fencing.epoch import epoch
 
 if TYPE_CHECKING:
@@ -146,7 +155,7 @@ class ItemWriter:
             )
         end = time.monotonic() + PUT_WAIT_S
         while not writer.store(octets, stamp, 0):
-            if _is_inside(writer.put) or time.monotonic() > end:
+            if _is_inside(writer) or time.monotonic() > end:
                 raise BoardError(f"item {self.name!r} is put inside of a put of it, by a signal's function; put it elsewhere")
             time.sleep(0)
 
@@ -197,11 +206,12 @@ class ItemWriter:
             source.place.words[(source.record.at + layout.REFUSED_FIELD) // 8] += 1
 
 
-def _is_inside(function: Callable[..., Any]) -> bool:
-    """Whether this thread is in the middle of a function."""
-    frame = sys._getframe()
-    while frame is not None and frame.f_code is not function.__code__:
-        frame = frame.f_back  # type: ignore[assignment]
+def _is_inside(writer: Writer) -> bool:
+    """Whether this thread is in the middle of a put already, besides the one that has just gone the slow way."""
+    codes = (writer.put.__code__, writer.store.__code__)  # type: ignore[attr-defined]
+    frame: FrameType | None = sys._getframe(2).f_back
+    while frame is not None and frame.f_code not in codes:
+        frame = frame.f_back
     return frame is not None
 
 

@@ -18,6 +18,7 @@ from typing import Final
 from failover.boards import futex, locks
 from failover.core.board import layout
 from failover.core.board.banks import Place, place_of
+from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import GENERATION_AT, GONE, HOLE, USER_LOCKS, USERS_MAX, WRITER_LOCKS, Header, Record, Wanted
 from failover.errors import BoardError, BoardGoneError
 
@@ -253,7 +254,7 @@ def _mapped(path: Path, descriptor: int, writable: bool) -> mmap.mmap:
     size = os.fstat(descriptor).st_size
     if size < layout.RECORDS_AT:
         raise BoardError(f"{path}: this is no board: it has {size} bytes")
-    size = min(size, layout.BLOCK_SIZE_MAX)
+    size = min(size, BLOCK_SIZE_MAX)
     protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     try:
         return mmap.mmap(descriptor, size, mmap.MAP_SHARED, protection)

@@ -41,7 +41,7 @@ RETRIES: Final = 16
 GENERATION: Final = GENERATION_AT // 8
 LOW_HALF: Final = 0xFFFF_FFFF
 EPOCH_SHIFT: Final = 40
-"""Numbers of a copy that runs under epoch e begin above e × 2⁴⁰: a million puts a second for twelve days do not reach the next."""
+"""Numbers of a copy that runs under epoch e begin above e × 2⁴⁰: a million puts a second reach the next in twelve days."""
 
 NO_ERROR_NS: Final = NO_ERROR_BOUND * NS_PER_US
 CLOCK_BOOTTIME: Final = 7
@@ -136,9 +136,7 @@ def sum_of(value: bytes, stamp_ns: int, number: int) -> int:
 # --- The plain form --------------------------------------------------------------------------------------------------
 
 
-def put_carefully(
-    place: Place, number: int, value: bytes, stamp_ns: int, error_us: int = 0, fence: Fence | None = None
-) -> None:
+def put_carefully(place: Place, number: int, value: bytes, stamp_ns: int, error_us: int = 0, fence: Fence | None = None) -> None:
     """Put ``number``, which is above the newest, by the only writer of this item.
 
     Args:

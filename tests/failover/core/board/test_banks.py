@@ -1,4 +1,4 @@
-"""No get ever mixes two puts: every interleaving of three puts and one get, word by word, of the very functions that programs run.
+"""No get ever mixes two puts: every interleaving of three puts and a get, word by word, of the very functions that programs run.
 
 A put only stores and a get only loads, so an interleaving is, for each load of the get, how many stores of the puts came before
 it. The stores are recorded once; then the get runs once for each way to place its loads among them. Only loads that can see
