@@ -124,10 +124,7 @@ def enter(directory: Path, name: str) -> tuple[MappedFile, int]:
         BoardError: it is no board, cannot be made, or has too many users.
     """
     for _ in range(TURNS):
-        try:
-            entered = _try_to_enter(directory, name)
-        except BoardGoneError:
-            entered = None  # removed between two steps
+        entered = _try_to_enter(directory, name)
         if entered is not None:
             return entered
     raise BoardError(f"cannot open the board {directory}: others have made and removed it {TURNS} times meanwhile; try again")
@@ -151,7 +148,10 @@ def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
             if _is_abandoned(path, descriptor):
                 _remove(directory, descriptor)
                 return None
-            file = MappedFile.open(path, descriptor, writable=True)
+            try:
+                file = MappedFile.open(path, descriptor, writable=True)
+            except BoardGoneError as error:
+                raise BoardError(f"{error}, and not replaced yet; is its agent running?") from None
             index = file.enter(os.getpid(), os.geteuid(), name)
             keep = True
             return file, index

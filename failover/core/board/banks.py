@@ -29,6 +29,7 @@ from failover.core.board.layout import (
     NUMBER_WORD,
     SIZE_WORD,
     STAMP_WORD,
+    STRUCT,
     SUM_WORD,
     WAITERS_FIELD,
     Record,
@@ -74,7 +75,7 @@ class Place(Struct, frozen=True):
     Attributes:
         halves: the file's words of two bytes: one of them says whether a process waits.
         banks: offset of each.
-        limit: most bytes of a value.
+        least, limit: bytes of a value; of a struct they are the same.
         newest, formula: indexes of words.
         wake: index of a word of two bytes.
     """
@@ -83,6 +84,7 @@ class Place(Struct, frozen=True):
     area: Area
     halves: Words
     banks: tuple[int, ...]
+    least: int
     limit: int
     newest: int
     formula: int
@@ -123,7 +125,7 @@ def place_of(record: Record, words: Words, area: Area, halves: Words) -> Place:
     banks = tuple(record.offset + index * record.stride for index in range(record.banks))
     at = record.at
     return Place(
-        *(words, area, halves, banks, record.size),
+        *(words, area, halves, banks, record.size if record.kind == STRUCT else 0, record.size),
         *((at + NEWEST_FIELD) // 8, (at + FORMULA_FIELD) // 8, (at + WAITERS_FIELD) // 2),
     )
 
@@ -184,8 +186,10 @@ def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRI
             fence()
         if words[word + NUMBER_WORD] != number:
             continue
-        if size > place.limit:
-            raise BoardError(f"damaged: a value of {size} bytes where {place.limit} are the most; its writer must put it anew")
+        if not place.least <= size <= place.limit:
+            raise BoardError(
+                f"damaged: a value of {size} bytes where {place.least} to {place.limit} are possible; its writer must put it anew"
+            )
         if total == 0 or total == sum_of(value, stamp_ns, number):
             return Found(value, stamp_ns, said >> 32, number)
     raise OvertakenError(
@@ -318,7 +322,7 @@ def reader(
             item was never written or is overtaken, its value does not unpack, no bound of its error is known, or there is a sum.
     """
     words, area, banks = place.words, place.area, place.banks
-    limit, newest, count = place.limit, place.newest, len(place.banks)
+    least, limit, newest, count = place.least, place.limit, place.newest, len(place.banks)
     learned = 0 if bound_ns or not is_received else place.formula
     generation = UNKNOWN
 
@@ -337,7 +341,7 @@ def reader(
         stamp, total = words[word + 1], words[word + 2]
         bank += 32
         value: Any = area[bank : bank + size]
-        if words[word] != number or total or not number:
+        if words[word] != number or total or not number or size < least:
             return slow(of)
         if unpack is not None:
             try:

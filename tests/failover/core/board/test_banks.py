@@ -99,7 +99,7 @@ class Seen(Memory):
 
 def place_in(memory: Memory) -> Place:
     offsets = tuple(8 * (FIRST_BANK + bank * BANK_WORDS) for bank in range(2))
-    return Place(memory, Bytes(memory), memory, offsets, VALUE_SIZE, NEWEST, 0, WAKE)
+    return Place(memory, Bytes(memory), memory, offsets, 0, VALUE_SIZE, NEWEST, 0, WAKE)
 
 
 def value_of(number: int) -> bytes:
