@@ -32,7 +32,7 @@ PURE_FILES = (
 PURE_IMPORTS = frozenset(
     """
     __future__ abc bisect binascii blake3 collections contextlib dataclasses enum functools hashlib heapq hmac itertools
-    math msgspec numpy operator re string struct types typing unicodedata xxhash zlib
+    math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
     """.split()  # noqa: SIM905
 )
 
