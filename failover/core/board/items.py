@@ -239,6 +239,11 @@ class Board(Struct, frozen=True):
             return 0
         return xxhash.xxh3_64_intdigest(msgspec.json.encode([item.as_words() for item in self.items]))
 
+    @property
+    def terms(self) -> bytes:
+        """The digest as bytes for a roster; b"" for a team without a board."""
+        return self.digest.to_bytes(8, "little") if self.items else b""
+
     def number_of(self, name: str) -> int | None:
         """An item's number; None where it is not declared."""
         return next((number for number, item in enumerate(self.items) if item.name == name), None)
