@@ -40,8 +40,8 @@ PURE_FILES = (
 
 PURE_IMPORTS = frozenset(
     """
-    __future__ abc bisect binascii blake3 collections contextlib dataclasses difflib enum functools hashlib heapq hmac itertools
-    math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
+    __future__ abc bisect binascii blake3 collections contextlib dataclasses difflib enum fractions functools hashlib heapq hmac
+    itertools math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
     """.split()  # noqa: SIM905
 )
 
