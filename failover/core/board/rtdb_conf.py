@@ -63,13 +63,19 @@ class Assignment(Struct, frozen=True):
 
 
 class Configuration(Struct, frozen=True):
-    """A whole file; ``notes``: sentences about what is allowed and probably not meant."""
+    """A whole file.
+
+    Attributes:
+        notes: sentences about what is allowed and probably not meant.
+        lines: where each item is declared, from 1.
+    """
 
     agents: tuple[str, ...] = ()
     items: tuple[ConfItem, ...] = ()
     schemas: tuple[Schema, ...] = ()
     assignments: tuple[Assignment, ...] = ()
     notes: tuple[str, ...] = ()
+    lines: tuple[int, ...] = ()
 
 
 def parse(content: bytes, source: str) -> Configuration:
@@ -122,11 +128,12 @@ def shares(configuration: Configuration) -> dict[str, tuple[tuple[str, ...], tup
     }
 
 
-def as_items(configuration: Configuration, sizes: Mapping[str, int]) -> tuple[Item, ...]:
-    """The items of a board, with the numbers that CAMBADA gives them; agents are robots of the same name.
+def as_items(configuration: Configuration, sizes: Mapping[str, int], robots: Mapping[str, str]) -> tuple[Item, ...]:
+    """The items of a board, with the numbers that CAMBADA gives them.
 
     Args:
         sizes: item → ``sizeof`` of its datatype, bytes.
+        robots: agent → robot; an agent that is not in it is the robot of the same name.
 
     Raises:
         ItemError: an item is not possible here; names it.
@@ -134,10 +141,8 @@ def as_items(configuration: Configuration, sizes: Mapping[str, int]) -> tuple[It
     found = []
     who = shares(configuration)
     for item in configuration.items:
-        having, sharing = who[item.name]
-        shared: bool | tuple[str, ...] = sharing == having if sharing == having or not sharing else sharing
-        if not sharing:
-            shared = False
+        having, sharing = (tuple(robots.get(agent, agent) for agent in agents) for agents in who[item.name])
+        shared = bool(sharing) if sharing in (having, ()) else sharing
         try:
             found.append(Item(item.name, size=sizes[item.name], shared=shared, period=item.period, robots=having))
         except ItemError as error:
@@ -226,7 +231,12 @@ class _Parser:
         self._note_unused()
         schemas = tuple(Schema(name, tuple(lists["shared"]), tuple(lists["local"])) for name, lists in self._lists.items())
         return Configuration(
-            tuple(self._agents.lines), tuple(self._declared), schemas, tuple(self._assignments), tuple(self._notes)
+            tuple(self._agents.lines),
+            tuple(self._declared),
+            schemas,
+            tuple(self._assignments),
+            tuple(self._notes),
+            tuple(self._items.lines.values()),
         )
 
     def _agent_list(self, section: _Token) -> None:

@@ -48,7 +48,7 @@ def test_the_file_of_a_whole_team_is_read() -> None:
 def test_one_item_is_shared_by_one_agent_and_private_at_others() -> None:
     found = parse(SAMPLE.read_bytes(), "rtdb.conf")
     assert shares(found)["COACH_INFO"] == (found.agents, ("BASE",))
-    board = Board(as_items(found, {item.name: 24 for item in found.items}))
+    board = Board(as_items(found, {item.name: 24 for item in found.items}, {}))
     assert board.number_of("COACH_INFO") == 2
     coach = board.items[2]
     assert (coach.is_shared_by("BASE"), coach.is_shared_by("PLAYER_1"), coach.is_at("PLAYER_1")) == (True, False, True)
@@ -59,7 +59,7 @@ def test_one_item_is_shared_by_one_agent_and_private_at_others() -> None:
 def test_an_item_that_is_too_large_for_the_radio_is_named() -> None:
     found = parse(SAMPLE.read_bytes(), "rtdb.conf")
     with pytest.raises(ItemError, match="item WORLD: a shared item holds at most 4096 bytes, this one 5000"):
-        as_items(found, {item.name: 5000 for item in found.items})
+        as_items(found, {item.name: 5000 for item in found.items}, {})
 
 
 @pytest.mark.parametrize(
