@@ -113,8 +113,11 @@ def _imported(content: bytes, path: Path, arguments: argparse.Namespace) -> tupl
     if content.lstrip()[:1] == b"<":
         return Board(rtdb_xml.parse(content, str(path), arguments.size)), (), {}
     found = rtdb_conf.parse(content, str(path))
-    items = rtdb_conf.as_items(found, _sizes(found, path, arguments), dict(arguments.robot))
-    return Board(items), found.notes, {item.name: f"{item.datatype} of {item.headerfile}" for item in found.items}
+    sizes = _sizes(found, path, arguments)
+    unknown = [item.name for item in found.items if item.name not in sizes]
+    notes = [f"{path}: the type of {name} is not found; no agent has it, so it keeps its number, with 1 byte" for name in unknown]
+    items = rtdb_conf.as_items(found, sizes | dict.fromkeys(unknown, 1), dict(arguments.robot))
+    return Board(items), (*found.notes, *notes), {item.name: f"{item.datatype} of {item.headerfile}" for item in found.items}
 
 
 def _commented(text: str, comments: dict[str, str]) -> str:
@@ -129,7 +132,7 @@ def _commented(text: str, comments: dict[str, str]) -> str:
 
 
 def _sizes(found: Configuration, path: Path, arguments: argparse.Namespace) -> dict[str, int]:
-    """Item → size of its type, by the compiler.
+    """Item → size of its type, by the compiler; one that no agent has may be missing.
 
     Raises:
         ImportFailedError: there is no compiler, or it does not know a type; has its sentences.
@@ -148,7 +151,8 @@ def _sizes(found: Configuration, path: Path, arguments: argparse.Namespace) -> d
         words = line.split()
         if len(words) == 4 and words[3].startswith(SYMBOL):
             sizes[words[3].removeprefix(SYMBOL)] = int(words[1], 16)
-    missing = [item.name for item in found.items if item.name not in sizes]
+    having = rtdb_conf.shares(found)
+    missing = [item.name for item in found.items if item.name not in sizes and having[item.name][0]]
     if missing:
         raise ImportFailedError(f"{path}: the object file of {compiler[0]} names no size of {', '.join(missing[:5])}")
     return sizes
@@ -157,12 +161,19 @@ def _sizes(found: Configuration, path: Path, arguments: argparse.Namespace) -> d
 def _source(found: Configuration, path: Path) -> str:
     """A C++ file with one array as long as each type; its lines are named as those of the configuration."""
     name = str(path).replace("\\", "\\\\").replace('"', '\\"')
-    lines = []
+    having = rtdb_conf.shares(found)
+    includes, arrays = [], []
     for item, line in zip(found.items, found.lines, strict=True):
-        lines += [f'#line {line} "{name}"', f'#include "{item.headerfile}"']
-    for item, line in zip(found.items, found.lines, strict=True):
-        lines += [f'#line {line} "{name}"', f"char {SYMBOL}{item.name}[sizeof({item.datatype})] = {{1}};"]
-    return "\n".join([*lines, ""])
+        at = f'#line {line} "{name}"'
+        array = f"char {SYMBOL}{item.name}[sizeof({item.datatype})] = {{1}};"
+        if having[item.name][0]:
+            includes += [at, f'#include "{item.headerfile}"']
+            arrays += [at, array]
+        else:  # teams leave such items behind, and not always their headers
+            guard = f'#if __has_include("{item.headerfile}")'
+            includes += [at, guard, at, f'#include "{item.headerfile}"', "#endif"]
+            arrays += [at, guard, at, array, "#endif"]
+    return "\n".join([*includes, *arrays, ""])
 
 
 def _tools(said: str | None) -> tuple[list[str], list[str]]:
@@ -194,6 +205,8 @@ def _run(words: list[str], what: str, path: Path) -> str:
         said = [line.strip() for line in ran.stderr.splitlines() if ": error: " in line or "fatal error" in line]
         reasons = tuple(dict.fromkeys(said or ran.stderr.splitlines()))[:REASONS_MAX]
         raise ImportFailedError(
-            f"{path}: {what} ({words[0]}) does not know every type; give the folders of the headers with -I DIR", reasons
+            f"{path}: {what} ({words[0]}) does not know every type; give the folders of the headers with -I DIR, "
+            f"and the C++ of old headers with --cc '{words[0]} -std=gnu++98'",
+            reasons,
         )
     return ran.stdout

@@ -147,6 +147,16 @@ def test_a_header_that_is_not_found_is_told_with_the_line_of_its_item(place: Pat
 
 @pytest.mark.compiler
 @pytest.mark.command("g++")
+def test_an_item_that_no_agent_has_needs_no_header_and_keeps_its_number(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "rtdb.conf").write_text(CONF.replace("int; headerfile = stdio.h", "Lost; headerfile = lost.h"))
+    status, out, err = said(capsys, "board", "import", "rtdb.conf", "-I", "include")
+    assert status == 0
+    assert "the type of CLOCK is not found; no agent has it, so it keeps its number, with 1 byte" in err
+    assert out.endswith('[board.items.CLOCK]  # Lost of lost.h\ntype = "bytes"\nsize = 1\nshared = false\nrobots = []\n')
+
+
+@pytest.mark.compiler
+@pytest.mark.command("g++")
 def test_nothing_of_a_header_is_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "include" / "World.h").write_text(
         '#include <stdio.h>\nstatic int at = fclose(fopen("ran", "w"));\nstruct WorldModel { char a[sizeof(at)]; };\n'
