@@ -9,6 +9,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -124,7 +125,7 @@ class Board:
     def __init__(self, place: Path | None, name: str) -> None:
         self._place = place
         self._name = name
-        self.guard = threading.RLock()
+        self.guard: AbstractContextManager[Any] = threading.RLock()
         self.skew_ns = 0
         self._is_closed = False
         self._items: weakref.WeakSet[Item] = weakref.WeakSet()

@@ -14,9 +14,10 @@ import time
 import weakref
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from functools import partial
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from failover.boards import boottime, futex
 from failover.boards.fence import FENCE
@@ -39,15 +40,29 @@ from failover.errors import (
 )
 from failover.fencing.epoch import epoch
 
-if TYPE_CHECKING:
-    from failover.boards.board import Board
-
 SLICE_S: Final = 0.1
 """The longest sleep without a look: a wake-up may be lost (BOARD.md), and a board may be made anew."""
 TURNS: Final = 100
 """Of a call whose board is made anew each time it looks."""
 PUT_WAIT_S: Final = 5.0
 """For another thread's put of the same item, which takes a microsecond of its processor's time."""
+
+
+class OpenBoard(Protocol):
+    """What an item asks its board (`failover.boards.board.Board`)."""
+
+    guard: AbstractContextManager[Any]
+    skew_ns: int
+
+    @property
+    def robot(self) -> str: ...
+    def found(self, name: str, robot: str) -> tuple[MappedFile, Record]: ...
+    def has(self, name: str, robot: str) -> bool: ...
+    def is_good(self, source: Source) -> bool: ...
+    def living(self) -> list[str]: ...
+    def own_source(self, name: str) -> Source: ...
+    def whose(self, file: MappedFile, record: Record) -> str: ...
+    def writer(self, name: str) -> ItemWriter: ...
 
 
 def values_for(record: Record, shape: Any) -> Values:
@@ -116,7 +131,7 @@ class Source:
 class ItemWriter:
     """All puts of one item by this process: one lock, one count, whatever handles there are."""
 
-    def __init__(self, board: Board, name: str) -> None:
+    def __init__(self, board: OpenBoard, name: str) -> None:
         self._board = board
         self.name = name
         self._writer: Writer | None = None
@@ -208,7 +223,7 @@ class ItemWriter:
 
 def _is_inside(writer: Writer) -> bool:
     """Whether this thread is in the middle of a put already, besides the one that has just gone the slow way."""
-    codes = (writer.put.__code__, writer.store.__code__)  # type: ignore[attr-defined]
+    codes = (writer.put.__code__, writer.store.__code__)
     frame: FrameType | None = sys._getframe(2).f_back
     while frame is not None and frame.f_code not in codes:
         frame = frame.f_back
@@ -241,7 +256,7 @@ class Item:
 
     __slots__ = ("__weakref__", "_board", "_gets", "_shape", "_sources", "_taken", "get", "name", "put")
 
-    def __init__(self, board: Board, name: str, shape: Any) -> None:
+    def __init__(self, board: OpenBoard, name: str, shape: Any) -> None:
         self.name = name
         self._board = board
         self._shape = shape
@@ -317,7 +332,7 @@ class Item:
         """
         board = self._board
         with board.guard:
-            robot = board.ensured().robot if robot is None else robot
+            robot = board.robot if robot is None else robot
             source = self._sources.get(robot)
             if source is None or not board.is_good(source):
                 source = self._bound(robot)

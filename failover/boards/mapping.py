@@ -56,7 +56,7 @@ class MappedFile:
         """Map a file.
 
         Args:
-            descriptor: an opening of it for its locks; -1: one is made.
+            descriptor: an opening of it for its locks, which becomes the file's; -1: one is made.
             writable: None: if this user may write it.
 
         Raises:
@@ -73,17 +73,12 @@ class MappedFile:
         except OSError as error:
             raise BoardError(f"cannot open {path}: {error.strerror}") from error
         try:
-            area, identity = _mapped(path, opened, writable), _identity(opened)
+            file = cls(path, _mapped(path, opened, writable), writable, descriptor, _identity(opened))
             if writable and descriptor < 0:
-                descriptor = _second_opening(path, opened)
+                file.descriptor = _second_opening(path, opened)
+            return file
         finally:
             os.close(opened)
-        try:
-            return cls(path, area, writable, descriptor, identity)
-        except BaseException:
-            if descriptor >= 0:
-                os.close(descriptor)
-            raise
 
     def close(self) -> None:
         """Give back the locks and the descriptor; what is mapped can still be read."""
