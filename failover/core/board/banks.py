@@ -201,6 +201,11 @@ def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRI
 # --- The fast form ---------------------------------------------------------------------------------------------------
 
 
+def _bank_words(place: Place) -> tuple[tuple[int, int, int, int], ...]:
+    """Of each bank the indexes of the words of its number, its stamp and its size, and the offset of its value."""
+    return tuple((at // 8, at // 8 + STAMP_WORD, at // 8 + SIZE_WORD, at + BANK_HEAD) for at in place.banks)
+
+
 Put = Callable[..., None]
 """``(value, at=None)``"""
 Get = Callable[..., Reading]
@@ -249,10 +254,12 @@ def writer(
         woken: wakes those that wait; is given the stamp.
         always_wake: readers cannot say that they wait.
     """
-    words, area, halves, banks = place.words, place.area, place.halves, place.banks
+    words, area, halves, banks = place.words, place.area, place.halves, _bank_words(place)
     limit, newest, wake, count = place.limit, place.newest, place.wake, len(place.banks)
     generation = UNKNOWN
     busy = False
+    for head, *_ in banks:
+        words[head + SUM_WORD] = 0  # here none is needed: once and for all
 
     def put(value: Any, at: int | None = None) -> None:
         """Put a value; ``at``: nanoseconds of CLOCK_BOOTTIME at which it was produced, unless that is now."""
@@ -264,15 +271,12 @@ def writer(
             busy = True
             try:
                 following = number + 1
-                bank = banks[following % count]
-                word = bank >> 3
-                words[word] = 0
-                words[word + 1] = stamp = clock(7) - skew_ns
-                words[word + 2] = 0
-                words[word + 3] = size
-                bank += 32
-                area[bank : bank + size] = value
-                words[word] = following
+                head, stamped, sized, begin = banks[following % count]
+                words[head] = 0
+                words[stamped] = stamp = clock(7) - skew_ns
+                words[sized] = size
+                area[begin : begin + size] = value
+                words[head] = following
                 words[newest] = number = following
                 if halves[wake] or always_wake:
                     woken(stamp)
@@ -319,9 +323,9 @@ def reader(
         unpack: bytes to a value; None: the bytes themselves.
         bound_ns: as declared; 0: none is, and if the item ``is_received`` from another robot its word says it.
         slow: is called instead, with the robot that the caller named: when the generation differs, a robot is named, the
-            item was never written or is overtaken, its value does not unpack, no bound of its error is known, or there is a sum.
+            item was never written or is overtaken, its value does not unpack, or no bound of its error is known.
     """
-    words, area, banks = place.words, place.area, place.banks
+    words, area, banks = place.words, place.area, _bank_words(place)
     least, limit, newest, count = place.least, place.limit, place.newest, len(place.banks)
     learned = 0 if bound_ns or not is_received else place.formula
     generation = UNKNOWN
@@ -331,17 +335,15 @@ def reader(
         if of is not None or words[2] != generation:
             return slow(of)
         number = words[newest]
-        bank = banks[number % count]
-        word = bank >> 3
-        size, error_ns = words[word + 3], 0
+        head, stamped, sized, begin = banks[number % count]
+        size, error_ns = words[sized], 0
         if size > limit:
             size, error_ns = size & LOW_HALF, (size >> 32) * NS_PER_US
             if size > limit or error_ns >= NO_ERROR_NS:
                 return slow(of)
-        stamp, total = words[word + 1], words[word + 2]
-        bank += 32
-        value: Any = area[bank : bank + size]
-        if words[word] != number or total or not number or size < least:
+        stamp = words[stamped]
+        value: Any = area[begin : begin + size]
+        if words[head] != number or not number or size < least:
             return slow(of)
         if unpack is not None:
             try:
