@@ -615,7 +615,7 @@ while hear() == 'tell':
                 other.tell("tell")
                 begun, age_ns = map(int, other.hear().split())
                 assert begun - skew_ns > stamp, "the clock inside is ahead by as much as was asked for"
-                assert 0 <= age_ns - (begun - skew_ns - stamp)
+                assert age_ns >= begun - skew_ns - stamp
                 put_at = int(other.hear()) - skew_ns
                 before = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
                 reading = theirs.wait(after=0)
