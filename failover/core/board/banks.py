@@ -258,8 +258,8 @@ def writer(
     limit, newest, wake, count = place.limit, place.newest, place.wake, len(place.banks)
     generation = UNKNOWN
     busy = False
-    for head, *_ in banks:
-        words[head + SUM_WORD] = 0  # here none is needed: once and for all
+    for head, *_ in banks if fence is None else ():
+        words[head + SUM_WORD] = 0  # none is needed: once and for all
 
     def put(value: Any, at: int | None = None) -> None:
         """Put a value; ``at``: nanoseconds of CLOCK_BOOTTIME at which it was produced, unless that is now."""
