@@ -21,7 +21,7 @@ LONG_COPY_NS: Final = 200_000_000
 """Where no budget is set: a freeze whose copying would take longer is given up for some more passes while the program runs."""
 LONG_CAPTURE_NS: Final = 8_000_000_000
 """Where no budget is set: after so long a capture makes no pass that does not catch up with the program, and takes the rest in
-one freeze, however long that is. Else an overloaded robot has no checkpoint of a program that writes 300 MB a second for minutes."""
+one freeze, however long that is. Else an overloaded robot has no checkpoint of a program that writes 300 MB/s for minutes."""
 
 
 class OverBudgetError(CaptureError):
