@@ -106,13 +106,19 @@ def _packed(seen: Sequence[int]) -> int:
     return packed
 
 
-def unpack_seen(words: Sequence[int], count: int) -> tuple[int, ...] | None:
-    """The inverse, for a roster of ``count``; None if the words are not of such a roster."""
-    if len(words) != -(-count // SEEN_PER_WORD) or any(not 0 <= one < 1 << 64 for one in words):
+def seen_of(words: Sequence[int], count: int) -> int | None:
+    """All words as one number, of which bits 2r and 2r + 1 are of rank r; None if they are not of a roster of ``count``."""
+    if len(words) != -(-count // SEEN_PER_WORD):
         return None
     together = 0
     for place, one in enumerate(words):
+        if not 0 <= one < 1 << 64:
+            return None
         together |= one << 64 * place
-    if together >> SEEN_BITS * count:
-        return None
-    return tuple(together >> SEEN_BITS * rank & SEEN_MASK for rank in range(count))
+    return None if together >> SEEN_BITS * count else together
+
+
+def unpack_seen(words: Sequence[int], count: int) -> tuple[int, ...] | None:
+    """The inverse of `pack_seen`, for a roster of ``count``; None if the words are not of such a roster."""
+    together = seen_of(words, count)
+    return None if together is None else tuple(together >> SEEN_BITS * rank & SEEN_MASK for rank in range(count))
