@@ -66,6 +66,7 @@ class Robot:
         self.pacer: Pacer | None = None
         self.slots: Slots | None = None
         self.stands_until_ns = 0
+        self.oversleeps_ns = 0
         self.is_deaf_meanwhile = False
         self.unread: list[tuple[SlotView, int]] = []
         self.wake = 0
@@ -188,6 +189,11 @@ class Team:
         if wake != robot.wake or robot.pacer is None:
             return
         if self.now_ns < robot.stands_until_ns:
+            self.agenda.at(robot.stands_until_ns, self._woken, whose)
+            return
+        if robot.oversleeps_ns:
+            span_ns, robot.oversleeps_ns = robot.oversleeps_ns, 0
+            self.stall(robot.rank, span_ns)
             self.agenda.at(robot.stands_until_ns, self._woken, whose)
             return
         now_ns = robot.clock_ns(self.now_ns)

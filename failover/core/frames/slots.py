@@ -39,6 +39,9 @@ HOLD_US_MAX = (1 << 32) - 1
 WHOLE_ROUND = 3 / 4
 """A round of less than this part of T_tup, cut short by a move of the slot or by own lateness, accuses nobody of silence."""
 
+WIDE = 2 / 3
+"""A gap of this part of the widest one is wide, too: jitter makes no choice."""
+
 ECHO_ROUNDS = 2
 """Rounds for which a frame is echoed."""
 
@@ -199,23 +202,20 @@ class Slots:
         """Where the first frame goes: into a team's largest gap; among robots that begin like us, by rank."""
         lowest = min((peer for peer in self.peers.values() if peer.heard), key=_rank)
         if lowest.set.bit_count() > 1:
-            first_ns = self._widest_gap(self._listened_ns)
+            first_ns = self._widest_gap(lowest)
         elif self.terms.spread:
             first_ns = lowest.left_ns + self._spread_ns(lowest.rank)
         else:
             return
         self._next_ns = self._listened_ns + (first_ns - self._listened_ns) % self._t_ns
 
-    def _widest_gap(self, at_ns: int) -> int:
-        """The middle of the widest gap between the sends that were heard in the last two rounds; of equal gaps one by rank."""
-        fresh_ns = at_ns - ECHO_ROUNDS * self._t_ns
-        phases = sorted(peer.left_ns % self._t_ns for peer in self.peers.values() if peer.heard and peer.left_ns > fresh_ns)
-        gaps = [
-            (after - before) % self._t_ns or self._t_ns for before, after in zip(phases, phases[1:] + phases[:1], strict=True)
-        ]
-        wide = [place for place, gap in enumerate(gaps) if gap + self.terms.delta_min_us * US >= max(gaps)]
+    def _widest_gap(self, first: Peer) -> int:
+        """The middle of a wide gap between the sends that were heard; which, is told by rank, as others may join with us."""
+        phases = sorted((peer.left_ns - first.left_ns) % self._t_ns for peer in self.peers.values() if peer.heard)
+        gaps = [after - before for before, after in zip(phases, [*phases[1:], self._t_ns], strict=True)]
+        wide = [place for place, gap in enumerate(gaps) if gap >= WIDE * max(gaps)]
         place = wide[self.me % len(wide)]
-        return phases[place] + gaps[place] // 2
+        return first.left_ns + phases[place] + gaps[place] // 2
 
     def _adapt(self, peer: Peer) -> None:
         """As the reference: the longest delay that is worth following makes this round longer."""
@@ -244,8 +244,8 @@ class Slots:
             self.set, self.set_round = lead.set, lead.set_round
         elif self._left_out < self.terms.remove_at_most:
             return  # it has not accepted us yet: we keep our phase, and move once only
-        if not self.set >> lead.rank & 1 or self._sent_ns is None:
-            return
+        if not self.set >> lead.rank & 1 or self._sent_ns is None or lead.came_ns >= self._next_ns:
+            return  # the last: our frame is due already, and leaves now
         target_ns = lead.left_ns + self._apart(self.me, lead.rank) * self._slot_ns()
         if target_ns - self._sent_ns < self._t_ns // 2:  # we have spoken in this round
             target_ns += self._t_ns
@@ -343,6 +343,7 @@ class Slots:
             self._use(self._own_view())
         elif self._is_in(self.peers[self._lead]):
             self._left_out = 0
+            self.set, self.set_round = self.peers[self._lead].set, self.peers[self._lead].set_round
         else:
             self._left_out += 1
             if self._left_out >= self.terms.remove_at_most:
