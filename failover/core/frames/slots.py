@@ -8,7 +8,7 @@ reference makes its round longer by as much: the team gives way to periodic traf
 What a robot sees of each other one, at the end of each own round (`TABLE`; a frame of a higher boot: `Slots._reborn`):
 
     NOT    -- heard -->                                            INSERT
-    INSERT -- not heard -->                                        NOT
+    INSERT -- not heard in two rounds -->                          NOT
     INSERT -- every running peer that it hears sees it -->         RUN
     INSERT -- heard for remove_at_most rounds without that -->     RUN
     RUN    -- not heard in this round -->                          REMOVE
@@ -89,9 +89,14 @@ def _is_missed(_terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
     return not peer.heard
 
 
+def _is_missed_twice(_terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
+    """A newcomer speaks in a gap: one frame that the medium delays beyond the end of our round is not missing yet."""
+    return peer.missed > 1
+
+
 def _is_agreed(_terms: Terms, peer: Peer, running: tuple[Peer, ...]) -> bool:
-    """Every running peer that it hears sees it, too; whom it does not hear is not asked."""
-    return all(one.sees(peer.rank) in _THERE for one in running if peer.sees(one.rank) != Seen.NOT)
+    """Heard, and every running peer that it hears sees it, too; whom it does not hear is not asked."""
+    return peer.heard and all(one.sees(peer.rank) in _THERE for one in running if peer.sees(one.rank) != Seen.NOT)
 
 
 def _waited_enough(terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
@@ -110,7 +115,7 @@ Condition = Callable[[Terms, Peer, tuple[Peer, ...]], bool]
 
 TABLE: dict[Seen, tuple[tuple[Condition, Seen], ...]] = {
     Seen.NOT: ((_is_heard, Seen.INSERT),),
-    Seen.INSERT: ((_is_missed, Seen.NOT), (_is_agreed, Seen.RUN), (_waited_enough, Seen.RUN)),
+    Seen.INSERT: ((_is_missed_twice, Seen.NOT), (_is_agreed, Seen.RUN), (_waited_enough, Seen.RUN)),
     Seen.RUN: ((_is_missed, Seen.REMOVE),),
     Seen.REMOVE: ((_is_heard, Seen.RUN), (_is_missed_by_all, Seen.NOT), (_is_missed_for_long, Seen.NOT)),
 }
