@@ -96,7 +96,7 @@ def _is_missed_twice(_terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> b
 
 def _is_agreed(_terms: Terms, peer: Peer, running: tuple[Peer, ...]) -> bool:
     """Heard, and every running peer that it hears sees it, too; whom it does not hear is not asked."""
-    return peer.heard and all(one.sees(peer.rank) in _THERE for one in running if peer.sees(one.rank) != Seen.NOT)
+    return peer.heard and all(one.sees(peer.rank) != Seen.NOT for one in running if peer.sees(one.rank) != Seen.NOT)
 
 
 def _waited_enough(terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
@@ -121,7 +121,6 @@ TABLE: dict[Seen, tuple[tuple[Condition, Seen], ...]] = {
 }
 """Every arrow; the first whose condition holds is taken."""
 
-_THERE = frozenset({Seen.INSERT, Seen.RUN})
 _AWAY = frozenset({Seen.REMOVE, Seen.NOT})
 _COUNTED = frozenset({Seen.RUN, Seen.REMOVE})
 
@@ -337,9 +336,11 @@ class Slots:
 
     def _vouched(self) -> list[int]:
         """Ranks that we hear no longer, but a running peer does: they send, so a slot is theirs."""
-        running = [peer for peer in self.peers.values() if peer.seen is Seen.RUN]
         lost = [rank for rank, peer in self.peers.items() if peer.seen is Seen.NOT or peer.missed >= self.terms.remove_after]
-        return [rank for rank in lost if any(peer.sees(rank) == Seen.RUN for peer in running)]
+        return [rank for rank in lost if self._is_run_by_one(rank)]
+
+    def _is_run_by_one(self, rank: int) -> bool:
+        return any(peer.seen is Seen.RUN and peer.sees(rank) == Seen.RUN for peer in self.peers.values())
 
     def _choose_set(self) -> None:
         """The reference makes the set; a follower takes it from the reference's frames, and makes its own only when left out."""
@@ -355,8 +356,9 @@ class Slots:
                 self._use(self._own_view())
 
     def _own_view(self) -> int:
-        counted = [rank for rank, peer in self.peers.items() if peer.seen in _COUNTED]
-        return word([*([self.me] if self.terms.transmit else []), *counted, *self._vouched()])
+        """Who has a slot, as far as we know: ourselves, whom we run, and whom a running peer runs."""
+        members = [rank for rank, peer in self.peers.items() if peer.seen in _COUNTED or self._is_run_by_one(rank)]
+        return word([self.me, *members] if self.terms.transmit else members)
 
     def _use(self, members: int) -> None:
         if members != self.set:
