@@ -3,9 +3,10 @@
 A robot's frame goes to the access point as unicast: acknowledged, sent again up to 7 times. The access point sends it on to all
 robots as multicast at 1 Mbit/s: no acknowledgement, so a collision there loses it. Alien stations add echo requests and replies.
 
-The distributed coordination function: a station with something to send waits until the medium was idle for DIFS, then for a random
-number of idle slots, which stops counting while the medium is busy. Equal counts collide; a unicast sender then doubles its window.
-Not modelled: capture, fading, hidden stations on the air, rate adaptation, RTS/CTS, post-backoff (each frame draws its own count).
+The distributed coordination function: a station with something to send waits until the medium was idle for DIFS, then for a
+random number of idle slots; the count stops while the medium is busy. Equal counts collide; a unicast sender then doubles its
+window. Not modelled: capture, fading, stations that do not hear each other, rate adaptation, RTS/CTS, post-backoff (each frame
+draws its own count).
 
 Source: IEEE 802.11-2007, clause 9.2 (DCF) and 15.3.3 (802.11b: slot 20 µs, SIFS 10, long preamble 192).
 """

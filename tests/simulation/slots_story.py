@@ -1,11 +1,11 @@
 """Scenarios of the slots that a person can read, played by the agent's own `Slots` on the radio of `radio.py`.
 
-A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment; robots are named by their numbers, ``all`` means all of the team.
+A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment; robots are named by their numbers, ``all`` are all of the team.
 
     team 8                     robots in the team file; before everything else
     terms spread=false         other terms than the usual ones
     0     on all               these robots start;  off 3: their power is cut (a later on is a new life)
-    0     clocks 100           every clock is wrong by up to so many ppm; before robots start (it is ± 50, and years apart, anyway)
+    0     clocks 100           every clock is wrong by up to so many ppm; before robots start (± 50, and years apart, anyway)
     0     listens 3            from its next start it only listens;  round 3 60: from its next start its t_tup_ms is 60
     500   one-way 1 2          what 1 sends does not reach 2;  cut 1 2: both ways;  mend: all of that ends
     500   apart 1 2 / 3 4      these groups do not hear each other
@@ -33,6 +33,7 @@ Every robot keeps the invariants all the time: never two frames within half a sl
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import msgspec
@@ -204,7 +205,7 @@ class SlotsStory:
         match verb:
             case "gaps":
                 sends = team.sends(self.mark_ns)
-                gaps = [(after[0] - before[0], before, after) for before, after in zip(sends, sends[1:], strict=False)]
+                gaps = [(after[0] - before[0], before, after) for before, after in itertools.pairwise(sends)]
                 least = min((gap for gap in gaps if gap[1][1] != gap[2][1]), default=(0, (0, 0), (0, 0)))
                 told = f"{least[0] / MS:.2f} ms between {least[1][1] + 1} and {least[2][1] + 1} at {least[1][0] / MS:.1f} ms"
                 self._expect(f"gaps of {arguments[0]} ms", least[0] >= at_least * MS, told)
@@ -213,7 +214,7 @@ class SlotsStory:
                 self._expect(f"{arguments[0]} has sent {arguments[1:]} frames", at_least <= sent <= at_most, sent)
             case "pauses":
                 sends = [at for at in team.robots[int(arguments[0]) - 1].sends if at >= self.mark_ns]
-                pauses = [(after - before) / MS for before, after in zip(sends, sends[1:], strict=False)]
+                pauses = [(after - before) / MS for before, after in itertools.pairwise(sends)]
                 is_so = bool(pauses) and at_least <= min(pauses) and max(pauses) <= at_most
                 self._expect(f"{arguments[0]} pauses for {arguments[1:]} ms", is_so, pauses)
             case "late":
