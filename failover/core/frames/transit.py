@@ -26,6 +26,7 @@ class Transit:
         self._first_ns = first_us * 1_000
         self._left: OrderedDict[int, int] = OrderedDict()
         self._trips: dict[int, deque[int]] = {}
+        self._least: dict[int, int] = {}
 
     def left(self, counter: int, now_ns: int) -> None:
         """Our frame of this number left."""
@@ -38,18 +39,20 @@ class Transit:
         left_ns = self._left.get(counter)
         trip_ns = came_ns - left_ns - hold_us * 1_000 if left_ns is not None else -1
         if 0 <= trip_ns <= TRIP_NS_MAX:
-            self._trips.setdefault(rank, deque(maxlen=TRIPS_MAX)).append(trip_ns)
+            trips = self._trips.setdefault(rank, deque(maxlen=TRIPS_MAX))
+            trips.append(trip_ns)
+            self._least[rank] = min(trips)
 
     def most_ns(self, rank: int) -> int | None:
         """The most that a frame of this peer can have travelled at its fastest; None before the first echo."""
-        trips = self._trips.get(rank)
-        return min(trips) if trips else None
+        return self._least.get(rank)
 
     def likely_ns(self, rank: int) -> int:
         """What is subtracted from an arrival to tell when the frame left."""
-        trips = self._trips.get(rank)
-        return min(trips) // 2 if trips else self._first_ns
+        least_ns = self._least.get(rank)
+        return self._first_ns if least_ns is None else least_ns // 2
 
     def forget(self, rank: int) -> None:
         """A peer began a new life: it may be another machine at another place."""
         self._trips.pop(rank, None)
+        self._least.pop(rank, None)
