@@ -120,6 +120,7 @@ def play(way: str, noise_ms: int, seed: int, span_s: int) -> Run:
     team.noise(noise_ms * MS)
     team.run(span_s * 1_000 * MS)
     delays_ms = sorted(delay / MS for delay in team.delays_ns)
+    p50_ms, p90_ms, p99_ms = (round(percentile(delays_ms, share), 2) for share in (0.5, 0.9, 0.99))
     return Run(
         way,
         noise_ms,
@@ -127,7 +128,9 @@ def play(way: str, noise_ms: int, seed: int, span_s: int) -> Run:
         span_s,
         sum(len(robot.sends) for robot in team.robots),
         team.lost,
-        *(round(percentile(delays_ms, share), 2) for share in (0.5, 0.9, 0.99)),
+        p50_ms,
+        p90_ms,
+        p99_ms,
         round(delays_ms[-1], 1),
         dict(Counter(int(delay / BIN_MS) for delay in delays_ms)),
         round(time.process_time() - began_s, 1),
