@@ -166,6 +166,16 @@ def test_a_follower_that_has_spoken_already_speaks_a_round_later() -> None:
     assert bench.slots.next_ns() == phase_ns + 2 * T_NS + 11 * MS + T_NS // 4
 
 
+def test_on_a_medium_slower_than_a_round_nobody_sends_twice_in_one() -> None:
+    bench = Bench(1, {0, 1, 2, 3})
+    phase_ns = bench.settled(rounds=12)
+    echo = ((1, bench.counter - 9, 0),)
+    bench.hears(0, phase_ns + T_NS, echo=echo)
+    assert bench.slots.view().peers[0].transit_us > 200_000
+    bench.hears(0, phase_ns + T_NS + 3 * MS, echo=echo)
+    assert bench.slots.next_ns() - bench.sends[-1] >= T_NS // 2
+
+
 def test_all_change_the_count_at_one_frame_of_the_reference() -> None:
     bench = Bench(3, {0, 1, 2, 3})
     phase_ns = bench.settled()
@@ -250,6 +260,7 @@ ARRIVALS = st.lists(
         st.integers(0, (1 << 12) - 1),  # views
         st.sampled_from([50_000] * 8 + [60_000]),
         st.integers(0, 100_000),  # hold
+        st.integers(0, 9),  # frames of ours since the one that is echoed
     ),
     max_size=120,
 )
@@ -261,7 +272,7 @@ def test_whatever_comes_no_robot_sends_twice_in_half_a_slot_or_pauses_for_more_t
 ) -> None:
     slots, now_ns, wakes, counter = Slots(me, TEAM, Terms(spread=spread), START_NS), START_NS, 0, 0
     sent_ns: int | None = None
-    for pause_us, rank, boot, members, views, t_tup_us, hold_us in [*arrivals, (200_000, 6, 1, 0, 0, 0, 0)]:
+    for pause_us, rank, boot, members, views, t_tup_us, hold_us, back in [*arrivals, (200_000, 6, 1, 0, 0, 0, 0, 0)]:
         now_ns += pause_us * 1_000
         while slots.next_ns() <= now_ns:
             wakes += 1
@@ -275,6 +286,6 @@ def test_whatever_comes_no_robot_sends_twice_in_half_a_slot_or_pauses_for_more_t
                 slots.sent(at_ns, counter)
             sent_ns = at_ns if slots.own is Own.RUNNING else None  # another round is used there: it keeps silent
             assert slots.next_ns() > at_ns
-        echo = ((me, counter, hold_us),)
+        echo = ((me, counter - back, hold_us),)
         slots.heard(SlotView(rank, boot, counter, Said(t_tup_us, members | 1 << rank, 1, (views,), echo)), now_ns)
         assert slots.view().count >= 1
