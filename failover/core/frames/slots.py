@@ -408,14 +408,12 @@ class Slots:
 
     def _peer_slot(self, peer: Peer) -> PeerSlot:
         rank = peer.rank
-        most_ns = self.transit.most_ns(rank)
         return PeerSlot(
             self.roster.names[rank],
             peer.seen,
             peer.missed,
             peer.delay_ns // US,
             self.transit.likely_ns(rank) // US,
-            None if most_ns is None else most_ns // US,
         )
 
     def _least_gap_ns(self) -> int:

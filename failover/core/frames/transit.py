@@ -1,8 +1,8 @@
-"""How long a frame travels, without comparing two clocks: the least round trip of the last 64, half of it each way.
+"""How long a frame travels, for the slots, without comparing two clocks: half of the least round trip of the last 64.
 
 A frame echoes the counter of each sender heard lately, and for how long it held it. Round trip = (echo came − that frame left) −
-hold; each difference is of one robot's own clock. The true one-way delay lies between 0 and the round trip, so a value's age has
-an upper bound though no two clocks agree.
+hold; each difference is of one robot's own clock. It tells when a frame is likely to have left. It bounds no age: a frame may
+have waited in a queue for much longer than the fastest of 64.
 """
 
 from __future__ import annotations
@@ -42,10 +42,6 @@ class Transit:
             trips = self._trips.setdefault(rank, deque(maxlen=TRIPS_MAX))
             trips.append(trip_ns)
             self._least[rank] = min(trips)
-
-    def most_ns(self, rank: int) -> int | None:
-        """The most that a frame of this peer can have travelled at its fastest; None before the first echo."""
-        return self._least.get(rank)
 
     def likely_ns(self, rank: int) -> int:
         """What is subtracted from an arrival to tell when the frame left."""
