@@ -14,6 +14,8 @@ from tests.simulation.slots_mutants import no_adaptation
 
 SPAN_S = 120
 
+pytestmark = pytest.mark.timeout(600)  # of a machine that is busy; alone they take seconds
+
 
 def run(way: str, noise_ms: int, p50_ms: float, p99_ms: float) -> Run:
     return Run(way, noise_ms, 1, 540, 43_200, 43, p50_ms, p50_ms, p99_ms, p99_ms, {int(p50_ms / fig6.BIN_MS): 43_157}, 1.0)
@@ -61,9 +63,8 @@ def test_a_record_comes_back_and_is_drawn(tmp_path: Path) -> None:
     write(tmp_path / "record.json", GOOD)
     assert read(tmp_path / "record.json") == GOOD
     assert read(tmp_path / "none.json") == []
-    for name in ("one.svg", "other.svg"):
-        draw(GOOD, tmp_path / "plots" / name)
-    picture = (tmp_path / "plots" / "one.svg").read_text()
+    draw(GOOD, tmp_path / "plots" / "radio.svg")
+    picture = (tmp_path / "plots" / "radio.svg").read_text()
     assert all(word in picture for word in (RA_TDMA, "quiet", "echo each 5 ms"))
 
 
