@@ -80,7 +80,7 @@ typedef struct fb_item fb_item;
 #define FB_OWN ((const char *)NULL)
 
 enum { FB_BYTES = 0, FB_STRUCT = 1, FB_MSGPACK = 2, FB_JSON = 3 }; /* kinds of values */
-enum { FB_URGENT = 1, FB_NOT_SENT = 2, FB_KEPT = 4 };              /* flags of an item */
+enum { FB_URGENT = 1, FB_NOT_SENT = 2, FB_KEPT = 4, FB_FINITE = 16 }; /* flags of an item */
 
 /* What a get finds besides the value. Ages are in nanoseconds since the value was produced. */
 typedef struct fb_reading {
@@ -94,14 +94,14 @@ typedef struct fb_reading {
 /* An item to add. All that is 0 has its default. */
 typedef struct fb_declaration {
     const char *name; /* 1 to 63 bytes of UTF-8 */
-    uint32_t size;    /* most bytes of a value: 1 to 65536 */
+    uint32_t size;    /* most bytes of a value: 1 to 4096; of a private item up to 65536 */
     uint32_t kind;    /* FB_BYTES … */
     uint32_t banks;   /* 2 to 8; 0: 2. More, where large values are put very often */
     uint32_t period, phase; /* in rounds of the radio; period 0: 1 */
     uint32_t flags;         /* FB_URGENT … */
     bool is_private;        /* other robots do not get it */
     int64_t bound_ns;       /* past it a reading is stale; 0: by the formula */
-    const char *type;       /* text of the type, as `failover board header` tells it; NULL: none */
+    const char *type;       /* of an FB_STRUCT: its text, "{x:f4,y:f4,seen:u4}" (BOARD.md); NULL for the other kinds */
 } fb_declaration;
 
 /* Open this robot's board. `directory`: where it is; NULL: $FAILOVER_BOARD, else the agent's, else one that programs of this user share
@@ -158,6 +158,7 @@ enum {
     FB_ADDED_ = 8,
     FB_ITEMS_MAX_ = 1024,
     FB_SIZE_MAX_ = 65536,
+    FB_SHARED_SIZE_MAX_ = 4096, /* of what travels to other robots */
     FB_FILE_SIZE_MAX_ = 16 << 20,
     FB_USERS_MAX_ = 256,
     FB_BANKS_MAX_ = 8,
@@ -973,7 +974,7 @@ static inline int fb_enter_(fb_board *board, bool is_named)
     }
     if (outcome == 0) {
         board->own = fb_mapped_(board, "own", file);
-        outcome = board->own == NULL ? (errno == ESTALE ? 1 : -errno) : fb_be_user_(board);
+        outcome = board->own == NULL ? -errno : fb_be_user_(board);
     }
     if (board->own == NULL)
         close(file);
@@ -1095,7 +1096,7 @@ static inline int fb_append_(fb_area_ *area, const fb_record_ *wanted, const cha
 
 static inline int fb_add_again_(fb_board *board, const fb_declaration *wanted)
 {
-    const char *text = wanted->type == NULL ? "" : wanted->type;
+    const char *text = wanted->type;
     fb_area_ *target = board->own;
     fb_record_ record, found;
     int outcome;
@@ -1106,9 +1107,9 @@ static inline int fb_add_again_(fb_board *board, const fb_declaration *wanted)
     record.stride = (uint32_t)fb_aligned_((uint64_t)FB_BANK_HEAD_ + wanted->size);
     record.period = wanted->period == 0 ? 1 : wanted->period;
     record.phase = wanted->phase;
-    record.digest = wanted->type == NULL ? 0 : fb_digest_(text, strlen(text));
+    record.digest = fb_digest_(text, strlen(text));
     record.bound = (uint64_t)wanted->bound_ns;
-    record.flags = (wanted->flags & (FB_URGENT | FB_NOT_SENT | FB_KEPT)) | FB_ADDED_;
+    record.flags = (wanted->flags & (FB_URGENT | FB_NOT_SENT | FB_KEPT | FB_FINITE)) | FB_ADDED_;
     for (fb_area_ *area = board->areas; wanted->is_private && area != NULL; area = area->next)
         target = (area->flags & FB_PRIVATE_) != 0 ? area : target;
     if (wanted->is_private && (target->flags & FB_PRIVATE_) == 0)
@@ -1134,24 +1135,35 @@ static inline int fb_add_again_(fb_board *board, const fb_declaration *wanted)
 
 static inline int fb_add(fb_board *board, const fb_declaration *wanted)
 {
-    const char *name = wanted->name == NULL ? "" : wanted->name;
-    const size_t text_size = wanted->type == NULL ? 0 : strlen(wanted->type);
+    static const char *const kinds[] = {"bytes", "struct", "msgpack", "json"};
+    const char *name = wanted->name == NULL ? "" : wanted->name, *type = wanted->type;
+    char opaque[32];
+    size_t text_size;
     fb_added_ *added;
     int outcome;
+    if (wanted->kind > FB_JSON || (wanted->kind == FB_STRUCT) != (type != NULL))
+        return fb_fail_(EINVAL, "cannot add item %.80s: a struct has a type in words, other kinds have none", name);
+    if (type == NULL) {
+        snprintf(opaque, sizeof opaque, "%s[%u]", kinds[wanted->kind], wanted->size);
+        type = opaque;
+    }
+    text_size = strlen(type);
     if (*name == '\0' || strlen(name) > FB_NAME_MAX_ || text_size > FB_TEXT_MAX_)
         return fb_fail_(EINVAL, "cannot add item %.80s: a name has 1 to %d bytes and a type at most %d", name, FB_NAME_MAX_, FB_TEXT_MAX_);
-    if (wanted->size < 1 || wanted->size > FB_SIZE_MAX_ || wanted->kind > FB_JSON || (wanted->banks != 0 && wanted->banks < 2) ||
+    if (wanted->size < 1 || wanted->size > FB_SIZE_MAX_ || (wanted->banks != 0 && wanted->banks < 2) ||
         wanted->banks > FB_BANKS_MAX_ || wanted->phase >= (wanted->period == 0 ? 1 : wanted->period) || wanted->bound_ns < 0)
         return fb_fail_(EINVAL, "cannot add item %s: 1 to %d bytes, 2 to %d banks, a phase below the period, a bound from 0 are possible", name,
                         FB_SIZE_MAX_, FB_BANKS_MAX_);
+    if (!wanted->is_private && wanted->size > FB_SHARED_SIZE_MAX_)
+        return fb_fail_(EINVAL, "cannot add item %s: a shared item holds at most %d bytes; make it private, or split it", name,
+                        FB_SHARED_SIZE_MAX_);
     added = (fb_added_ *)calloc(1, sizeof *added + text_size + 1);
     if (added == NULL)
         return fb_fail_(ENOMEM, "cannot add item %s: no memory", name);
     added->wanted = *wanted;
     memcpy(added->name, name, strlen(name));
     added->wanted.name = added->name;
-    if (wanted->type != NULL)
-        added->wanted.type = (const char *)memcpy((char *)(added + 1), wanted->type, text_size + 1);
+    added->wanted.type = (const char *)memcpy((char *)(added + 1), type, text_size + 1);
     pthread_mutex_lock(&board->guard);
     outcome = -ESTALE;
     for (int turn = 0; outcome == -ESTALE && turn < FB_TURNS_; turn++) {

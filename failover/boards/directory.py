@@ -175,7 +175,7 @@ def _made(directory: Path, name: str) -> tuple[MappedFile, int] | None:
 def _examine(directory: Path) -> None:
     """Refuse a directory below /dev/shm that another user has put there."""
     found = directory.lstat()
-    if VARIABLE in os.environ or found.st_uid in (0, os.geteuid()) and stat.S_ISDIR(found.st_mode):
+    if VARIABLE in os.environ or (found.st_uid in (0, os.geteuid()) and stat.S_ISDIR(found.st_mode)):
         return
     raise BoardError(
         f"cannot make the board {directory}: it belongs to uid {found.st_uid}; remove it, or name another place in {VARIABLE}"

@@ -27,7 +27,15 @@ from failover.core.board.banks import writer as writer_of
 from failover.core.board.item_types import OPAQUE, Opaque, canonical, parse
 from failover.core.board.item_values import Values, values_of
 from failover.core.board.layout import Record
-from failover.errors import BoardError, BoardGoneError, ItemError, NeverWrittenError, OvertakenError, ValueMisfitError, WriterTakenError
+from failover.errors import (
+    BoardError,
+    BoardGoneError,
+    ItemError,
+    NeverWrittenError,
+    OvertakenError,
+    ValueMisfitError,
+    WriterTakenError,
+)
 from failover.fencing.epoch import epoch
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ import xxhash
 from failover.boards import boottime, directory
 from failover.boards.board import Board, board
 from failover.core.board import layout
+from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import RUN, Wanted
 from failover.errors import WriterTakenError
 from tests.include.board_programs import Tool, place_for_board, tool
@@ -222,8 +223,8 @@ def test_c_goes_on_while_others_add_and_remove_items(place: Path) -> None:
         for index in range(40):
             c.ok("put", "ball", f"v{index}")
             with tool(place) as other:
-                other.ok("add", f"more{index}", 5000)
-            c.ok("find", f"more{index}", 5000) if index < 10 else None
+                other.ok("add", f"more{index}", 4000)
+            c.ok("find", f"more{index}", 4000) if index < 10 else None
             assert c.say("get", "ball", "-").startswith(f"v{index} ")
         python.remove("ball")
         assert "has no item ball" in c.say("get", "ball", "-")
@@ -260,19 +261,31 @@ def test_a_change_of_the_table_whose_process_was_killed_hinders_no_one(place: Pa
 
 
 def test_an_item_of_another_type_is_refused_with_both(place: Path) -> None:
-    with board(place), tool(place) as c:
-        text = "{x=f4,y=f4}"
+    with board(place) as python, tool(place) as c:
+        text = "{x:f4,y:f4}"
         c.ok("add", "pose", 8, "own", text)
         c.ok("find", "pose", 8, f"{xxhash.xxh3_64_intdigest(text.encode()):016x}")
+        c.ok("add", "raw", 16)
+        assert python.item("raw", bytes).name == python.add(Declaration("raw", size=16)).name, "both declare it alike"
         assert "has another type" in c.say("find", "pose", 8, f"{1:016x}")
         assert "has values of 8 bytes; this program means 9" in c.say("find", "pose", 9)
         assert "a value of 3 bytes; the item holds 8" in c.say("put", "pose", "abc")
-        assert "declared otherwise already" in c.say("add", "pose", 8, "own", "{x=f4,z=f4}")
+        python.add(Declaration("twist", {"x": "f4", "y": "f4"}))
+        python.item("twist").put({"x": 1.5, "y": 2.5})
+        c.ok("find", "twist", 8, f"{xxhash.xxh3_64_intdigest(text.encode()):016x}")
+        assert " number 1 " in c.say("get", "twist", "-")
+        assert "declared otherwise already" in c.say("add", "pose", 8, "own", "{x:f4,z:f4}")
 
 
 def test_bad_arguments_are_refused_in_a_sentence(place: Path) -> None:
     with tool(place) as c:
-        for words in (("find", "x" * 64, 3), ("add", "x" * 64, 3), ("add", "none", 0), ("add", "large", 65537)):
+        for words in (
+            ("find", "x" * 64, 3),
+            ("add", "x" * 64, 3),
+            ("add", "none", 0),
+            ("add", "large", 65537, "private"),
+            ("add", "shared", 4097),
+        ):
             assert "cannot" in c.say(*words)
         c.ok("close")
         assert "cannot make the board" in c.say("open", "/proc/no/such")
