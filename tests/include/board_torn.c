@@ -52,6 +52,7 @@ int main(int count, char **arguments)
         if (is_both && fb_put(item, &value) == 0)
             number++;
         int outcome = fb_get_reading(item, FB_OWN, &value, &reading);
+        turn += outcome == -ENODATA; /* its writer is about to start */
         overtaken += outcome == -EAGAIN;
         if (outcome != 0)
             continue;

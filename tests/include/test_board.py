@@ -16,6 +16,7 @@ import xxhash
 from failover.boards import boottime, directory
 from failover.boards.board import Board, board
 from failover.core.board import layout
+from failover.core.board.banks import put_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import RUN, Wanted
 from failover.errors import WriterTakenError
@@ -134,8 +135,6 @@ def with_peer(python: Board, place: Path, robot: str, rank: int) -> None:
         file.add(Wanted(0, "ball", 379, bound_ns=NS_PER_MS))
     record = file.record("ball")
     assert record is not None
-    from failover.core.board.banks import put_carefully
-
     put_carefully(file.place(record), 7, b"theirs", boottime.now_ns(0) - 2 * NS_PER_MS, error_us=250)
     file.close()
 
