@@ -63,6 +63,8 @@ class OvertakenError(BoardError):
 
 class WriterTakenError(BoardError):
     """Another process writes this item; the message names its pid."""
+
+
 class ItemError(FailoverError):
     """An item of the board is declared in a way that cannot work; nothing was changed.
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -124,7 +125,7 @@ class Board:
     def __init__(self, place: Path | None, name: str) -> None:
         self._place = place
         self._name = name
-        self.guard = threading.RLock()
+        self.guard: AbstractContextManager[Any] = threading.RLock()
         self.skew_ns = 0
         self._is_closed = False
         self._items: weakref.WeakSet[Item] = weakref.WeakSet()
@@ -154,8 +155,8 @@ class Board:
         """A handle of an item.
 
         Args:
-            type: what the program puts and gets: ``bytes``, "msgpack", "json", a dataclass, a `msgspec.Struct`, a numpy dtype; None:
-                dictionaries and numbers, as the item is declared.
+            type: what the program puts and gets: ``bytes``, "msgpack", "json", a dataclass, a `msgspec.Struct`, a numpy dtype;
+                None: dictionaries and numbers, as the item is declared.
 
         Raises:
             BoardError: it is not declared; names the nearest.
@@ -191,8 +192,8 @@ class Board:
                     file.add(wanted)
                 elif there[0] is not file or not _is_alike(there[1], wanted):
                     raise BoardError(
-                        f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, period "
-                        f"{there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
+                        f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, "
+                        f"period {there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
                     )
             return self.item(declaration.name)
 
@@ -323,7 +324,7 @@ class Board:
         pid = file.word32(record.at + layout.PID_FIELD)
         name = next((f" ({name})" for user, _, name in self.users() if user == pid and name), "")
         same = " in another opening of the board" if pid == os.getpid() else ""
-        return f"item {record.name!r} is written by pid {pid}{name}{same}; one process writes an item: end that one, or put another item"
+        return f"item {record.name!r} is written by pid {pid}{name}{same}; one process writes an item: end that one first"
 
     def ensured(self) -> _Opened:
         """The open board; opened anew if it was made anew, or this is a forked child.

@@ -16,7 +16,8 @@ from failover.boards import boottime, locks
 from failover.boards.mapping import GENERATION, MappedFile
 from failover.client.control import socket_path
 from failover.core.board import layout
-from failover.core.board.layout import ALONE, GONE, ITEMS_MAX, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
+from failover.core.board.items import ITEMS_MAX
+from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
 from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError
 
@@ -53,8 +54,16 @@ def this_robot() -> str:
 
 
 def make_file(
-    path: Path, flags: int, robot: str, *, capacity: int = ITEMS_MAX, rank: int = 0, state: int = layout.RUN, roster_digest: int = 0,
-    mode: int = 0o600, hold: bool = False,
+    path: Path,
+    flags: int,
+    robot: str,
+    *,
+    capacity: int = ITEMS_MAX,
+    rank: int = 0,
+    state: int = layout.RUN,
+    roster_digest: int = 0,
+    mode: int = 0o600,
+    hold: bool = False,
 ) -> int:
     """Make one file of a board, without items, whole at its place.
 
@@ -143,8 +152,9 @@ def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
                 _remove(directory, descriptor)
                 return None
             file = MappedFile.open(path, descriptor, writable=True)
+            index = file.enter(os.getpid(), os.geteuid(), name)
             keep = True
-            return file, file.enter(os.getpid(), os.geteuid(), name)
+            return file, index
     finally:
         if not keep:
             os.close(descriptor)
@@ -154,15 +164,12 @@ def _made(directory: Path, name: str) -> tuple[MappedFile, int] | None:
     """Make the board; None if another one was quicker."""
     robot = this_robot()
     try:
-        with contextlib.suppress(FileExistsError):
-            directory.mkdir(mode=0o700)
+        _make_directory(directory)
         _examine(directory)
         with contextlib.suppress(FileExistsError):
             make_file(directory / PRIVATE_NAME, PRIVATE + ALONE, robot)
         descriptor = make_file(directory / OWN_NAME, OWN + ALONE, robot, hold=True)
     except (FileExistsError, FileNotFoundError):
-        if not directory.parent.is_dir():
-            raise BoardError(f"cannot make the board {directory}: there is no {directory.parent}") from None
         return None
     except OSError as error:
         raise BoardError(f"cannot make the board {directory}: {error.strerror}; {VARIABLE} names another place") from error
@@ -170,6 +177,15 @@ def _made(directory: Path, name: str) -> tuple[MappedFile, int] | None:
     index = file.enter(os.getpid(), os.geteuid(), name)  # its own lock does not stand in the way: 0
     locks.give(descriptor, TABLE_LOCK)
     return file, index
+
+
+def _make_directory(directory: Path) -> None:
+    try:
+        directory.mkdir(mode=0o700)
+    except FileExistsError:
+        pass
+    except FileNotFoundError:
+        raise BoardError(f"cannot make the board {directory}: no directory can be made in {directory.parent}") from None
 
 
 def _examine(directory: Path) -> None:

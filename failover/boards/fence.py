@@ -1,7 +1,7 @@
 """What orders loads and stores for other processors, on those that reorder; None on the others.
 
-CPython has no fence. A release of a lock is a store that no earlier load or store passes, taking it again a load that no later one
-passes, and the two are ordered because they are of one lock. So nothing passes both.
+CPython has no fence. To release a lock is a store that no earlier load or store passes, to take it again a load that no later one
+passes; and the two are ordered, because they are of one lock. So nothing passes both.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class _Timespec(ctypes.Structure):
 class _Buffer(ctypes.Structure):
     """Py_buffer, as far as it is read here; the rest is room."""
 
-    _fields_ = (("address", ctypes.c_void_p), ("object", ctypes.py_object), ("size", ctypes.c_ssize_t), ("rest", ctypes.c_byte * 128))
+    _fields_ = (("address", ctypes.c_void_p), ("object", ctypes.py_object), ("rest", ctypes.c_byte * 128))
 
 
 def address_of(mapping: Any) -> int:

@@ -1,7 +1,7 @@
 """An item of a board in a program's hands: put, get, wait.
 
-`put` and `get` are closures of `failover.core.board.banks`, made for the place where the item lies. They go the slow way, which is
-written here, whenever something is not as it was: the table changed, the board was made anew, a robot was named, a process was
+`put` and `get` are closures of `failover.core.board.banks`, made for the place where the item lies. They go the slow way, which
+is written here, whenever something is not as it was: the table changed, the board was made anew, a robot was named, a process was
 forked. So this file may take its time, and the closures need none.
 """
 
@@ -12,10 +12,12 @@ import os
 import sys
 import time
 import weakref
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from types import FrameType
+from typing import Any, Final, Protocol
 
 from failover.boards import boottime, futex
 from failover.boards.fence import FENCE
@@ -38,15 +40,29 @@ from failover.errors import (
 )
 from failover.fencing.epoch import epoch
 
-if TYPE_CHECKING:
-    from failover.boards.board import Board
-
 SLICE_S: Final = 0.1
 """The longest sleep without a look: a wake-up may be lost (BOARD.md), and a board may be made anew."""
 TURNS: Final = 100
 """Of a call whose board is made anew each time it looks."""
 PUT_WAIT_S: Final = 5.0
 """For another thread's put of the same item, which takes a microsecond of its processor's time."""
+
+
+class OpenBoard(Protocol):
+    """What an item asks its board (`failover.boards.board.Board`)."""
+
+    guard: AbstractContextManager[Any]
+    skew_ns: int
+
+    @property
+    def robot(self) -> str: ...
+    def found(self, name: str, robot: str) -> tuple[MappedFile, Record]: ...
+    def has(self, name: str, robot: str) -> bool: ...
+    def is_good(self, source: Source) -> bool: ...
+    def living(self) -> list[str]: ...
+    def own_source(self, name: str) -> Source: ...
+    def whose(self, file: MappedFile, record: Record) -> str: ...
+    def writer(self, name: str) -> ItemWriter: ...
 
 
 def values_for(record: Record, shape: Any) -> Values:
@@ -115,7 +131,7 @@ class Source:
 class ItemWriter:
     """All puts of one item by this process: one lock, one count, whatever handles there are."""
 
-    def __init__(self, board: Board, name: str) -> None:
+    def __init__(self, board: OpenBoard, name: str) -> None:
         self._board = board
         self.name = name
         self._writer: Writer | None = None
@@ -154,7 +170,7 @@ class ItemWriter:
             )
         end = time.monotonic() + PUT_WAIT_S
         while not writer.store(octets, stamp, 0):
-            if _is_inside(writer.put) or time.monotonic() > end:
+            if _is_inside(writer) or time.monotonic() > end:
                 raise BoardError(f"item {self.name!r} is put inside of a put of it, by a signal's function; put it elsewhere")
             time.sleep(0)
 
@@ -205,11 +221,12 @@ class ItemWriter:
             source.place.words[(source.record.at + layout.REFUSED_FIELD) // 8] += 1
 
 
-def _is_inside(function: Callable[..., Any]) -> bool:
-    """Whether this thread is in the middle of a function."""
-    frame = sys._getframe()
-    while frame is not None and frame.f_code is not function.__code__:
-        frame = frame.f_back  # type: ignore[assignment]
+def _is_inside(writer: Writer) -> bool:
+    """Whether this thread is in the middle of a put already, besides the one that has just gone the slow way."""
+    codes = (writer.put.__code__, writer.store.__code__)
+    frame: FrameType | None = sys._getframe(2).f_back
+    while frame is not None and frame.f_code not in codes:
+        frame = frame.f_back
     return frame is not None
 
 
@@ -239,7 +256,7 @@ class Item:
 
     __slots__ = ("__weakref__", "_board", "_gets", "_shape", "_sources", "_taken", "get", "name", "put")
 
-    def __init__(self, board: Board, name: str, shape: Any) -> None:
+    def __init__(self, board: OpenBoard, name: str, shape: Any) -> None:
         self.name = name
         self._board = board
         self._shape = shape
@@ -315,7 +332,7 @@ class Item:
         """
         board = self._board
         with board.guard:
-            robot = board.ensured().robot if robot is None else robot
+            robot = board.robot if robot is None else robot
             source = self._sources.get(robot)
             if source is None or not board.is_good(source):
                 source = self._bound(robot)
@@ -329,7 +346,7 @@ class Item:
         unpack = None if record.kind == layout.BYTES else source.values.unpack
         is_own = robot == board.robot
         slow: Get = self._slow_own if is_own else partial(self._slow_peer, robot)
-        get, remember = reader_of(source.place, boottime.CLOCK, board.skew_ns, robot, unpack, record.bound_ns, slow)
+        get, remember = reader_of(source.place, boottime.CLOCK, board.skew_ns, robot, unpack, record.bound_ns, not is_own, slow)
         source.use(get, remember)
         self._sources[robot] = source
         self._gets[robot] = get

@@ -18,6 +18,7 @@ from typing import Final
 from failover.boards import futex, locks
 from failover.core.board import layout
 from failover.core.board.banks import Place, place_of
+from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import GENERATION_AT, GONE, HOLE, USER_LOCKS, USERS_MAX, WRITER_LOCKS, Header, Record, Wanted
 from failover.errors import BoardError, BoardGoneError
 
@@ -55,7 +56,7 @@ class MappedFile:
         """Map a file.
 
         Args:
-            descriptor: an opening of it for its locks; -1: one is made.
+            descriptor: an opening of it for its locks, which becomes the file's; -1: one is made.
             writable: None: if this user may write it.
 
         Raises:
@@ -72,17 +73,12 @@ class MappedFile:
         except OSError as error:
             raise BoardError(f"cannot open {path}: {error.strerror}") from error
         try:
-            area, identity = _mapped(path, opened, writable), _identity(opened)
+            file = cls(path, _mapped(path, opened, writable), writable, descriptor, _identity(opened))
             if writable and descriptor < 0:
-                descriptor = _second_opening(path, opened)
+                file.descriptor = _second_opening(path, opened)
+            return file
         finally:
             os.close(opened)
-        try:
-            return cls(path, area, writable, descriptor, identity)
-        except BaseException:
-            if descriptor >= 0:
-                os.close(descriptor)
-            raise
 
     def close(self) -> None:
         """Give back the locks and the descriptor; what is mapped can still be read."""
@@ -253,7 +249,7 @@ def _mapped(path: Path, descriptor: int, writable: bool) -> mmap.mmap:
     size = os.fstat(descriptor).st_size
     if size < layout.RECORDS_AT:
         raise BoardError(f"{path}: this is no board: it has {size} bytes")
-    size = min(size, layout.BLOCK_SIZE_MAX)
+    size = min(size, BLOCK_SIZE_MAX)
     protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     try:
         return mmap.mmap(descriptor, size, mmap.MAP_SHARED, protection)

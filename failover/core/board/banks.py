@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol
 import xxhash
 from msgspec import Struct
 
-from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, UNBOUNDED_NS
+from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US
 from failover.core.board.layout import (
     BANK_HEAD,
     FORMULA_FIELD,
@@ -41,7 +41,7 @@ RETRIES: Final = 16
 GENERATION: Final = GENERATION_AT // 8
 LOW_HALF: Final = 0xFFFF_FFFF
 EPOCH_SHIFT: Final = 40
-"""Numbers of a copy that runs under epoch e begin above e × 2⁴⁰: a million puts a second for twelve days do not reach the next."""
+"""Numbers of a copy that runs under epoch e begin above e × 2⁴⁰: a million puts a second reach the next in twelve days."""
 
 NO_ERROR_NS: Final = NO_ERROR_BOUND * NS_PER_US
 CLOCK_BOOTTIME: Final = 7
@@ -136,9 +136,7 @@ def sum_of(value: bytes, stamp_ns: int, number: int) -> int:
 # --- The plain form --------------------------------------------------------------------------------------------------
 
 
-def put_carefully(
-    place: Place, number: int, value: bytes, stamp_ns: int, error_us: int = 0, fence: Fence | None = None
-) -> None:
+def put_carefully(place: Place, number: int, value: bytes, stamp_ns: int, error_us: int = 0, fence: Fence | None = None) -> None:
     """Put ``number``, which is above the newest, by the only writer of this item.
 
     Args:
@@ -307,6 +305,7 @@ def reader(
     robot: str,
     unpack: Callable[[bytes], Any] | None,
     bound_ns: int,
+    is_received: bool,
     slow: Get,
 ) -> tuple[Get, Remember]:
     """The get of one robot's item on a processor that keeps the order of loads.
@@ -314,12 +313,13 @@ def reader(
     Args:
         robot: whose item it is.
         unpack: bytes to a value; None: the bytes themselves.
-        bound_ns: as declared; 0: the reception's word says it.
+        bound_ns: as declared; 0: none is, and if the item ``is_received`` from another robot its word says it.
         slow: is called instead, with the robot that the caller named: when the generation differs, a robot is named, the
-            item was never written or is overtaken, its value does not unpack, or a sum is to be examined.
+            item was never written or is overtaken, its value does not unpack, no bound of its error is known, or there is a sum.
     """
     words, area, banks = place.words, place.area, place.banks
-    limit, newest, formula, count = place.limit, place.newest, place.formula, len(place.banks)
+    limit, newest, count = place.limit, place.newest, len(place.banks)
+    learned = 0 if bound_ns or not is_received else place.formula
     generation = UNKNOWN
 
     def get(of: str | None = None) -> Reading:
@@ -332,12 +332,12 @@ def reader(
         size, error_ns = words[word + 3], 0
         if size > limit:
             size, error_ns = size & LOW_HALF, (size >> 32) * NS_PER_US
-            if size > limit:
+            if size > limit or error_ns >= NO_ERROR_NS:
                 return slow(of)
         stamp, total = words[word + 1], words[word + 2]
         bank += 32
         value: Any = area[bank : bank + size]
-        if words[word] != number or number == 0 or total:
+        if words[word] != number or total or not number:
             return slow(of)
         if unpack is not None:
             try:
@@ -345,8 +345,8 @@ def reader(
             except ValueMisfitError:
                 return slow(of)
         age = clock(7) - skew_ns - stamp
-        age_max = age + error_ns if error_ns < NO_ERROR_NS else UNBOUNDED_NS
-        bound = bound_ns or words[formula]
+        age_max = age + error_ns
+        bound = words[learned] if learned else bound_ns
         return Reading(value, age, age_max, robot, number, 0 < bound < age_max)
 
     def remember(new: int) -> None:

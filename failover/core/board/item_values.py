@@ -306,6 +306,8 @@ class _ArrayNode(_Node):
 
 
 class _RecordNode(_Node):
+    """``read``: the values of an object's fields, in order; ``make``: the object of them."""
+
     def __init__(self, names: tuple[str, ...], parts: tuple[_Node, ...], shape: Any) -> None:
         self.parts = parts
         self._names = names
@@ -313,6 +315,7 @@ class _RecordNode(_Node):
         getter: Any = operator.itemgetter if self._mapping else operator.attrgetter
         several = getter(*names)
         self._read = several if len(names) > 1 else lambda value: (several(value),)
+        self.read = self._read_mapping if self._mapping else self._read
         self.make = self._maker(shape)
 
     def _maker(self, shape: Any) -> Callable[..., Any]:
@@ -323,9 +326,8 @@ class _RecordNode(_Node):
             return shape  # type: ignore[no-any-return]
         return lambda *values: shape(**dict(zip(names, values, strict=True)))
 
-    def read(self, value: Any) -> tuple[Any, ...]:
-        """The values of the fields, in order."""
-        if self._mapping and len(value) != len(self._names):
+    def _read_mapping(self, value: Any) -> tuple[Any, ...]:
+        if len(value) != len(self._names):
             raise LookupError
         found: tuple[Any, ...] = self._read(value)
         return found

@@ -54,7 +54,7 @@ BANK_ALIGNMENT: Final = 64
 
 
 class Item(Struct, frozen=True):
-    """One item as it is declared: `Item("ball", {"x": "f4", "y": "f4"})`, `Item("goal", size=64)`, `Item("plan", "json", size=9)`.
+    """One item as it is declared: `Item("ball", {"x": "f4"})`, `Item("goal", size=64)`, `Item("plan", "json", size=99)`.
 
     Attributes:
         name: without blanks and "/".
@@ -160,9 +160,7 @@ def _typed(said: Any, size: int) -> Type:
         raise ItemError(f"size {size} is not from 1 to {ITEM_SIZE_MAX}", "size")
     if said is None or said in ("bytes", "msgpack", "json"):
         if not size:
-            raise ItemError(
-                f"{said or 'an item without a type'} needs a size: the most bytes of a value", "size" if said else "type"
-            )
+            raise ItemError(f"{said or 'an item without a type'} needs a size: the most bytes of a value", "type")
         return Opaque(said or "bytes", size)
     kind = type_of(said)
     if size and size != size_of(kind):

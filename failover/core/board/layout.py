@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 from msgspec import Struct
 from msgspec.structs import astuple
@@ -356,8 +356,8 @@ def addition(header: Header, wanted: Wanted) -> Addition:
         (FILE_SIZE_AT, WORD.pack(size)),
         (COUNT_AT, COUNT.pack(header.count + 1)),
     )
-    placed = Record(*astuple(wanted), header.count, offset, stride)
-    return Addition(placed, size, pieces)
+    place: tuple[Any, ...] = (header.count, offset, stride)
+    return Addition(Record(*astuple(wanted), *place), size, pieces)
 
 
 def removal(index: int) -> Piece:
