@@ -26,6 +26,7 @@ from typing import Final
 
 from benchmarks import (
     beside,
+    board_in_c,
     chains,
     costs,
     crowd,
@@ -113,6 +114,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "beats": interference.beats,
     "encoding": encoding.encoding,
     "task": task.task,
+    "board_in_c": board_in_c.board_in_c,
 }
 
 BY_ITSELF: Final = "soak"
