@@ -351,3 +351,21 @@ def test_a_program_of_a_signal_free_past_ends_by_a_bus_error_that_is_not_ours(pl
     subprocess.run(["gcc", *STRICT, "-Iinclude", "-o", made, source], check=True, cwd=Path(__file__).parents[2])
     done = subprocess.run([made, other], env={"FAILOVER_BOARD": str(place)}, check=False)
     assert done.returncode == -signal.SIGBUS
+
+
+def test_the_example_of_the_manual_compiles_and_runs(place: Path, tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    section = (root / "docs" / "c.md").read_text().split("\n## The team's board\n")[1]
+    (tmp_path / "example.c").write_text(section.split("```c\n")[1].split("```")[0])
+    made = tmp_path / "example"
+    subprocess.run(["gcc", *STRICT, f"-I{root / 'include'}", "-pthread", "-o", made, tmp_path / "example.c"], check=True)
+    environment = {"FAILOVER_BOARD": str(place)}
+    done = subprocess.run([made], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "has no item ball" in done.stderr
+    with board(place) as python:
+        ball = python.add(Declaration("ball", {"x": "f4", "y": "f4", "seen": "u4"}))
+        done = subprocess.run([made], env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0
+        assert "no robot robot2" in done.stderr
+        assert ball.get().value == {"x": 1.0, "y": 2.0, "seen": 1}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 ROBOTS = ("robot1", "robot2")
 ITEMS = ("map", "order")
+LANGUAGES = pytest.mark.parametrize("language", ["c", "python"])
+IN_PYTHON = Path(__file__).with_name("board_component.py")
 
 
 @dataclass
@@ -67,7 +70,8 @@ def robots(tmp_path: Path) -> Iterator[Robots]:
 def component(robots: Robots, tmp_path: Path, *words: str) -> Program:
     """The program, when it has opened the board, under epoch 3."""
     env = {"FAILOVER_BOARD": str(robots.path), "FAILOVER_EPOCH": f"{3:020d}", "PATH": os.environ["PATH"]}
-    started = start([program("board_component"), *words], tmp_path, env=env)
+    command = [sys.executable, str(IN_PYTHON)] if "python" in words else [program("board_component"), *words]
+    started = start(command, tmp_path, env=env)
     started.wait_for_line("ready")
     return started
 
@@ -81,9 +85,12 @@ def answer(asked: Program) -> dict[str, str]:
     return dict(line.split(" ", 1) for line in told.read_text().splitlines())
 
 
-def test_a_program_that_resumes_on_another_robot_puts_and_gets_on_that_robots_board(robots: Robots, tmp_path: Path) -> None:
+@LANGUAGES
+def test_a_program_that_resumes_on_another_robot_puts_and_gets_on_that_robots_board(
+    robots: Robots, tmp_path: Path, language: str
+) -> None:
     one, other = robots.boards
-    with ended(component(robots, tmp_path)) as first, protected(first) as session:
+    with ended(component(robots, tmp_path, language)) as first, protected(first) as session:
         assert answer(first)["robot"] == "robot1"
         base = transported(captured_at_last(session, CaptureOrder()))
         session.acknowledge(base.position)
@@ -108,9 +115,10 @@ def test_a_program_that_resumes_on_another_robot_puts_and_gets_on_that_robots_bo
     one.item("map").put(bytes(8))  # its lock there is free
 
 
-def test_a_ready_board_may_come_late(robots: Robots, tmp_path: Path) -> None:
+@LANGUAGES
+def test_a_ready_board_may_come_late(robots: Robots, tmp_path: Path, language: str) -> None:
     """Until the robot's agent has made its board the calls fail in a sentence; then they work."""
-    with ended(component(robots, tmp_path)) as first, protected(first) as session:
+    with ended(component(robots, tmp_path, language)) as first, protected(first) as session:
         base = transported(captured_at_last(session, CaptureOrder()))
         first.kill()
     robots.path.unlink()
@@ -139,9 +147,12 @@ def years_later(state: Snapshot, years: int) -> Snapshot:
     return replace(state, clocks=Clocks(clocks.realtime_ns, clocks.monotonic_ns + ns, clocks.boottime_ns + ns))
 
 
+@LANGUAGES
 @pytest.mark.parametrize("years", [3, 6])
-def test_a_program_resumed_in_a_time_namespace_years_ahead_tells_true_ages(robots: Robots, tmp_path: Path, years: int) -> None:
-    with ended(component(robots, tmp_path)) as first, protected(first) as session:
+def test_a_program_resumed_in_a_time_namespace_years_ahead_tells_true_ages(
+    robots: Robots, tmp_path: Path, years: int, language: str
+) -> None:
+    with ended(component(robots, tmp_path, language)) as first, protected(first) as session:
         base = transported(captured_at_last(session, CaptureOrder()))
         first.kill()
     robots.is_robot(1)

@@ -41,7 +41,7 @@ CAPABILITIES: Final = (
         Area.MEMORY,
         "the team's board (`failover.board`, failover_board.h)",
         "its pages are never captured; the program uses the board of the robot on which it resumes, from its next call on "
-        "(docs/board.md)",
+        "(docs/c.md)",
     ),
 )
 
