@@ -49,8 +49,8 @@ def board_in_c(quick: bool, directory_: Path) -> Findings:
     return Findings(
         "Board, in C",
         "One call of `fb_put` and of `fb_get` (failover_board.h), each the mean of 20,000 in a row; the value of a put is "
-        "marked, stamped and published, that of a get examined and its age computed. Beside it a bare copy, and what CAMBADA's RTDB "
-        "does for a put and a get: two banks and a time stamp without a check.",
+        "marked, stamped and published, that of a get examined and its age computed. Beside it a bare copy, and what CAMBADA's "
+        "RTDB does for a put and a get: two banks and a time stamp without a check.",
         tuple(figures),
     )
 

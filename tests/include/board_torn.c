@@ -2,7 +2,7 @@
  *
  *     board_torn write ITEM SIZE         puts 1, 2, 3 … for ever, from what is there on
  *     board_torn read ITEM SIZE COUNT    gets so often; prints how many were found, overtaken and torn
- *     board_torn both ITEM SIZE COUNT    puts and gets in turn whatever comes; prints the same */
+ *     board_torn both ITEM SIZE COUNT    puts and gets in turn whatever comes, and looks for the item again; prints the same */
 #include "failover_board.h"
 
 #include <inttypes.h>
@@ -49,6 +49,8 @@ int main(int count, char **arguments)
     const bool is_both = strcmp(arguments[1], "both") == 0;
     for (uint64_t turn = strtoull(arguments[4], NULL, 10); turn > 0; turn--) {
         fb_reading reading;
+        fb_item *again = is_both && turn % 8 == 0 ? fb_find(board, arguments[2], size, 0) : NULL;
+        item = again == NULL ? item : again;
         if (is_both && fb_put(item, &value) == 0)
             number++;
         int outcome = fb_get_reading(item, FB_OWN, &value, &reading);

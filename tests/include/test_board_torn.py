@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from failover.boards import directory
 from failover.boards.board import Board, board
 from failover.core.board import layout
 from failover.core.board.items import Item
@@ -160,27 +161,34 @@ def test_without_the_zeroing_of_the_banks_number_values_are_torn(place: Path) ->
 # --- Files that lie --------------------------------------------------------------------------------------------------
 
 
-def scribble(area: memoryview, dice: random.Random, places: Sequence[tuple[int, int]]) -> None:
-    """Overwrite a few bytes of what a file says of itself, and put them back."""
-    begin, end = dice.choice(places)
-    at = dice.randrange(begin, end - 8)
-    before = bytes(area[at : at + 8])
-    area[at : at + 8] = dice.choice((dice.randbytes(8), b"\xff" * 8, bytes(8), (1 << dice.randrange(64)).to_bytes(8, "little")))
+def scribble(area: memoryview, dice: random.Random, fields: Sequence[tuple[int, int]]) -> None:
+    """Overwrite a field of what a file says of itself, and mostly put it back."""
+    at, size = dice.choice(fields)
+    before = bytes(area[at : at + size])
+    word = dice.choice((dice.getrandbits(64), 2**64 - 1, 0, 1 << dice.randrange(64), 2**64 - (1 << dice.randrange(64))))
+    area[at : at + size] = word.to_bytes(8, "little")[:size]
     time.sleep(dice.random() * 0.0005)
-    if dice.random() < 0.8:
-        area[at : at + 8] = before
+    if dice.random() < 0.95:
+        area[at : at + size] = before
 
 
 def test_a_member_of_the_group_who_scribbles_into_the_file_crashes_no_program_in_c(place: Path) -> None:
     dice = random.Random(SEED)
     print(f"FAILOVER_SEED={SEED}")
     torn = program("board_torn")
+    place.mkdir()
+    directory.make_file(place / "private", layout.PRIVATE, "robot1")
+    directory.make_file(place / "own", layout.OWN, "robot1")  # an agent's, which no program makes anew
     with board(place) as python:
         with_item(python, SMALL)
         file, record = python.found("value", python.robot)
         whole = bytes(file.view)
-        places = [(0, 152), (record.at, record.at + layout.RECORD_SIZE), (record.offset, record.offset + 64)]
-        places.append((layout.names_at(file.header.capacity), layout.names_at(file.header.capacity) + 24))
+        header = [(0, 8), (8, 4), (12, 4), (16, 8), (24, 4), (28, 4), (32, 8), (40, 8)]
+        declared = [(6, 2), (8, 8), (16, 4), (20, 4), (24, 4), (28, 4), (32, 8), (40, 8), (48, 8), (64, 8), (72, 2), (76, 4)]
+        bank = [(0, 8), (8, 8), (16, 8), (24, 4), (28, 4)]
+        fields = [*header, *((record.at + at, size) for at, size in declared * 3)]
+        fields += [(record.offset + at, size) for at, size in bank]
+        fields += [(layout.names_at(file.header.capacity), 2)]
         until = time.monotonic() + 8
         rounds = 0
         while time.monotonic() < until:
@@ -188,7 +196,7 @@ def test_a_member_of_the_group_who_scribbles_into_the_file_crashes_no_program_in
             words = [torn, "both", "value", str(SMALL), "20000"]
             started = subprocess.Popen(words, env={**os.environ, "FAILOVER_BOARD": str(place)}, stdout=-3, stderr=-3)
             while started.poll() is None:
-                scribble(file.view, dice, places)
+                scribble(file.view, dice, fields)
             assert started.returncode in (0, 1), f"it was killed by signal {-started.returncode}"
             rounds += 1
         assert rounds > 0
