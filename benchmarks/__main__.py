@@ -26,6 +26,7 @@ from typing import Final
 
 from benchmarks import (
     beside,
+    board,
     board_in_c,
     chains,
     costs,
@@ -114,6 +115,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "beats": interference.beats,
     "encoding": encoding.encoding,
     "task": task.task,
+    "board": board.board,
     "board_in_c": board_in_c.board_in_c,
 }
 

@@ -961,7 +961,7 @@ static inline int fb_enter_(fb_board *board, bool is_named)
         if (file < 0)
             return file == -EEXIST ? 1 : file;
     } else if (file < 0) {
-        return fb_fail_(errno, "cannot open the board %.400s: %s; its user or group may (board_group of agent.toml)", board->directory,
+        return fb_fail_(errno, "cannot open the board %.400s: %s; its user or group may (the group of [board] in team.toml)", board->directory,
                         strerror(errno));
     } else {
         outcome = fb_take_table_(file, board->directory);

@@ -62,7 +62,7 @@ class Result(Struct):
 def without_zeroing() -> Callable[..., banks.Writer]:
     """The writer of `banks` as it would be without the first step of a put."""
     source = textwrap.dedent(inspect.getsource(banks.writer))
-    line = "words[word] = 0\n"
+    line = "words[head] = 0\n"
     assert source.count(line) == 1
     namespace: dict[str, Any] = dict(vars(banks))
     exec(compile(source.replace(line, "pass\n"), "<banks.writer without zeroing>", "exec"), namespace)
