@@ -1,0 +1,70 @@
+"""Programs in C with a board, driven line by line; and boards that they share with this process."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.include.programs import program
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+class Tool:
+    """board_tool.c: each order is a line, each answer one too."""
+
+    def __init__(self, place: Path, **variables: str) -> None:
+        environment = {"PATH": os.environ["PATH"], "FAILOVER_BOARD": str(place), **variables}
+        self.process = subprocess.Popen(
+            [program("board_tool")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def say(self, *words: object) -> str:
+        """Give an order and read the answer."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(" ".join(map(str, words)) + "\n")
+        self.process.stdin.flush()
+        line = self.process.stdout.readline()
+        assert line, f"board_tool ended at {words}: {self.process.wait()}"
+        return line.rstrip("\n")
+
+    def ok(self, *words: object) -> None:
+        """Give an order that must work."""
+        assert self.say(*words) == "ok"
+
+    def kill(self) -> None:
+        """End it as a power cut does."""
+        self.process.kill()
+        self.process.communicate()
+
+
+@contextmanager
+def tool(place: Path, *, opened: bool = True, **variables: str) -> Iterator[Tool]:
+    """One that runs for the body."""
+    started = Tool(place, **variables)
+    try:
+        if opened:
+            started.ok("open")
+        yield started
+    finally:
+        started.kill()
+
+
+@contextmanager
+def place_for_board() -> Iterator[Path]:
+    """A directory of a board that is not there yet; nothing of it is left afterwards."""
+    place = SHARED_MEMORY / f"failover-{secrets.token_hex(6)}-robot1"
+    try:
+        yield place
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
