@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.include.programs import program
+from tests.include.programs import STRICT, program
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -18,11 +18,9 @@ SHARED_MEMORY = Path("/dev/shm")
 class Tool:
     """board_tool.c: each order is a line, each answer one too."""
 
-    def __init__(self, place: Path, **variables: str) -> None:
+    def __init__(self, place: Path, made: Path, **variables: str) -> None:
         environment = {"PATH": os.environ["PATH"], "FAILOVER_BOARD": str(place), **variables}
-        self.process = subprocess.Popen(
-            [program("board_tool")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-        )
+        self.process = subprocess.Popen([made], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
     @property
     def pid(self) -> int:
@@ -49,9 +47,10 @@ class Tool:
 
 
 @contextmanager
-def tool(place: Path, *, opened: bool = True, **variables: str) -> Iterator[Tool]:
-    """One that runs for the body."""
-    started = Tool(place, **variables)
+def tool(place: Path, *, opened: bool = True, sums: bool = False, **variables: str) -> Iterator[Tool]:
+    """One that runs for the body; ``sums``: it writes and examines sums, as on processors that reorder."""
+    made = program("board_tool_sums", "board_tool.c", flags=("-O2", *STRICT, "-DFB_SUMS=1")) if sums else program("board_tool")
+    started = Tool(place, made, **variables)
     try:
         if opened:
             started.ok("open")

@@ -16,7 +16,7 @@ import xxhash
 from failover.boards import boottime, directory
 from failover.boards.board import Board, board
 from failover.core.board import layout
-from failover.core.board.banks import put_carefully
+from failover.core.board.banks import put_carefully, sum_of
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import RUN, Wanted
 from failover.errors import WriterTakenError
@@ -304,6 +304,19 @@ def test_the_digest_is_xxh3(place: Path) -> None:
     with tool(place, opened=False) as c:
         for size in [*range(1200), 4096, 65535, 65536]:
             assert int(c.say("digest", size), 16) == xxhash.xxh3_64_intdigest(data[:size]), size
+
+
+def test_the_sums_of_c_are_those_of_python_and_a_value_that_does_not_match_is_not_read(place: Path) -> None:
+    with board(place) as python, tool(place, sums=True) as c:
+        added(python, c)
+        c.ok("put", "ball", "x" * 379)
+        assert python.item("ball").get().value == b"x" * 379
+        file, record = python.found("ball", python.robot)
+        bank = file.place(record).banks[1]
+        assert file.words[bank // 8 + 2] == sum_of(b"x" * 379, file.words[bank // 8 + 1], 1)
+        assert c.say("get", "ball", "-").startswith("x" * 379)
+        file.area[bank + 32 + 100 : bank + 32 + 101] = b"y"
+        assert "written 16 times" in c.say("get", "ball", "-")
 
 
 # --- CAMBADA's names -------------------------------------------------------------------------------------------------
