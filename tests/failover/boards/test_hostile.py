@@ -245,6 +245,17 @@ def test_one_who_may_not_write_is_told_so(place: Path) -> None:
         assert said.startswith("BoardError: cannot open") and "Permission denied" in said and "[board]" in said
 
 
+def test_a_struct_of_another_size_is_damage(place: Path) -> None:
+    with failover.board() as board:
+        item = board.add(Item("x", {"a": "f8", "b": "f4[3]"}))
+        item.put({"a": 1.0, "b": [1, 2, 3]})
+        assert item.get().value["a"] == 1.0
+        source = item.source()
+        struct.pack_into("<I", source.file.area, source.place.banks[1] + 24, 8)
+        with pytest.raises(BoardError, match="a value of 8 bytes where 24 to 24"):
+            item.get()
+
+
 def test_damage_in_a_size_word_is_one_error_and_a_new_put_heals_it(place: Path) -> None:
     with failover.board() as board:
         item = board.add(Item("x", size=8))
