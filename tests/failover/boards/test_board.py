@@ -403,11 +403,7 @@ own.close(); board.close()
 
 def peer(board: Board, robot: str, *items: Item, state: int = layout.RUN) -> MappedFile:
     """What an agent has received from another robot."""
-    file = directory.make_peer(board.directory, robot, rank=1, state=state)
-    for item in items:
-        with file.changing():
-            file.add(layout.wanted_of(item, file.next_id()))
-    return file
+    return directory.make_peer(board.directory, robot, items=dict(enumerate(items)), rank=1, state=state)
 
 
 def receive(file: MappedFile, name: str, number: int, value: bytes, age_ns: int = 0, error_us: int = 0) -> None:
