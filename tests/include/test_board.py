@@ -21,7 +21,7 @@ from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import RUN, Wanted
 from failover.errors import WriterTakenError
 from tests.include.board_programs import EMULATOR, Tool, emulated_tool, place_for_board, tool
-from tests.include.programs import STRICT, STRICT_CC, has
+from tests.include.programs import STRICT, has
 
 pytestmark = pytest.mark.compiler
 
@@ -45,34 +45,6 @@ def added(python: Board, tool_: Tool, name: str = "ball", size: int = 379) -> No
     tool_.ok("add", name, size)
     tool_.ok("find", name, size)
     assert python.item(name).name == name
-
-
-# --- Compiling -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("header", ["failover_board.h", "failover_rtdb.h"])
-@pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
-@pytest.mark.parametrize(
-    ("compiler", "strict"),
-    [
-        ("gcc", STRICT),
-        ("clang", STRICT),
-        ("musl-gcc", STRICT),
-        ("aarch64-linux-gnu-gcc", STRICT),
-        ("g++", STRICT_CC),
-        ("clang++", STRICT_CC),
-    ],
-)
-def test_it_compiles_without_a_warning_as_c11_and_as_cxx17(
-    compiler: str, strict: tuple[str, ...], level: str, header: str, tmp_path: Path
-) -> None:
-    if not has(compiler):
-        pytest.skip(f"needs {compiler}, which is not installed here")
-    source = tmp_path / ("only.cc" if strict is STRICT_CC else "only.c")
-    source.write_text(f'#include "{header}"\nint main(void) {{ return fb_open(NULL) == NULL; }}\n')
-    command = [compiler, *strict, level, "-Iinclude", "-c", "-o", tmp_path / "only.o", source]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
-    assert done.returncode == 0, done.stderr
 
 
 # --- Values both ways ------------------------------------------------------------------------------------------------
