@@ -23,7 +23,7 @@ SETTLE_S: Final = 1.0
 
 SETTLE_STEP_S: Final = 0.001
 STANDING: Final = frozenset("TZX")
-"""States of /proc/PID/stat in which a process runs nothing, whoever lives or dies."""
+"""States of /proc/PID/stat in which a process runs nothing, whichever other process lives or dies."""
 HELD: Final = STANDING | {"t"}
 """The same, with a tracer that holds it now: once SIGSTOP is pending, it stands also when that tracer dies."""
 
@@ -37,7 +37,7 @@ class Freezer(Protocol):
     kind: Literal["cgroup", "SIGSTOP"]
 
     def birthplace(self) -> AbstractContextManager[None]:
-        """What this process starts within the body is born inside."""
+        """Processes that this process starts within the body are born inside."""
 
     def add(self, pid: int) -> None:
         """Take a process that is there already, and what it starts from now on."""
@@ -173,7 +173,7 @@ class SignalFreezer:
 
     @contextmanager
     def birthplace(self) -> Iterator[None]:
-        """There is no place to be: whoever is born is added."""
+        """This freezer has no place to be born in: `add` takes each new process."""
         yield
 
     def add(self, pid: int, pidfd: int = -1) -> None:
@@ -303,7 +303,7 @@ def _state_of_others(pid: int) -> str:
 
 
 def _stat(whose: str) -> list[str]:
-    """What follows the name in /proc/PID/stat, or that of a thread: state, parent …; nothing if it is gone."""
+    """The fields after the name in /proc/PID/stat, or in that of a thread: state, parent …; nothing if it is gone."""
     try:
         with open(f"/proc/{whose}/stat", encoding="utf-8", errors="replace") as file:
             return file.read().rpartition(")")[2].split()

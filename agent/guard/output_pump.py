@@ -64,7 +64,7 @@ class Counters:
         self._words = memoryview(self._mapping).cast("Q")  # an item is stored by one eight-byte move, never in parts
 
     def begin_at(self, totals: tuple[int, int], firsts: tuple[int, int]) -> None:
-        """Before a byte is taken: what was written before this program, and where the logs begin."""
+        """Set, before a byte is taken, how much was written before this program, and where the logs begin."""
         self._words[1], self._words[3] = totals
         self._words[4], self._words[5] = firsts
 

@@ -140,7 +140,7 @@ def interface_index(ancillary: Iterable[tuple[int, int, bytes]]) -> int:
 
 
 def drain(listener: socket.socket) -> None:
-    """Take all that has come; what changed is asked for anew, so that a message which was lost (ENOBUFS) loses nothing."""
+    """Take all that has come. The caller reads the state anew, so a message that was lost (ENOBUFS) loses nothing."""
     for _ in range(PIECES_A_TURN):
         try:
             listener.recv(PIECE_SIZE)

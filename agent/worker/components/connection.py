@@ -36,7 +36,7 @@ class Dialogue:
         """
         Args:
             incoming: the union of what may come.
-            lost: raised to whoever waits, or asks, when the other end has gone.
+            lost: raised to each task that waits, or asks, when the other end has gone.
             whom: the other end, for messages.
         """
         end.setblocking(False)
@@ -81,7 +81,7 @@ class Dialogue:
             raise self._lost(f"{self._whom} has gone: {error}") from error
 
     def close(self) -> None:
-        """Hang up; whoever waits is told that the other end is lost, and `ended` is not called."""
+        """Hang up; each waiting task is told that the other end is lost, and `ended` is not called."""
         self.ended = lambda: None
         self._end()
 

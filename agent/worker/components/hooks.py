@@ -57,7 +57,7 @@ END_S: Final = 2.0
 """How long the end of a hook that took too long is waited for."""
 
 SWEEPS: Final = 5
-"""Looks for processes of a hook that is ended: what was born during one is found by the next."""
+"""Looks for processes of a hook that is ended: the next look finds processes that were born during one."""
 
 SYSTEMD_S: Final = 2.0
 """How much later than that systemd tells of a hook that it has ended."""
@@ -115,7 +115,7 @@ class Outcome(Struct, frozen=True):
 
     Attributes:
         failure: why it failed, a sentence; "" if it did not.
-        last_line: what it said last; "" if nothing.
+        last_line: the last line that it wrote; "" if none.
     """
 
     failure: str = ""
@@ -197,8 +197,8 @@ class _Running(Struct):
     """A hook that was begun.
 
     Attributes:
-        reader, output: of what it says; closed by whoever began it. The pipe is ours, not asyncio's, which would take a hook for
-            running as long as any process has the other end: one that puts itself in the background keeps it.
+        reader, output: of the hook's output; closed by the hook's caller. The pipe is ours, not asyncio's, which would take
+            a hook for running as long as any process has the other end: one that puts itself in the background keeps it.
     """
 
     process: asyncio.subprocess.Process
@@ -231,14 +231,14 @@ class _Running(Struct):
 
 
 def _user_of(user: Inheritance | None) -> dict[str, Any]:
-    """What subprocess is told to become, where we can become somebody."""
+    """The user and groups that subprocess gives the hook, where this process has the right to change them."""
     if user is None or os.geteuid() != 0 or user.uid == 0:
         return {}
     return {"user": user.uid, "group": user.gid, "extra_groups": list(user.groups)}
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
-    """End a hook and whatever it started in its session, in whichever process group."""
+    """End a hook and all processes that it started in its session, in every process group."""
     for _ in range(SWEEPS):
         if not sum(_kill_of(process.pid, int(name)) for name in os.listdir("/proc") if name.isdigit()):
             break

@@ -108,7 +108,7 @@ class Following:
         return self._places.budget.share(self._name, self._wanted, self._remembered)
 
     def note(self, captured: messages.Captured) -> None:
-        """What it remembers since a capture."""
+        """Note how much it remembers after a capture."""
         self._wanted, self._remembered = captured.wanted_bytes, captured.remembered_bytes
 
     def _remembers_nothing(self) -> None:

@@ -36,7 +36,7 @@ POLL_S: Final = 0.005
 _PEER: Final = struct.Struct("3i")
 
 SPARES_MAX: Final = 8
-"""Pairs that wait at most; each holds about 60 MB. Whatever is taken over beyond that waits for interpreters to start."""
+"""Pairs that wait at most; each holds about 60 MB. A takeover of more components waits for interpreters to start."""
 
 REFILL_S: Final = 1.0
 """How long after one was used its successor is started: a takeover has the processor for itself."""
@@ -84,7 +84,7 @@ class ProcessPool:
         self._closed = False
 
     def begin(self) -> None:
-        """There is a component: have a pair born, both at the same time, for who is given a guard asks for a keeper next."""
+        """There is a component: have a pair born, both at the same time: a worker that takes a guard asks for a keeper next."""
         if not self._least:
             self._least = 1
             self._prepare_if_possible()

@@ -31,11 +31,11 @@ NAMES_FOR_EACH: Final = 2
 """Names of components that a user may have used, those that were released included, for each component that he may have."""
 
 OTHERS_BYTES_MAX: Final = 32 << 20
-"""The same of all users together who are neither root nor the agent's own."""
+"""The same of all users together except root and the agent's own."""
 
 
 class Admission:
-    """Who holds what of the control socket. Lives in one asyncio loop."""
+    """How much of the control socket each user holds. Lives in one asyncio loop."""
 
     def __init__(self) -> None:
         self._connections: Counter[int] = Counter()

@@ -34,7 +34,7 @@ NAMED: Final = 3
 DIGESTS_KEPT: Final = 4096
 
 ASKING_S: Final = 60.0
-"""What was named within this time counts as one asking: all parts of one come in seconds."""
+"""Files that a peer names within this time count as one asking: all parts of one come in seconds."""
 
 MB: Final = 10**6
 
@@ -42,7 +42,7 @@ log = logging.getLogger("failover.belongings")
 
 
 class Limits(Struct, frozen=True):
-    """What this robot's operator allows.
+    """The limits that this robot's operator sets.
 
     Attributes:
         bring: files are brought here at all.
@@ -56,7 +56,7 @@ class Limits(Struct, frozen=True):
 
 
 class Stock:
-    """What is here. One for an agent; lives in its loop, looks at files in threads. It is the desk for contents that come in."""
+    """The files here, and the `Desk` for contents that come in. One for an agent; lives in its loop, reads files in threads."""
 
     def __init__(self, store: Store, limits: Limits, robot: str, admits: Callable[[str, str], str]) -> None:
         """

@@ -58,9 +58,9 @@ class Deposit:
     ) -> None:
         """
         Args:
-            kept: called with what was offered, and that snapshot without its pages, once the core has accepted it.
-            runs: this member runs components: what it keeps it may have to lay down.
-            here: what this robot's operator wants for a component.
+            kept: called with the offer, and that snapshot without its pages, once the core has accepted it.
+            runs: this member runs components: it may have to lay down the files that it keeps.
+            here: the settings that this robot's operator gives a component.
         """
         self._runs = runs
         self._here = here
@@ -202,10 +202,10 @@ class Deposit:
     async def settled(self, component: str, position: Position | None = None) -> None:
         """Return once no snapshot of it is being stored: from then on a guard writes its output here.
 
-        The core has ordered that no robot's are taken any more; what waits for its turn is refused.
+        The core has ordered that snapshots are taken from no robot any more; a snapshot that waits for its turn is refused.
 
         Args:
-            position: what the component goes on from here: its output is in the logs when this returns, shown before or not.
+            position: of the checkpoint to go on from here: its output is in the logs when this returns, shown before or not.
         """
         async with self._turns.setdefault(component, asyncio.Lock()):
             if position is not None:
@@ -222,7 +222,7 @@ class Deposit:
                 self._mend_logs_of(name)
 
     def _mend_logs_of(self, name: str) -> None:
-        """What the newest snapshot continues was acknowledged; whether that one was, the core will say (`show`)."""
+        """The chain before the newest snapshot was acknowledged; the core will say whether the newest one was (`show`)."""
         descriptors = self._store.open_chain(name)
         try:
             if len(descriptors) > 1 and complete_logs(log_directory(name, self._places), descriptors[:-1]):

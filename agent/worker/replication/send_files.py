@@ -47,7 +47,7 @@ Reader = Callable[[str, Need], Awaitable[int]]
 
 
 class _Sure(Struct):
-    """What a peer was found to have of a component."""
+    """The files of a component that a peer was found to have."""
 
     needs: tuple[Need, ...]
     until_s: float
@@ -93,7 +93,7 @@ class Bringing:
         """Return once the peer has all of these.
 
         Raises:
-            LaneError: it cannot have them, or not yet; what is under way goes on all the same.
+            LaneError: it cannot have them, or not yet; transfers under way go on all the same.
         """
         known = self._peers.setdefault(peer, _Peer())
         sure = known.sure.get(component)
@@ -122,7 +122,7 @@ class Bringing:
             asked[1].set_result(message)
 
     def lost(self, peer: str) -> None:
-        """The connection is gone: what comes back may be another robot by that name."""
+        """The connection is gone: another robot may come back by that name."""
         self._peers.setdefault(peer, _Peer()).sure.clear()
         for name, answer in self._asked.values():
             if name == peer and not answer.done():

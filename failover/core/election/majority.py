@@ -30,7 +30,7 @@ _BOUND = HOLDING | {State.STOPPING}
 
 
 def look(component: Component, turn: Turn) -> None:
-    """What this member would vote for now; its next beat says so."""
+    """Note how this member would vote now; its next beat says so."""
     component.free = is_free(component, turn)
     component.open = component.free and _all_gone(component, turn)
 
@@ -143,7 +143,7 @@ def _covers(component: Component, turn: Turn, sure: tuple[str, ...], robot: str,
 
 
 def _position_at(component: Component, turn: Turn, robot: str) -> Position | None:
-    """What a living robot says that it can restore from."""
+    """The position from which a living robot says that it can restore."""
     if robot == turn.me:
         return component.newest
     peer = turn.team.peers.get(robot)
@@ -152,7 +152,7 @@ def _position_at(component: Component, turn: Turn, robot: str) -> Position | Non
 
 
 def _all_gone(component: Component, turn: Turn) -> bool:
-    """Whether those who hold what was acknowledged were waited for long enough, or are back without it."""
+    """Whether the robots that hold all that was acknowledged were waited for long enough, or are back without it."""
     return all(_lost(component, turn, robot) for robot in _sure(component, turn))
 
 
@@ -171,7 +171,7 @@ def _lost(component: Component, turn: Turn, robot: str) -> bool:
 
 
 def _would(component: Component, turn: Turn, peer: Peer, position: Position | None) -> bool:
-    """Whether a peer would vote for us, by what it has noted itself; one that does not know the component is bound to nobody."""
+    """Whether a peer would vote for us, by its own notes; one that does not know the component is bound to no robot."""
     entry = peer.entry(component.name)
     if entry is None:
         return peer.complete

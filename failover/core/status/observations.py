@@ -16,7 +16,7 @@ TOLD_SHARE = 2
 
 
 class Watch(Struct):
-    """What was noticed so far.
+    """The facts noticed so far.
 
     Attributes:
         late_ns: the most that our loop was late within the last loyalty.
