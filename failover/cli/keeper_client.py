@@ -84,9 +84,9 @@ class Keeper:
     def release(self) -> None:
         """Have it let go of what it follows, and leave it to its end: the more memory it has held, the longer that takes.
 
-        For a command, which ends soon itself: nobody reaps it.
+        For a command, which ends soon itself: no process reaps it.
         """
-        with contextlib.suppress(CheckpointError):  # what it followed has been killed: nothing is left to let go of
+        with contextlib.suppress(CheckpointError):  # the program that it followed has been killed: nothing is left to let go of
             self.ask(Release(), Released)
         self._complaints.close()
         self._link.close()
@@ -98,7 +98,7 @@ class Keeper:
             return
         self._complaints.close()
         self._link.close()
-        with contextlib.suppress(ProcessLookupError):  # nobody else reaps it
+        with contextlib.suppress(ProcessLookupError):  # no other process reaps it
             end = os.pidfd_open(self._process.pid)
             try:
                 if not select.select([end], [], [], LEAVE_S)[0]:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 BAD_STATES: Final = frozenset({"degraded", "failed"})
 OVER_STATES: Final = frozenset({"ended", "released"})
-"""Nobody expects anything of these any more."""
+"""No robot is expected to run a component in one of these states any more."""
 
 Sight = Mapping[str, Any]
 """One component, as one robot sees it."""
@@ -36,7 +36,7 @@ def sight(component: Sight) -> Sight:
 
 
 def _of_primary(seen: Sight, elsewhere: Mapping[str, Sight]) -> Sight:
-    """What the robot says of it that others take for its primary, where that one agrees."""
+    """The word on it of the robot that others take for its primary, where that one agrees."""
     primary = seen.get("primary")
     theirs: Sight = elsewhere.get(primary, {}) if primary else {}
     return theirs if theirs.get("primary") == primary else seen
@@ -48,7 +48,7 @@ def is_lacking(component: Sight) -> bool:
 
 
 def is_unprotected(component: Sight) -> bool:
-    """It runs, and nobody could go on with what it does now."""
+    """It runs, and no robot could go on with its present state."""
     checkpointed = component.get("protection") not in ("none", "stopped")
     is_refused = is_lacking(component) or bool(component.get("contested"))
     return component.get("role") == "primary" and (not checkpointed or is_refused)

@@ -63,7 +63,7 @@ _FUNCTIONS: Final = (types.FunctionType, types.BuiltinFunctionType, types.Method
 
 
 def advice_for(cls: type) -> str:
-    """What to do about a value of a class that cannot be kept; "" where nothing more is known than that."""
+    """The advice on a value of a class that cannot be kept; "" where nothing more is known than that."""
     for base in cls.__mro__:
         known = _ADVICE.get(f"{base.__module__}.{base.__qualname__}")
         if known is not None:

@@ -42,11 +42,11 @@ class Kind(ABC):
         name: the type as a person would declare it.
         types: what ``type(value)`` may be; a union chooses by it.
         exact: those of ``types`` whose values are their own wire values and need no look.
-        shapes: what its wire values look like: names of Python types, "record", marks. Kinds of one union that share a shape
+        shapes: the looks of its wire values: names of Python types, "record", marks. Kinds of one union that share a shape
             are told apart by a label, unless both are evident.
         keeps_text: any text is its own wire value, as far as a wire can hold it.
-        evident: the wire alone says what the value is, whatever was declared: two such kinds never make different values of
-            one wire.
+        evident: the wire alone says what the value is, regardless of the declaration: two such kinds never make different values
+                of one wire.
     """
 
     name: str = ""
@@ -66,7 +66,7 @@ class Kind(ABC):
 
     @abstractmethod
     def lift(self, wire: Wire, build: Build, place: Place) -> Any:
-        """The value of a wire value, whoever wrote it.
+        """The value of a wire value, from any writer.
 
         Raises:
             FitError: it is not of the declared type; names the place.

@@ -76,7 +76,7 @@ FORMS: Final[dict[str, dict[str, Form]]] = {
     "Philox": {"state.counter": ("<u8", 4), "state.key": ("<u8", 2), "buffer": ("<u8", 4), "buffer_pos": 4, **_HALF},
     "SFC64": {"state.state": ("<u8", 4), **_HALF},
 }
-"""Of each bit generator that is kept: what its ``state`` holds, by the way to it."""
+"""Of each bit generator that is kept: the items of its ``state``, by the way to each."""
 
 
 class GeneratorKind(Kind):

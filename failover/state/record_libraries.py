@@ -272,7 +272,7 @@ def _may_be_absent(annotation: Any, optional: bool) -> bool:
 
 
 class Components(Mappings):
-    """The kept fields of a component: whatever else the program's object holds is its own affair."""
+    """The kept fields of a component. The other attributes of the program's object are its own affair."""
 
     mutable = False
 

@@ -70,7 +70,7 @@ def attribute_reader(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]
 
 
 def undeclared(cls: type, value: Any) -> tuple[str, ...]:
-    """What lies in an object's dictionary, if it has one, besides what cached properties left there."""
+    """The names in an object's dictionary, if it has one, except those that cached properties left there."""
     found = getattr(value, "__dict__", ())
     return tuple(name for name in found if not isinstance(getattr(cls, name, None), cached_property))
 

@@ -15,7 +15,7 @@ Wire: TypeAlias = Any
 """None | bool | int | float | str | bytes | list[Wire] | dict[str, Wire]."""
 
 FORMAT = "failover.state/1"
-"""First element of every stored state: what it is, and the version of the wire format."""
+"""First element of every stored state: its kind, and the version of the wire format."""
 
 INLINE_SIZE_MAX = 4096
 """Bytes. Arrays and bytes of this size and more lie in regions of their own, so that they travel as changed pages."""
@@ -36,7 +36,7 @@ KEY_TEXT_MAX = 40
 """Characters of a dictionary's key in the name of a place."""
 
 INT_MIN, INT_MAX = -(1 << 63), (1 << 64) - 1
-"""What msgpack holds as an integer; others are stored as bytes."""
+"""The integers that msgpack holds; others are stored as bytes."""
 
 INT_BITS_MAX = 1 << 20
 """An integer beyond this is a mistake or an attack: printing one takes quadratic time."""
@@ -121,7 +121,7 @@ def mark_of(wire: Wire) -> str | None:
 
 
 def said(wire: Wire) -> str:
-    """What a stored value is, in a few words of a message: ``str 'north'``, ``a list of 3``, ``a record (x, y)``."""
+    """A description of a stored value, in a few words of a message: ``str 'north'``, ``a list of 3``, ``a record (x, y)``."""
     if wire is None:
         return "None"
     if isinstance(wire, bool | int | float | str | bytes):

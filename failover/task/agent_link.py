@@ -55,10 +55,10 @@ log = logging.getLogger("failover")
 
 
 class Handed(Struct, frozen=True):
-    """What the guard gave at the beginning.
+    """The state and the descriptors that the guard gave at the beginning.
 
     Attributes:
-        state: what was committed last; None where the component begins.
+        state: of the last commit; None where the component begins.
     """
 
     begin: Begin
@@ -78,7 +78,7 @@ class Guarded:
     def __init__(self, end: socket.socket) -> None:
         self._end = end
         self._hearing = threading.RLock()
-        """Held by whoever waits for the next packet: a thread, and perhaps a signal handler that interrupts it."""
+        """Held by the code that waits for the next packet: a thread, and perhaps a signal handler that interrupts it."""
         self._output: OwnOutput | None = None
         self._is_pending = False
         self._told_segment = 0
@@ -137,7 +137,7 @@ class Guarded:
             raise
 
     def outputs(self) -> Outputs:
-        """What this program has written until now, for its commit."""
+        """The output that this program has written until now, for its commit."""
         outputs = self._output.totals() if self._output is not None else None
         self._is_pending = outputs is PENDING
         return outputs
@@ -148,7 +148,7 @@ class Guarded:
         return "its output pipe is full, the guard takes nothing from it; a later commit will do" if self._is_pending else ""
 
     def notice(self, segment: int) -> None:
-        """There is a new commit. Whoever takes it looks by himself, and is told of the first in each segment.
+        """There is a new commit. The keeper looks for commits by itself. The guard is told of the first one in each segment.
 
         Args:
             segment: how many segments there were, with the one that it went to.
@@ -157,7 +157,7 @@ class Guarded:
             return
         try:
             self._end.send(encode(Keeps()), socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)
-        except OSError:  # full: at the next commit; gone: nobody listens
+        except OSError:  # full: at the next commit; gone: no guard listens
             return
         self._told_segment = segment
 
@@ -201,7 +201,7 @@ class Guarded:
 
 
 def guarded() -> Guarded | None:
-    """Our end of the guard's socket; None where this program was started by nobody who keeps its state.
+    """Our end of the guard's socket; None where this program has no guard that keeps its state.
 
     Raises:
         TaskError: its guard will not have it.

@@ -42,7 +42,7 @@ TIDY_S: Final = 5.0
 RETRY_S: Final = 0.5
 """After a write that failed."""
 LOOK_S: Final = 1.0
-"""How often whoever waits looks whether the thread still lives."""
+"""How often a waiting thread looks whether the writing thread still lives."""
 
 _LEARNING: Final = threading.Lock()
 """Held while the thread does for the first time what loads modules and has decoders built: a child that is forked in the middle
@@ -90,7 +90,7 @@ class StateFile:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What was found damaged or left over: one sentence each."""
+        """Files found damaged or left over: one sentence each."""
         return tuple(self._store.notices)
 
     def load(self) -> Snapshot | None:
@@ -114,7 +114,7 @@ class StateFile:
             The number of the commit that is safe now.
 
         Raises:
-            CheckpointError: it was not written; what was kept is intact.
+            CheckpointError: it was not written; the state kept before is intact.
         """
         is_small = session.reader.layout.page_count <= SMALL_PAGES
         order = CaptureOrder(base=is_small or self._sequence == 0, generation=self.generation, sequence=self._sequence + 1)
@@ -122,7 +122,7 @@ class StateFile:
             snapshot = session.capture(order)
             descriptor = memfd_holding(format.encode_bytes(snapshot), "state")
             if not self._has_learnt:
-                format.read_outline(descriptor)  # as the store will, but without the disk: nobody who forks waits for that
+                format.read_outline(descriptor)  # as the store will, but without the disk: no thread that forks waits for that
                 self._has_learnt = True
         try:
             self._store.put(descriptor, prove=False)

@@ -69,7 +69,7 @@ class OwnOutput:
         """Whether a flush fits into the pipe, however its slots are filled.
 
         Two neighbours hold more than one page together, else the kernel had put them into one slot; the first may be read in
-        part. What other threads and children write meanwhile is not foreseen. A pipe that is empty is taken as it is.
+        part. Writes by other threads and children meanwhile are not foreseen. A pipe that is empty is taken as it is.
         Source: pipe(7), ``pipe_write`` in the kernel's fs/pipe.c.
         """
         unread = self._counts.unread(index)

@@ -286,7 +286,7 @@ class Play:
             self._screen.say(f"{act.program.title} has ended ({ending}); its {act.size} bytes of output are {verdict}")
 
     def end_references(self) -> None:
-        """Whatever happens, no undisturbed run goes on without us, and nobody watches any more."""
+        """Stop the watchers, and end the undisturbed runs, however the demo ends: none goes on without us."""
         for act in self.acts:
             act.before.stop()
             act.after.stop()

@@ -271,7 +271,7 @@ def _moved(answer: dict[str, Any]) -> str:
 
 
 def promote(arguments: argparse.Namespace) -> int:
-    """Have a robot run what nobody is heard to run, once whoever orders it knows what that risks."""
+    """Have a robot run what no robot is heard to run, once the operator knows what that risks."""
     wanted = {"name": arguments.name, "robot": arguments.robot or ""}
     with connect(arguments) as agent:
         would = agent.ask("promote", **wanted)
@@ -287,7 +287,7 @@ def promote(arguments: argparse.Namespace) -> int:
 
 
 def _agreed(question: str) -> bool:
-    """Whether a person at the terminal says yes; without one nobody does."""
+    """Whether the person at the terminal says yes; False without a terminal."""
     if not sys.stdin.isatty():
         return False
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)

@@ -206,9 +206,9 @@ def _ended(pid: int) -> Iterator[None]:
 
 
 def _wait_for_ends(dying: Mapping[int, int]) -> None:
-    """Wait, for a while, until these have ended, and their parents can be told: who restores at once finds files and PIDs free.
+    """Wait, for a while, until these have ended, and their parents can be told: a restore at once finds files and PIDs free.
 
-    The end of who is traced is told to its tracer first, and to its parent when that has taken note, or has ended itself.
+    The end of a traced process is told to its tracer first, and to its parent when that has taken note, or has ended itself.
 
     Args:
         dying: process ids by their pidfds.
@@ -272,7 +272,7 @@ def _written_whole(target: Path) -> Iterator[int]:
 
 
 def terms_of(arguments: argparse.Namespace) -> Terms:
-    """What was ruled for this capture or restore.
+    """The terms that the user ruled for this capture or restore.
 
     Raises:
         FailoverError: a rule is none.
@@ -289,7 +289,7 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
 
 
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
-    """What becomes of devices.
+    """The rules for devices.
 
     Raises:
         FailoverError: a rule is none.
@@ -306,7 +306,7 @@ def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
 def restore(arguments: argparse.Namespace) -> int:
     """Start the program of a snapshot where it stood; print its PID and return, or stay until it ends."""
     try:
-        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what is no file is told, not waited for
+        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe is refused, not waited for
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
     try:
@@ -359,7 +359,7 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
 
 
 def _reduced(path: str, state: State, author: Author) -> tuple[str, ...]:
-    """What a snapshot asks for and does not get, as a note; none where it asks for no more than its owner has."""
+    """The rights that a snapshot asks for and does not get, as a note; none where it asks for no more than its owner has."""
     assert author.owner is not None
     if not (asked := credentials.excess(state, author.owner)):
         return ()
@@ -378,7 +378,7 @@ def _told_of(reduced: tuple[str, ...]) -> Iterator[None]:
 
 
 def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.ExitStack) -> Birth:
-    """The same for an owner who is not root: with nothing of root's, also not root's terminal to read from."""
+    """The same for an owner other than root: with nothing of root's, also not root's terminal to read from."""
     if owner is None:
         return birth
     theirs = credentials.at_most(state.process.credentials, owner)
@@ -387,7 +387,7 @@ def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.E
 
 
 def _without_terminal(opened: contextlib.ExitStack) -> tuple[int, int, int]:
-    """Our standard streams for who is not to read what is typed: a terminal is open for writing alone."""
+    """Our standard streams for a program that must not read the typed text: a terminal is open for writing alone."""
 
     def unread(stream: int) -> int:
         if not os.isatty(stream):
