@@ -46,7 +46,7 @@ class Kind(ABC):
             are told apart by a label, unless both are evident.
         keeps_text: any text is its own wire value, as far as a wire can hold it.
         evident: the wire alone says what the value is, regardless of the declaration: two such kinds never make different values
-                of one wire.
+            of one wire.
     """
 
     name: str = ""
