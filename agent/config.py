@@ -103,7 +103,7 @@ class ComponentConfig:
             along where it is handed over; refuse: it is not captured while it has one.
         bring_data: files that it has open for reading only are brought to its standby, as its program is, when it runs here.
         carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
-        carry_limit: what they may hold while it runs here.
+        carry_limit: the most that they may hold while it runs here.
         carry_at: where they are laid down here, by their path on the other robots; the same path for those not named.
         shared: files and folders that others write to as well: they keep the content that they have here.
         shared_memory: detach: shared memory that others have mapped, too, becomes its own copy where it resumes; refuse: it is
@@ -153,7 +153,7 @@ class Config:
     Attributes:
         robot: this robot's name in the team file.
         team_directory: see `failover.config.team`.
-        state_directory: what survives a power cut: vote record, snapshots, streams.
+        state_directory: files that survive a power cut: vote record, snapshots, streams.
         runtime_directory: sockets; gone after a reboot.
         insecure: run without keys: any machine on the network can read memory and start programs.
         group: unix group that may use the control socket besides its owner; "" for no group.

@@ -74,7 +74,7 @@ def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
     A level of another kind of processor means the usual one of this kind: a mixed team has the same words everywhere.
 
     Args:
-        wanted: of ``failover run``: a level, "no", or "" for what this robot's operator says.
+        wanted: of ``failover run``: a level, "no", or "" for the setting of this robot's operator.
     """
     said: bool | str = wanted or (config.portable if component.portable == "" else component.portable)
     if isinstance(said, bool):

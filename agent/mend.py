@@ -78,7 +78,7 @@ def _mended(record: Record, epoch: int, *, has_left: bool) -> Record:
 
 
 def _later(store: Store | None, name: str, epoch: int) -> list[tuple[int, int]]:
-    """Generation and number of what was captured under later epochs."""
+    """Generation and number of the snapshots captured under later epochs."""
     positions = store.positions(name) if store is not None else ()
     return [(one.generation, one.sequence) for one in positions if one.generation // (PEERS_MAX + 1) > epoch]
 

@@ -97,7 +97,7 @@ class BeginTask(Message, frozen=True):
     """Have a program begin that was started warm; under the lease given before. With its state as a segment, if it has an origin.
 
     Attributes:
-        totals: bytes that the component had written to its two streams by then; what waits in its pipes follows them.
+        totals: bytes that the component had written to its two streams by then; output that waits in its pipes follows them.
     """
 
     epoch: int

@@ -59,7 +59,7 @@ FAR_AWAY: Final = 1 << 40
 
 
 class Bounds(Struct, frozen=True):
-    """Where one stream begins, what of it is committed, and where it ends; all in bytes from the component's first."""
+    """Where one stream begins, how far it is committed, and where it ends; all in bytes from the component's first."""
 
     start: int
     committed: int
@@ -112,7 +112,7 @@ class OutputLogs:
         return bool(self._word(HELD))
 
     def hold(self, held: bool) -> None:
-        """Note, on this robot, what the component's record says of its output."""
+        """Note, on this robot, whether the component's record has its output held."""
         if held != self.is_held:
             self._set_word(HELD, int(held))
 
@@ -136,7 +136,7 @@ class OutputLogs:
         The piece says where it begins: later than asked where the beginning is no longer kept.
 
         Args:
-            committed: only what no takeover can take back, of held output only what is safe; otherwise all that was written.
+            committed: only bytes that no takeover can take back, of held output only safe ones; otherwise all that was written.
         """
         while True:
             bounds = self.bounds(stream)

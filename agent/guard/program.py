@@ -154,7 +154,7 @@ class GuardedProgram(Struct):
         """Logs, pipes and a freezer first; the process last, into all of them.
 
         Args:
-            totals: bytes that it had written by then; None: it waits, and what it writes now stays in its pipes.
+            totals: bytes that it had written by then; None: it waits, and its output stays in its pipes.
             user: uid and gid that the pipes shall belong to, so that the program can open /dev/stdout; None: ours.
         """
         pump = Pump()
@@ -192,7 +192,7 @@ class GuardedProgram(Struct):
         return (self.pump.counters.descriptor, *reads, *logs)
 
     def note_logs(self) -> None:
-        """Say what the filesystem of the logs cannot do."""
+        """Note if the filesystem of the logs cannot give old bytes back."""
         if self.pump is not None and self.pump.is_open and not self.pump.logs.trims:
             self.notes.append(NO_TRIM)
 
@@ -309,7 +309,7 @@ class GuardedProgram(Struct):
     # --- the end ---
 
     def kill(self, number: int) -> None:
-        """Send a signal; SIGKILL goes to everything that it started, too. To what has ended, nothing happens."""
+        """Send a signal; SIGKILL goes to everything that it started, too. A process that has ended gets none."""
         if self.exited is not None:
             return
         try:
@@ -372,7 +372,7 @@ class GuardedProgram(Struct):
         self.exited = Exited(status, self.totals(), tuple(self.notes))
 
     def close(self) -> None:
-        """Give back what was made outside this process."""
+        """Remove what this object has made outside this process."""
         self.freezer.close()
 
     # --- telling ---

@@ -56,7 +56,7 @@ class VoteRecordFile:
         return self._record
 
     def open(self) -> Record:
-        """Read what an earlier life left and begin a new one: the boot counter is raised, durably.
+        """Read the record of an earlier life and begin a new one: the boot counter is raised, durably.
 
         Raises:
             BallotError: the file is unreadable, altered, or another robot's; or the directory cannot be written.

@@ -142,7 +142,7 @@ class WorkerProcess:
             log.error("the worker process does not read; the main loop ends it")
             self._waiting.clear()
             if self._wanted > self._begun:
-                self._is_doomed = True  # it will miss what was for it
+                self._is_doomed = True  # it will miss its messages
             else:
                 self._kill()
         self._waiting.append(message)
@@ -177,7 +177,7 @@ class WorkerProcess:
             self.send(messages.order(self._early.popleft()))
 
     def flush(self) -> None:
-        """Send what waits, as much as goes without waiting."""
+        """Send waiting messages, as many as go without waiting."""
         assert self._channel is not None, "start comes first"
         while self._waiting:
             try:

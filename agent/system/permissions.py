@@ -33,7 +33,7 @@ SCHED_DEADLINE: Final = 6
 
 ROOT: Final = 0
 NOBODY: Final = -1
-"""For what a robot asks another one by itself: it may be told how things stand, and no more."""
+"""For questions that a robot asks another one by itself: it may be told how things stand, and no more."""
 
 SAID: Final = "; it said: "
 """Begins, at the end of a sentence of the status or the event log, the last line that a program wrote."""
@@ -57,7 +57,7 @@ class Caller(Struct, frozen=True):
 
 
 def may(uid: int, owner: int | None) -> bool:
-    """The rule: root and the agent's own user may do everything, another user what concerns his own components.
+    """The rule: root and the agent's own user may do everything, another user all that concerns his own components.
 
     Args:
         owner: whose the component is; None: it is not known.

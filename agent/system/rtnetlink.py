@@ -122,7 +122,7 @@ def allow_absent(listener: socket.socket) -> None:
 
 
 def tell_interfaces(listener: socket.socket) -> None:
-    """From now on `interface_index` finds in what comes with a datagram by which interface it came. Source: ip(7), ipv6(7)."""
+    """From now on `interface_index` finds, in the data beside a datagram, by which interface it came. Source: ip(7), ipv6(7)."""
     if listener.family == socket.AF_INET6:
         listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_RECVPKTINFO, 1)
     else:

@@ -89,7 +89,7 @@ class _Opened:
         return sorted(path.name.removeprefix(prefix) for path in self.directory.glob(f"{prefix}*"))
 
     def leave(self) -> None:
-        """Give everything back; the last user without an agent removes the board. A forked child only closes what it has."""
+        """Give everything back; the last user without an agent removes the board. A forked child only closes its files."""
         for file in self.files[1:]:
             file.close()
         if self.pid != os.getpid():

@@ -75,14 +75,14 @@ class Keeper:
         self._link.send(request)
 
     def _last_words(self) -> str:
-        """The last line of what it wrote to standard error."""
+        """The last line that it wrote to standard error."""
         self._process.wait(LEAVE_S)
         self._complaints.seek(0)
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "nothing"
 
     def release(self) -> None:
-        """Have it let go of what it follows, and leave it to its end: the more memory it has held, the longer that takes.
+        """Have it let go of the program that it follows, and leave it to its end: the more memory it held, the longer that takes.
 
         For a command, which ends soon itself: no process reaps it.
         """

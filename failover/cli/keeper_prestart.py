@@ -35,7 +35,7 @@ class Started(NamedTuple):
     """A keeper's process.
 
     Attributes:
-        ours: our end of its channel's socket; when that is closed it lets go of what it traces, and ends.
+        ours: our end of its channel's socket; when that is closed it lets go of its tracees, and ends.
         complaints: its standard error.
     """
 
@@ -109,7 +109,7 @@ def _forked(theirs: socket.socket, complaints: IO[bytes]) -> Child:
 
 
 def _as_keeper(theirs: int, complaints: int) -> int:
-    """Be in the child what `_spawned` starts."""
+    """Be in the child the keeper that `_spawned` starts."""
     import fcntl
 
     os.setpgid(0, 0)

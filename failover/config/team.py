@@ -61,7 +61,7 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Team:
-    """The members, by name, and what lies on their board."""
+    """The members, by name, and the items of their board."""
 
     team: str
     robots: dict[str, Robot] = field(default_factory=dict)

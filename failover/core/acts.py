@@ -225,7 +225,7 @@ class Cool(Struct, frozen=True):
 
 
 class Inquire(Struct, frozen=True):
-    """Ask robot ``to`` what it lacks of what the component needs to go on there. → Inquired, unless the robot cannot be asked."""
+    """Ask robot ``to`` which needs of the component it does not meet. → Inquired, unless the robot cannot be asked."""
 
     component: str
     epoch: int
@@ -265,7 +265,7 @@ class ReportExit(Struct, frozen=True):
 
 
 class Answer(Struct, frozen=True):
-    """The reply to an operator's command; ``sentence`` says what was done, or why not and what to do about it.
+    """The reply to an operator's command; ``sentence`` says what was done, or why not, and the cure.
 
     Attributes:
         risks: of a promotion that was only asked about: a sentence for each reason to think before it is ordered.

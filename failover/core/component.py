@@ -1,4 +1,4 @@
-"""One component on one robot: its state, the table of its states, and what one step may change."""
+"""One component on one robot: its state, the table of its states, and the changes that one step may make."""
 
 from __future__ import annotations
 
@@ -377,7 +377,7 @@ class Turn(Struct):
         self.acts.append(act)
 
     def say(self, component: Component, sentence: str, output_pending: int = -1) -> None:
-        """For ``failover why``: a decision about a component, with what is known now."""
+        """For ``failover why``: a decision about a component, with the facts known now."""
         before = next((record.epoch for record in self.before.records if record.name == component.name), 0)
         checkpoint, age_ns = _newest_checkpoint(component, self.now_ns)
         facts = Facts(

@@ -209,9 +209,9 @@ class Membership:
         return self.peers[robot].loyal_until_ns
 
     def _count_loyalty(self, peer: Peer) -> None:
-        """Bytes that cannot be authenticated prove that a robot lives only where that robot was never heard in this life of ours.
+        """Packets that cannot be authenticated prove that a robot lives only where it was never heard in this life of ours.
 
-        One that was heard and then falls silent is replaced, even if such bytes come from it. Under majority votes decide.
+        One that was heard and then falls silent is replaced, even if such packets come from it. Under majority votes decide.
         """
         if peer.boot:
             peer.loyal_until_ns = peer.heard_ns + self._loyalty_ns + self._wider_ns(peer)
@@ -264,7 +264,7 @@ class Membership:
         return robot not in self.peers or not self.peers[robot].boot
 
     def unreadable(self, robot: str, why: str, now_ns: int) -> str:
-        """Note what could not be authenticated; a sentence for the event log where it is the first, or says more than before.
+        """Note a packet that could not be authenticated; a sentence for the event log where it is the first, or says more.
 
         Of a peer that lives it says nothing: any machine may send from its address.
         """
@@ -281,12 +281,12 @@ class Membership:
         return f"{self._own[0]} receives from {robot} and cannot authenticate it: {peer.unread_why}" if is_news else ""
 
     def unread(self, robot: str, now_ns: int) -> str:
-        """Why what comes from a peer cannot be authenticated; "" where nothing of that kind came lately."""
+        """Why packets from a peer cannot be authenticated; "" where no such packet came lately."""
         peer = self.peers.get(robot)
         return peer.unread_why if peer is not None and self._is_recent(peer.unread_ns, now_ns) else ""
 
     def keeps_waiting(self, robot: str, now_ns: int) -> bool:
-        """Whether a peer would count as dead, but for what comes from it that cannot be authenticated."""
+        """Whether a peer would count as dead, but for packets from it that cannot be authenticated."""
         peer = self.peers[robot]
         return not peer.boot and peer.heard_ns + self._grace_ns <= now_ns < peer.loyal_until_ns
 
@@ -328,7 +328,7 @@ class Membership:
         return tuple(self._view(peer, now_ns) for peer in self.peers.values())
 
     def sightings(self, component: str, now_ns: int) -> tuple[Sighting, ...]:
-        """For ``failover why``: every peer, and what it says of a component ("" for none)."""
+        """For ``failover why``: every peer, and its word on a component ("" for none)."""
         return tuple(self._sighting(peer, component, now_ns) for peer in self.peers.values())
 
     def _sighting(self, peer: Peer, component: str, now_ns: int) -> Sighting:

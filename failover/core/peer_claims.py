@@ -1,4 +1,4 @@
-"""Checks what a member may say of a component: by its role, by the growth of epochs, by what the robot that it names says.
+"""Checks whether a member may say its word on a component: by its role, by the growth of epochs, by the robot that it names.
 
 Every member holds a key of the team, and one key may be stolen. So each entry is checked before the rules see it:
 
@@ -41,7 +41,7 @@ _SAYS = {State.ABSENT, State.STANDBY, *ENDED}
 
 
 class Beyond(enum.StrEnum):
-    """In what way a member said more than it may."""
+    """A way in which a member says more than it may."""
 
     RUNS = "runs"
     KEEPS = "keeps"
@@ -69,7 +69,7 @@ class Testimony(Struct):
     """The words of peers that were refused in this life of ours.
 
     Attributes:
-        denied_ns: since when a member has been saying of a component what the named robot denies.
+        denied_ns: since when a member has been saying a word on a component that the named robot denies.
     """
 
     refusals: dict[tuple[str, Beyond], Refusal] = field(default_factory=dict)

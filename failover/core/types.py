@@ -1,4 +1,4 @@
-"""Terms of the rules: the values for a component, for what a robot remembers, for what it shows. Frozen values only.
+"""Terms of the rules: the values for a component, for a robot's memory, for its status. Frozen values only.
 
 Instants are integer nanoseconds of this machine's own clock (suffix ``_ns``); two machines' clocks are never compared.
 Events of a node are in `failover.core.events`, its orders in `failover.core.acts`, the messages between robots in
@@ -75,7 +75,7 @@ class State(enum.StrEnum):
 class Resumption(enum.StrEnum):
     """Why a program goes on from a checkpoint, in the words that it is told (``checkpoint/segment/TASK.md``).
 
-    It is told what became of the copy before it, not where the checkpoint was made: that may have been here all the same.
+    It is told how the copy before it ended, not where the checkpoint was made: that may have been here all the same.
     """
 
     RESTARTED = "restarted"
@@ -142,7 +142,7 @@ class Launch(Struct, frozen=True):
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
         hooks: (occasion, command) pairs that came with the program and are run as its user, see `agent.worker.components.hooks`.
-        output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
+        output: `IMMEDIATE` or `COMMITTED`: when its output is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.spawn.inherited_limits`); b"": the
             agent's own.
         carry: files and folders that travel with it, as absolute paths.
@@ -246,8 +246,8 @@ class Config(Struct, frozen=True, dict=True):
         rule: by which primaries are replaced.
         servers: members, perhaps this one, that keep checkpoints and vote, and run nothing.
         witnesses: members, perhaps this one, that only vote.
-        patience_ms: under majority, how long the robots that hold what was acknowledged are waited for before another one goes on
-            from an older checkpoint.
+        patience_ms: under majority, how long the robots that hold all that was acknowledged are waited for before another goes
+            on from an older checkpoint.
         archive_ms: between two whole checkpoints for a server that does not keep up with the deltas.
         boot_patience_ms: under pair, how long after its own start a robot waits for the robots that ran a component last, or that
             may have taken it over since, before it claims the component without having heard them.

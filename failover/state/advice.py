@@ -76,7 +76,7 @@ def advice_for(cls: type) -> str:
 
 
 def advice_for_annotation(annotation: Any, origin: Any) -> str:
-    """The same for what stands in the place of a type."""
+    """The same for an object in the place of a type."""
     if origin is collections.abc.Callable or annotation is collections.abc.Callable:
         return _FUNCTION
     if isinstance(annotation, types.BuiltinFunctionType) and annotation.__module__ in ("_thread", "threading"):

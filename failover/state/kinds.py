@@ -242,7 +242,7 @@ def _shares_memory(left: np.ndarray[Any, Any], right: np.ndarray[Any, Any]) -> b
 
 
 class Build:
-    """One lifting: which regions there are and what was made already."""
+    """One lifting: the regions, and the objects that were made already."""
 
     __slots__ = ("_left", "_shared", "allocate", "made", "notes")
 
@@ -255,7 +255,7 @@ class Build:
         self.notes: dict[str, str] = {}
 
     def note(self, subject: str, text: str) -> None:
-        """Remember what a person should know; once a subject, however often it occurs."""
+        """Remember a sentence for a person; once a subject, however often it occurs."""
         self.notes.setdefault(subject, text)
 
     def note_made(self, value: object, kind: Kind, place: Place) -> None:

@@ -1,4 +1,4 @@
-"""Kinds of random number generators: Python's and numpy's, kept as the numbers that say what they draw next.
+"""Kinds of random number generators: Python's and numpy's, kept as the numbers that determine the next draws.
 
 Nothing on the wire names anything but one of numpy's own bit generators. Every number is checked against the table below: some
 of them are places in an array, and numpy's C code would follow them anywhere.

@@ -58,7 +58,7 @@ class Style(ABC):
         """The object with its contents."""
 
     def extras(self, value: Any, count: int) -> tuple[str, ...]:
-        """Names of what an object holds besides its ``count`` fields."""
+        """Names of attributes that an object holds besides its ``count`` fields."""
         return ()
 
 
@@ -170,7 +170,7 @@ class RecordKind(Kind):
         return wire
 
     def _refuse_extras(self, extras: tuple[str, ...], place: Place) -> None:
-        """Refuse an object that holds what is not declared.
+        """Refuse an object that holds undeclared attributes.
 
         Raises:
             KeepError: names the first of them.

@@ -227,7 +227,7 @@ class Schema(Struct, frozen=True):
         return Decoded(value, (*notes, *build.notes.values()), stored.version)
 
     def _migrated(self, stored: Stored, regions: dict[str, memoryview]) -> tuple[Wire, dict[str, memoryview], bool, list[str]]:
-        """The state in the form of this version, its regions, whether it is shared, and what was done.
+        """The state in the form of this version, its regions, whether it is shared, and the notes.
 
         Raises:
             FitError: it is newer, or a migration is missing or failed.

@@ -182,7 +182,7 @@ def _contradict(left: Kind, right: Kind, shapes: frozenset[str]) -> bool:
 
 
 def _nameless(value: object, where: str) -> KeepError:
-    """The refusal of a value of which a stored state would not say what it is."""
+    """The refusal of a value whose type a stored state would not tell."""
     cure = advice_for(type(value))
     if cure:
         return KeepError(f"cannot keep {where}: it holds {with_article(type(value).__name__)}: {cure}", where)

@@ -3,7 +3,7 @@
 A stored state is msgpack of a *wire* value: None, a bool, an integer of 64 bits, a float, text, bytes, a list, a map with text
 keys that are the fields of a record, or a *marked* value: a map of one entry whose key starts with "$" and says what kind its
 payload is ("$datetime", "$array" …). The marks are a closed list of built-in kinds: no name on the wire is ever looked up as a
-class, so a stored state describes itself and still can build only what the program declares.
+class, so a stored state describes itself and still can build only classes that the program declares.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class Guarded:
         end: connected to the guard; ours from now on.
 
     Raises:
-        TaskError: the guard will not have it, or says what makes no sense.
+        TaskError: the guard will not have it, or sends nonsense.
     """
 
     def __init__(self, end: socket.socket) -> None:
@@ -114,12 +114,12 @@ class Guarded:
         """One packet, and its descriptors, ours to close.
 
         Raises:
-            TaskError: the guard has gone, or what came is no packet.
+            TaskError: the guard has gone, or sent bytes that are no packet.
         """
         room = socket.CMSG_SPACE(DESCRIPTORS_MAX * _INT_SIZE)
         try:
             content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, flags | socket.MSG_CMSG_CLOEXEC)
-        except ConnectionResetError:  # said once, before what it said when it hung up
+        except ConnectionResetError:  # said once, before the last packet of a guard that hung up
             content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, flags | socket.MSG_CMSG_CLOEXEC)
         carried = array.array("i")
         for level, kind, packed in ancillary:

@@ -257,7 +257,7 @@ class _Process:
         atexit.register(self.release)
 
     def release(self) -> None:
-        """Write what is newest, and let it go."""
+        """Write the newest commit, and let the task go."""
         if self.task is not None:
             task, self.task = self.task, None
             atexit.unregister(self.release)
@@ -291,7 +291,7 @@ def resume(
 
     Args:
         default: an object that can change: a dataclass, an attrs, msgspec or pydantic model, a dict, a list, an array.
-        version: of what the state looks like; raise it when a migration is needed.
+        version: of the state's form; raise it when a migration is needed.
         migrations: by the version that they start from, see ``failover.state``.
         pickled: store what is no plain data by pickle. A person who can write the folder can then run code in this program.
 

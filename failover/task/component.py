@@ -85,8 +85,8 @@ def kept(
 
     Args:
         default: its first value, copied for each use; or ``factory`` makes it.
-        shape, dtype: of an array that keeps its form, zeros at first. A large one lies in memory of which the kernel tells what
-            was written, so that a commit costs what was changed and not what it holds.
+        shape, dtype: of an array that keeps its form, zeros at first. The kernel tells which pages of a large one
+            were written, so that a commit costs the changed pages and not the whole array.
         formerly: names under which it was stored before it was renamed.
         pickled: store it by pickle. A person who can write the stored state can then run code in this program.
     """
@@ -135,7 +135,7 @@ def component(
     Args:
         name: of the component; the class's name in small letters unless given. The person who starts the program may set another.
         every: seconds from the beginning of a step to that of the next one; none: at once.
-        version: of what is kept; raise it when a migration is needed.
+        version: of the kept state; raise it when a migration is needed.
         migrations: by the version that they start from, see ``failover.state``.
     """
     if cls is not None and not isinstance(cls, type):
@@ -205,7 +205,7 @@ def run(cls: type[R]) -> R:
     """Make the component, give it its state, and run its steps; each that returns is committed.
 
     Kept attributes are there when ``__init__`` runs. After a resume they are set again afterwards, so that the beginnings which
-    it sets do not take the place of what was kept; then ``on_resume`` is called, if there is one, and then the steps begin.
+    it sets do not take the place of the kept values; then ``on_resume`` is called, if there is one, and then the steps begin.
     A step that returns `FINISHED` is the last one; one that raises is not committed. SIGTERM ends the program after the step
     under way.
 

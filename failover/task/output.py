@@ -17,7 +17,7 @@ from checkpoint.segment.layout import PENDING, Pending
 from checkpoint.segment.output_counters import StreamCounts, Totals
 
 PATIENCE_S: Final = 0.0003
-"""How long a commit waits for a guard that is just emptying a pipe or counting what it took; for one that stands still, once."""
+"""How long a commit waits for a guard that is just emptying a pipe or counting its bytes; for one that stands still, once."""
 LOOK_S: Final = 0.00005
 BUFFERED_MAX: Final = io.DEFAULT_BUFFER_SIZE + 8192
 """Bytes that Python holds back of one stream at most: the buffer of bytes, and one piece of text before it (``_CHUNK_SIZE``)."""

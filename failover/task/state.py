@@ -42,7 +42,7 @@ class KeptState:
     """Commits values of one schema. May be called from any thread; one commit at a time.
 
     Attributes:
-        live: memory for arrays, of which the kernel tells what was written.
+        live: memory for arrays, of which the kernel tells which pages were written.
     """
 
     def __init__(self, schema: Schema) -> None:

@@ -370,7 +370,7 @@ class Component:
     # --- holding still ---
 
     async def lease(self, until_ns: int) -> None:
-        """The program may run until CLOCK_BOOTTIME passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
+        """The program may run until CLOCK_BOOTTIME passes ``until_ns`` (0: for ever); renew in time. Thaws it if a lease froze it."""
         self._lease_until_ns = until_ns
         if self.prepared is None:  # else it is given with the start
             await self.ask_guard(messages.Lease(until_ns))
@@ -382,7 +382,7 @@ class Component:
     async def thaw(self) -> None:
         """Let it go on. Raises GuardError while its lease is over."""
         if self._held:
-            self._drop_keeper()  # lets go of what its last capture held; the next capture has a new one
+            self._drop_keeper()  # lets go of the program held by its last capture; the next capture has a new one
         await self.ask_guard(messages.Thaw())
 
     async def describe(self) -> Standing:
@@ -448,7 +448,7 @@ class Component:
     # --- guard and keeper ---
 
     def take(self, born: Started | VesselReady | Described, streams: tuple[int, ...]) -> None:
-        """Note what the guard said of it."""
+        """Note the guard's facts about it."""
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self._take_streams(streams)
         self.limit_output(self.engine == PTRACE)

@@ -41,7 +41,7 @@ class Occasions(Struct):
     """When before_capture began last."""
 
     async def before_start(self, act: acts.Start) -> None:
-        """Run what is to be run before it begins here.
+        """Run the hook that is due before it begins here.
 
         Raises:
             AgentError: it failed, and the program must not run here without it.
@@ -49,7 +49,7 @@ class Occasions(Struct):
         await self._prepare("before_start", act.spec, self._occasion(act, hooks.STARTED))
 
     async def before_capture(self, act: acts.Capture, pid: int) -> None:
-        """Run what is to be run before a whole snapshot, or the last one of a handover; it runs on meanwhile.
+        """Run the hook that is due before a whole snapshot, or the last one of a handover; the program runs on meanwhile.
 
         The agent takes the snapshot even when the hook fails: a snapshot of an unprepared program is better than none.
         """
@@ -96,7 +96,7 @@ class Occasions(Struct):
         self.around.tell(events.Noticed(self.name, said))
 
     async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion, pid: int) -> None:
-        """Run what is to be run once it has gone on here."""
+        """Run the hook that is due once it has gone on here."""
         if _signal_in(self._hook("after_resume", spec).command):
             return
         await self._run("after_resume", spec, replace(occasion, pid=pid))

@@ -42,7 +42,7 @@ from checkpoint.sentences import in_words
 STARTED: Final = "started"
 CAPTURED: Final = "captured"
 OUTPUT_MAX: Final = 4_096
-"""Bytes of what a hook said that stand in the log: the last ones."""
+"""Bytes of a hook's output that stand in the log: the last ones."""
 
 CHUNK: Final = 1 << 16
 """Bytes of it that are read at a time."""
@@ -51,7 +51,7 @@ LINE_MAX: Final = 300
 """Characters of the last line that ``failover why`` shows."""
 
 REST_S: Final = 0.5
-"""How long the rest of what a hook said is waited for once it has ended: another process may have its output open for ever."""
+"""How long to wait for the rest of a hook's output once it has ended: another process may have its output open for ever."""
 
 END_S: Final = 2.0
 """How long the end of a hook that took too long is waited for."""
@@ -73,7 +73,7 @@ class Hook(Struct, frozen=True):
     Attributes:
         command: the first word names the program; () for none.
         limit_s: it is ended after that.
-        user: None: the agent's own user, for what its operator wrote; else the program's, for what came with it.
+        user: None: the agent's own user, for a hook that its operator wrote; else the program's, for one that came with it.
     """
 
     command: tuple[str, ...]
@@ -207,10 +207,10 @@ class _Running(Struct):
     said: bytes = b""
 
     async def last_said(self, limit_s: float) -> bytes:
-        """Wait for the end of the hook; of what it said, which may be without end, the last bytes.
+        """Wait for the end of the hook; return the last bytes of its output, which may be without end.
 
         Raises:
-            TimeoutError: it runs for longer than ``limit_s``; how long the rest of what it said takes does not count.
+            TimeoutError: it runs for longer than ``limit_s``; the time for the rest of its output does not count.
         """
         reading = asyncio.create_task(self._read())
         try:
@@ -264,7 +264,7 @@ def _kill_of(session: int, pid: int) -> bool:
 
 
 def _log_output(kind: Kind, occasion: Occasion, said: bytes) -> str:
-    """Put what a hook said into the log; its last line."""
+    """Put a hook's output into the log; return its last line."""
     lines = said.decode(errors="replace").splitlines()
     for line in lines:
         log.info("%s: %s said: %s", occasion.component, kind, line)

@@ -90,14 +90,14 @@ class Following:
             self._link.dialogue.tell(message)
 
     async def let_loose(self) -> None:
-        """Have the keeper let go of what it follows, if it is there; it may follow something else then."""
+        """Have the keeper let go of the component that it follows, if it is there; it may follow another one then."""
         self._remembers_nothing()
         if self.is_there:
             self.followed = None
             await self.ask(messages.Release())
 
     def drop(self) -> None:
-        """The keeper ends, and lets go of what it follows."""
+        """The keeper ends, and lets go of the component that it follows."""
         self._remembers_nothing()
         link, self._link, self.followed = self._link, None, None
         if link is not None:

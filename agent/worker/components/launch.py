@@ -280,7 +280,7 @@ async def lay(
 
 
 def stale(name: str) -> ChainError:
-    """A ready copy does not lead to what the store holds now: a base has come."""
+    """A ready copy does not lead to the chain that the store holds now: a base has come."""
     return ChainError(copy_outdated("a new chain has begun", name))
 
 
@@ -307,7 +307,7 @@ async def finish(component: Component, outline: Snapshot, places: Places, option
 
 
 def terms_of(outline: Snapshot, here: Terms, owner: Owner | None) -> Terms:
-    """On which terms a component that comes back is followed on this robot: it carries what its snapshot says.
+    """The terms on which a component that comes back is followed on this robot: its snapshot says which files it carries.
 
     Args:
         owner: whose rights bound it, see `agent.worker.components.restore_limits.bound_of`.

@@ -62,7 +62,7 @@ class KeeperLink(Struct):
             raise KeeperLostError("the keeper ended before it was asked anything") from error
 
     def end(self) -> None:
-        """Hang up: it lets go of what it follows, and ends."""
+        """Hang up: it lets go of the component that it follows, and ends."""
         self.dialogue.close()
 
 
@@ -168,7 +168,7 @@ class ProcessPool:
         asyncio.get_running_loop().call_later(REFILL_S, self._prepare_if_possible)
 
     def _prepare_if_possible(self) -> None:
-        """A machine without memory or processes left is not made to fail by what only waits."""
+        """Spare processes only wait: they must not fail a machine without memory or processes left."""
         if self._closed:
             return
         try:
@@ -246,7 +246,7 @@ class ProcessPool:
         return child
 
     def _reap(self) -> None:
-        """Collect what has ended."""
+        """Collect the processes that have ended."""
         self._children = [child for child in self._children if child.poll() is None]
 
 

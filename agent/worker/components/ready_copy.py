@@ -44,7 +44,7 @@ log = logging.getLogger("failover.component")
 
 
 class Ready(Struct, frozen=True):
-    """A copy and what it stands at."""
+    """A copy, and the snapshot whose state it has."""
 
     component: Component
     outline: Snapshot
@@ -109,7 +109,7 @@ class ReadyCopy:
         return ready
 
     async def close(self) -> None:
-        """End what is kept, and see it ended."""
+        """End the copy that is kept, and see it ended."""
         self.drop()
         await asyncio.gather(*self._ending, return_exceptions=True)
 
@@ -189,7 +189,7 @@ class ReadyCopy:
         return wanted if wanted is not None and wanted in self._around.store.positions(self._name) else None
 
     async def _bring_on(self, position: Position | None = None) -> None:
-        """Apply what the store holds beyond it, up to a position; lay it again where that does not continue it."""
+        """Apply the snapshots that the store holds beyond it, up to a position; lay it again where that does not continue it."""
         ready = self._ready
         assert ready is not None, "laid before"
         entries = self._around.store.chain_of(self._name, position)

@@ -25,7 +25,7 @@ from failover.core import acts
 from failover.core.types import ComponentSpec, Resumption
 
 LINE_LIMIT: Final = 300
-"""Characters of what a program said last that are told."""
+"""Characters of a program's last line that are told."""
 
 
 async def brought_back(

@@ -86,7 +86,7 @@ class Snapshots(Struct, frozen=True):
         return path
 
     async def tidy(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
-        """Put away what is not needed any more.
+        """Remove snapshots that are not needed any more.
 
         Raises:
             CheckpointError, OSError: from the store.

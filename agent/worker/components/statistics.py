@@ -19,7 +19,7 @@ REASONS_TOLD: Final = 3
 
 
 GAPS_KEPT: Final = 64
-"""Of the commits that were captured last; the longest of them is what a program is used to."""
+"""Of the commits that were captured last; the longest interval is a program's usual one."""
 SILENT_TIMES: Final = 10
 """A program whose newest commit is so many times older than it is used to has stopped committing, it seems…"""
 SILENT_NS_MIN: Final = 2 * 10**9
@@ -169,7 +169,7 @@ class Figures(Struct):
 
     @property
     def xor_hit_rate(self) -> float | None:
-        """Which part of what deltas carried could be told as a difference; None before the first one."""
+        """Which part of the bytes in deltas could be told as a difference; None before the first one."""
         return self.known_bytes / self.written_bytes if self.written_bytes else None
 
     def captured(self, captured: Captured, budget_ms: float = 0) -> None:

@@ -46,7 +46,7 @@ log = logging.getLogger("failover.component")
 
 @dataclass(slots=True)
 class Supervisor:
-    """The component and what is to be done with it.
+    """The component and the acts that are due on it.
 
     Attributes:
         component: None while nothing of it runs here.
@@ -110,7 +110,7 @@ class Supervisor:
             self._queue.put_nowait(act)
 
     def _note_lease(self, act: Act) -> None:
-        """Leases and freezes overtake what waits in the queue: a thaw or a restore must not bring an older lease back."""
+        """Leases and freezes overtake the acts that wait in the queue: a thaw or a restore must not bring an older lease back."""
         match act:
             case acts.SetLease():
                 self._lease_until_ns = act.until_ns

@@ -72,7 +72,7 @@ class Standby:
         return ready
 
     async def close(self) -> None:
-        """End what waits, and see it ended."""
+        """End the program that waits, and see it ended."""
         self.cool()
         await asyncio.gather(*self._ending, return_exceptions=True)
 

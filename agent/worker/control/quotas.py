@@ -22,7 +22,7 @@ USER_CONNECTIONS_MAX: Final = 32
 """Of any other user: each `failover run` that waits, `logs -f` and `status --watch` holds one."""
 
 OTHERS_CONNECTIONS_MAX: Final = 128
-"""Of all those users together: the agent keeps its descriptors for what it protects."""
+"""Of all those users together: the agent keeps its descriptors for the components that it protects."""
 
 USER_BYTES_MAX: Final = 8 << 20
 """Of requests of one user that have arrived and are not answered, without the first 32 KB of each: a small one is heard."""

@@ -121,7 +121,7 @@ class ControlServer:
             writer.close()
 
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Request after request, until the client closes, or says what is none, or says nothing."""
+        """Serve request after request, until the client closes, sends bytes that are none, or sends nothing."""
         connection = writer.get_extra_info("socket")
         uid = uid_of(connection)
         try:

@@ -174,7 +174,7 @@ class Links:
         self.trouble = ""
 
     def refresh(self) -> list[str]:
-        """Ask the kernel anew; returns what changed, a sentence each."""
+        """Ask the kernel anew; returns the changes, a sentence each."""
         try:
             self._scene = scene = Scene.now()
         except OSError as error:

@@ -107,7 +107,7 @@ class Errands:
         task.add_done_callback(end_worker_on_mistake)
 
     async def close(self) -> None:
-        """Give up what is under way."""
+        """Give up the orders under way."""
         tasks = [task for under_way in self._under_way.values() for task in under_way]
         for task in tasks:
             task.cancel()

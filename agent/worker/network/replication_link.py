@@ -1,7 +1,7 @@
 """The replication link: ZeroMQ between agents, authenticated and encrypted by CURVE. The only ``zmq`` import.
 
 One ROUTER socket receives from all peers; one DEALER socket sends to each peer. A connection carries one direction's messages, in
-order. Messages queued for a connection are lost with the connection: the core says again what still matters.
+order. Messages queued for a connection are lost with the connection: the core repeats messages that still matter.
 
 The link identifies a sender by key, not by claim: the ZAP answer below admits only public keys of the team file and names their
 owner. Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
@@ -130,7 +130,7 @@ Unread = Callable[[str, str], None]
 
 
 class Callbacks(Struct, frozen=True):
-    """Whom a link tells what happens on it."""
+    """Functions to which a link tells its events."""
 
     receive: Receive
     changed: Changed

@@ -86,7 +86,7 @@ class Deposit:
         return self._senders.get(component, "")
 
     def admits(self, peer: str, offer: Offer) -> None:
-        """Refuse what was not asked for, before a byte of it travels.
+        """Refuse a snapshot that was not asked for, before a byte of it travels.
 
         Raises:
             Refusal: with the reason for the sender's status.
@@ -104,14 +104,14 @@ class Deposit:
         return "" if taken else f"this robot does not take snapshots of {component} from {peer}"
 
     async def make_room(self, size: int) -> None:
-        """Have room for a snapshot of so many bytes, if what is kept for people can give it."""
+        """Have room for a snapshot of so many bytes, if the snapshots kept for people can give it."""
         try:
             await asyncio.to_thread(self._store.make_room, size)
         except StoreError as error:
             log.warning("%s", error)
 
     def not_taken(self, peer: str, offer: Offer, why: str) -> None:
-        """The disk did not take what was admitted: the core hears of it, and status tells."""
+        """The disk did not take an admitted snapshot: the core hears of it, and status tells."""
         self._tell(StoreFailed(offer.component, offer.epoch, peer, why, needs_base=False))
 
     async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
@@ -186,7 +186,7 @@ class Deposit:
                 logs.apply(one.output, is_safe=True)
         finally:
             logs.close()
-        if is_gap:  # an earlier worker took in what came before
+        if is_gap:  # an earlier worker took in the snapshots before
             self._complete(component, directory, position, is_safe=True)
         while unshown and unshown[0].position <= position:
             unshown.popleft()

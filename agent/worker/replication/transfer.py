@@ -300,7 +300,7 @@ class Receiver:
             try:
                 await self._fill(peer, transfer, descriptor)
                 if isinstance(offer, Offer):
-                    self._incoming.pop((peer, offer.transfer), None)  # a newer one does not end what is whole
+                    self._incoming.pop((peer, offer.transfer), None)  # a newer offer does not end a whole one
                 await self._desk.take(peer, offer, descriptor)
                 self._link.say(peer, Taken(offer.transfer))
             finally:

@@ -85,7 +85,7 @@ class Means(Struct, frozen=True):
 
 
 def means() -> Means:
-    """Find out what can be had here."""
+    """Find out which means can be had here."""
     probe = subprocess.run(host_command(True, ["/bin/true"]), input=GO, capture_output=True, check=False)
     own_network = os.geteuid() == 0 and ip_command() is not None and can_unshare_network()
     return Means(own_pids=probe.returncode == 0, own_network=own_network)
@@ -373,7 +373,7 @@ def run(command: list[str]) -> None:
     """Run one set-up command.
 
     Raises:
-        FailoverError: it failed; says what it said.
+        FailoverError: it failed; quotes its message.
     """
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     if ran.returncode:

@@ -285,7 +285,7 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
 
 
 def _add(told: str, line: str, lines: list[str]) -> None:
-    """Add a line. Where another one gives its cause, which stands behind a colon, that one says what else follows from it."""
+    """Add a line. Where another one gives its cause, which stands behind a colon, that one also tells this consequence."""
     what, _, rest = line.partition(": ")
     cause = rest.partition("; ")[0]
     for index, other in enumerate(lines):

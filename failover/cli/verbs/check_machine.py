@@ -30,7 +30,7 @@ STAND_IN = ("sleep", "60")
 
 
 LOCKED_OR_FIRST: Final = ("beats run at ", "the main loop's memory ")
-"""How an agent's notes begin that say what it was refused of real-time priority and locked memory (`agent.system.clock`)."""
+"""How an agent's notes begin that tell of refused real-time priority and locked memory (`agent.system.clock`)."""
 
 
 class Offer(Struct, frozen=True):

@@ -207,7 +207,7 @@ def stop(arguments: argparse.Namespace) -> int:
 
 
 def logs(arguments: argparse.Namespace) -> int:
-    """Show what a component wrote, from whichever robot it wrote it; with --follow through restarts of the agent."""
+    """Show the output of a component, on whichever robot it wrote it; with --follow through restarts of the agent."""
     offsets = [0, 0]
     agent = connect(arguments)
     try:
@@ -230,7 +230,7 @@ def logs(arguments: argparse.Namespace) -> int:
 
 
 def _show_logs(agent: Control, arguments: argparse.Namespace, offsets: list[int]) -> dict[str, Any]:
-    """Show the streams from the offsets on, which move along; returns what the agent ends with."""
+    """Show the streams from the offsets on, which move along; returns the agent's last answer."""
     for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow, offsets=offsets):
         if isinstance(reply, Output):
             _show_piece(arguments, reply)

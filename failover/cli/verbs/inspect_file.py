@@ -22,7 +22,7 @@ PROTECTION = ((1, "r"), (2, "w"), (4, "x"))
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Show what a snapshot holds."""
+    """Show the content of a snapshot."""
     try:
         format.verify(arguments.file)
         snapshot = format.read_outline(arguments.file)

@@ -23,7 +23,7 @@ NEAR_MS: Final = 1.0
 
 
 def why(arguments: argparse.Namespace) -> int:
-    """Tell what was seen, by whom, when, and what was done about it."""
+    """Tell which robot saw which facts, when, and what it decided."""
     wanted = {"name": arguments.name or "", "robot": arguments.robot or "", "age_ms_max": arguments.since or 0}
     with connect(arguments) as agent:
         answer = agent.ask("why", **wanted)

@@ -248,7 +248,7 @@ def writer(
     (A lock would do the same for a quarter of a microsecond more.)
 
     Args:
-        number: of the newest put, or what the first one is to come after.
+        number: of the newest put, or the one that the first one is to come after.
         skew_ns: by how much this process's CLOCK_BOOTTIME is ahead of the machine's.
         slow: is called in place of ``put``.
         woken: wakes those that wait; is given the stamp.

@@ -239,10 +239,10 @@ def read_records(view: Buffer, header: Header) -> Iterator[Record]:
 def read_record(view: Buffer, header: Header, index: int) -> Record | None:
     """One record; None where there is a hole.
 
-    All that it names lies inside of ``view``: the file may be longer than what is mapped, when others have added items since.
+    All that it names lies inside of ``view``: the file may be longer than the mapping, when others have added items since.
 
     Raises:
-        BoardError: it is damaged, or lies outside of what is mapped.
+        BoardError: it is damaged, or lies outside of the mapping.
     """
     id_, kind, banks, offset, size, stride, period, phase, digest, name_offset, bound, flags = DECLARATION.unpack_from(
         view, record_at(index)

@@ -8,7 +8,7 @@
   valid leases.
 * *Pre-vote.* Members say in heartbeats whether they are free. No robot claims before a majority is free: a robot that is cut off
   raises no epoch.
-* *Nothing acknowledged is lost.* A primary acknowledges what a standby holds once a majority has noted that standby. Members vote
+* *Nothing acknowledged is lost.* A primary acknowledges a standby's position once a majority has noted that standby. Members vote
   for robots that hold as much; for others only when those were out of reach for ``patience_ms``, or by an operator's order.
 * *The robot with a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that. A robot
   without one gives its copy up to an elected one, and to a later epoch's that holds as much; otherwise it contends for votes.
@@ -125,13 +125,13 @@ def starters(component: Component, turn: Turn) -> Iterator[str]:
 
 
 def _sure(component: Component, turn: Turn) -> tuple[str, ...]:
-    """The robots that hold what was acknowledged: the primary and whom it has entrusted; this one not, if it has lost it."""
+    """The robots that hold all that was acknowledged: the primary and those it has entrusted; this one not, if it has lost it."""
     lost = turn.me if component.bare else ""
     return tuple(robot for robot in (component.primary, *component.entrusted) if robot not in ("", lost))
 
 
 def holds_all(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
-    """Whether a robot is one of those, or has at least what one of them has."""
+    """Whether a robot is one of those, or has at least as much as one of them."""
     return _covers(component, turn, _sure(component, turn), robot, position)
 
 

@@ -1,4 +1,4 @@
-"""Decides which robot runs a component: claims, consent, and what follows from hearing another robot's.
+"""Decides which robot runs a component: claims, consent, and the consequences of another robot's word.
 
 A primacy is an epoch and the robot that all robots which know of it name as its primary. The rules:
 
@@ -103,10 +103,10 @@ def waits_after_boot_ns(component: Component, turn: Turn) -> int:
 def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> bool:
     """No living member holds it or knows its end, and each member is heard or dead.
 
-    A server or a witness repeats what it has heard of an end: its word, or its silence, counts until a majority knows of none.
+    A server or a witness repeats an end that it has heard of: its word, or its silence, counts until a majority knows of none.
 
     Args:
-        is_ordered: an operator says so of robots that send what cannot be authenticated.
+        is_ordered: an operator says so of robots whose packets cannot be authenticated.
     """
     is_doubtful = False
     for robot, peer in turn.team.peers.items():
@@ -342,7 +342,7 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
 
 
 def clear_away(component: Component, turn: Turn, epoch: int) -> None:
-    """Have the agent end the copy that is here, or what is left of it, before this robot stands by."""
+    """Have the agent end the copy that is here, or its remains, before this robot stands by."""
     component.move(Cause.OUTBID)
     component.until_ns = turn.now_ns + turn.config.retry_ms * MS
     turn.order(acts.Stop(component.name, epoch))

@@ -64,7 +64,7 @@ def _newest_of(entries: list[tuple[str, Entry]]) -> Position | None:
 
 
 def _is_untold(component: Component, turn: Turn) -> bool:
-    """Whether a server that lives has not said yet what it keeps of the component."""
+    """Whether a server that lives has not told its checkpoint of the component yet."""
     return any(
         peer.entry(component.name) is None and not peer.complete
         for peer in turn.team.living(turn.now_ns)

@@ -1,4 +1,4 @@
-"""Record of a decision for ``failover why``: the sentence, and what this robot knew at that instant.
+"""Record of a decision for ``failover why``: the sentence, and the facts that this robot knew at that instant.
 
 The newest heartbeats that a robot had heard order the event logs of several robots without a comparison of their clocks: a robot
 that had heard a heartbeat sent after this robot's decision decided later (`failover.core.event_log.merge`).

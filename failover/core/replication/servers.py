@@ -72,7 +72,7 @@ def _send(component: Component, turn: Turn, server: str, has: Position | None) -
 
 
 def give_back(component: Component, turn: Turn) -> None:
-    """Send what this server, or (``on_loss = hold``) this standby, keeps to the robot that is to run it."""
+    """Send the checkpoint of this server, or (``on_loss = hold``) this standby, to the robot that is to run it."""
     flight, mine = component.flight, component.newest
     if flight is not None and (turn.now_ns >= flight.until_ns or not turn.alive(flight.to)):
         component.flight = flight = None
@@ -115,7 +115,7 @@ def _lacks(component: Component, peer: Peer, mine: Position) -> bool:
 
 
 def admit_a_return(component: Component, turn: Turn) -> None:
-    """The checkpoint that a server, or (``on_loss = hold``) the standby, kept for us may come back; or what an operator wants."""
+    """The checkpoint that a server, or (``on_loss = hold``) the standby, kept for us may come back; or one an operator wants."""
     if not turn.config.runs(turn.me) or not vacant(component, turn):
         return
     best = offer(component, turn, is_ordered=component.wanted is not None)

@@ -1,7 +1,7 @@
 """Replication of a component's state to its standby, and its acknowledgement there.
 
 Invariants: one snapshot in flight per component (a slower link means fewer snapshots, not longer queues); a position is
-acknowledged to the keeper only when it is safe elsewhere, or no other robot is there; a delta counts from what the standby has.
+acknowledged to the keeper only when it is safe elsewhere, or no other robot is there; a delta counts from the standby's position.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def ship_ended(component: Component, turn: Turn, event: ShipEnded) -> None:
 
 
 def acknowledged(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
-    """The standby's word on what it holds."""
+    """The standby's word on its newest snapshot."""
     flight = component.flight
     if flight is None or flight.position is None or flight.to != sender or not _follows_us(component, turn, entry):
         return

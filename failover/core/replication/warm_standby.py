@@ -18,7 +18,7 @@ from failover.core.wire.messages import WARM
 
 
 def review(component: Component, turn: Turn) -> None:
-    """Order what should wait here, and the end of what should wait no longer."""
+    """Order the program that should wait here, and the end of one that should wait no longer."""
     if component.state is State.CLAIMING:  # the waiting program is about to be used
         return
     if component.holding:  # the order to run it has used the waiting program, or ended it

@@ -1,4 +1,4 @@
-"""Decides what follows when a component's program ended, crashed, or could not be brought to run.
+"""Decides the next step when a component's program ended, crashed, or could not be brought to run.
 
 Invariants: an end is a record before any robot or client is told of it; crashes make no endless loop and throw no checkpoint
 away.

@@ -1,4 +1,4 @@
-"""An operator's order that this robot runs a component now, although the rules still wait; and what that risks.
+"""An operator's order that this robot runs a component now, although the rules still wait; and its risks.
 
 Under ``pair`` the order stands for the consent of robots that are not heard: it brings a component back to life that
 ``on_loss = hold`` or ``when_alone = freeze`` holds still. Its epoch is above any that they could have opened meanwhile. Under
