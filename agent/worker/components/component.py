@@ -370,7 +370,7 @@ class Component:
     # --- holding still ---
 
     async def lease(self, until_ns: int) -> None:
-        """The program may run until CLOCK_BOOTTIME passes ``until_ns`` (0: for ever); renew in time. Thaws it if a lease froze it."""
+        """Let it run until CLOCK_BOOTTIME passes ``until_ns``; renew in time. 0 for ever. Thaws a program that a lease froze."""
         self._lease_until_ns = until_ns
         if self.prepared is None:  # else it is given with the start
             await self.ask_guard(messages.Lease(until_ns))
