@@ -150,8 +150,8 @@ class WorkerProcess:
     def order(self, act: Act) -> None:
         """Pass an act on, and remember it until it is answered.
 
-        A process that has not sent its inventory cannot carry anything out yet. When the inventory comes, expected answers count
-        as lost, and all other acts are sent.
+        A process that has not sent its inventory cannot carry anything out yet. When the inventory comes, acts that await
+        an answer count as lost, and all other acts are sent.
         """
         expected = isinstance(act, EXPECTED)
         if isinstance(act, acts.Admit):

@@ -31,7 +31,7 @@ PATIENCE_S: Final = 15.0
 """How long another robot may take to look what it lacks: it reads files."""
 
 CLEARING_S: Final = 5.0
-"""How long to wait for a copy that is being ended here: the next copy does not lack the names and ports that it holds."""
+"""How long to wait for a copy that is being ended here: once it has gone, its names and ports are free for the next one."""
 
 log = logging.getLogger("failover.lacks")
 
