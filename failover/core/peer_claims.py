@@ -1,4 +1,4 @@
-"""Checks whether a member may say its word on a component: by its role, by the growth of epochs, by the robot that it names.
+"""Checks each word of a member on a component: by its role, by the growth of epochs, by the word of the robot that it names.
 
 Every member holds a key of the team, and one key may be stolen. So each entry is checked before the rules see it:
 

@@ -55,7 +55,7 @@ log = logging.getLogger("failover")
 
 
 class Handed(Struct, frozen=True):
-    """The state and the descriptors that the guard gave at the beginning.
+    """The packet and the state that the guard gave at the beginning.
 
     Attributes:
         state: of the last commit; None where the component begins.

@@ -271,7 +271,7 @@ def _moved(answer: dict[str, Any]) -> str:
 
 
 def promote(arguments: argparse.Namespace) -> int:
-    """Have a robot run what no robot is heard to run, once the operator knows what that risks."""
+    """Have a robot run a component that no robot is heard to run, once the operator knows the risks."""
     wanted = {"name": arguments.name, "robot": arguments.robot or ""}
     with connect(arguments) as agent:
         would = agent.ask("promote", **wanted)

@@ -124,7 +124,7 @@ def admit_a_return(component: Component, turn: Turn) -> None:
 
 
 def offer(component: Component, turn: Turn, *, is_ordered: bool) -> tuple[str, Position] | None:
-    """The living member whose checkpoint is the newest that one would send us, and that. ``is_ordered``: by an operator."""
+    """The newest checkpoint that a living member would send us: the member, and the position. ``is_ordered``: by an operator."""
     offers = [
         (entry.position, turn.config.runs(robot), robot)
         for robot, entry in living_entries(component, turn)

@@ -28,7 +28,7 @@ def begin(component: Component, turn: Turn, to: str, request: int) -> None:
 
 
 def resume_here(component: Component, turn: Turn, request: int) -> None:
-    """By order: run what no robot runs, from the checkpoint held here, unless another robot may have a newer one."""
+    """By order: run a component that no robot runs, from the checkpoint held here, unless another may have a newer one."""
     if component.newest is None:
         _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
     elif not turn.config.runs(turn.me):
