@@ -36,6 +36,7 @@ from benchmarks import (
     files,
     increments,
     interference,
+    lateness,
     load,
     machine,
     outage,
@@ -111,6 +112,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "throughput": interference.throughput,
     "costs": costs.costs,
     "beats": interference.beats,
+    "lateness": lateness.lateness,
     "encoding": encoding.encoding,
     "task": task.task,
 }

@@ -42,7 +42,7 @@ from agent.main_loop.outbox import Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
 from agent.main_loop.vote_record_writer import Persister
 from agent.main_loop.worker_process import LanesProcess
-from agent.system import clock, syscalls
+from agent.system import clock, syscalls, timers
 from agent.system.sd_notify import Notifier, watchdog_period_ns
 from checkpoint.keeper.messages import ChannelClosedError, ChannelError
 from failover.core import vote_record as core_vote_record
@@ -112,6 +112,7 @@ class Heart:
         self._persister = Persister(lambda wanted: ballot.keep(core_vote_record.encode(wanted)))
         self._scribe = Scribe(Path(settings.config.state_directory), self._me, ballot.record.boot)
         self._poll = select.epoll()
+        self._alarm = timers.Alarm()
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
@@ -160,7 +161,7 @@ class Heart:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
-        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno()):
+        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno(), self._alarm.fileno()):
             self._poll.register(descriptor, select.EPOLLIN)
         gc.collect()
         syscalls.give_back()  # before memory is locked: then it would stay
@@ -184,7 +185,8 @@ class Heart:
         """Sleep, then one round of everything that came, then the core's deadline."""
         self._lanes.flush()
         self._rest()
-        came = self._poll.poll(self._pause_s())
+        self._alarm.set(self._wakes_ns())
+        came = self._poll.poll(SLEEP_LIMIT_S)
         if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
             self._hear()
         for descriptor, _ in came:
@@ -237,14 +239,12 @@ class Heart:
         self._lanes_silent_ns = self._lanes_unseen_ns = 0
         self._lanes_turns, self._lanes_allowed_ns = None, allowed_ns
 
-    def _pause_s(self) -> float:
+    def _wakes_ns(self) -> int | None:
+        """When the next turn is due, whatever comes; None while the node is not born yet."""
         if self._node is None:
-            return SLEEP_LIMIT_S
-        now_ns = clock.now_ns()
-        left_ns = self._node.next_deadline_ns() - now_ns
-        if not self._listens and not self._rests:
-            left_ns = min(left_ns, self._deaf_until_ns - now_ns)
-        return min(max(left_ns / NANOSECONDS_A_SECOND, 0.0), SLEEP_LIMIT_S)
+            return None
+        deadline_ns = self._node.next_deadline_ns()
+        return deadline_ns if self._listens or self._rests else min(deadline_ns, self._deaf_until_ns)
 
     # --- events in ---
 
@@ -406,6 +406,7 @@ class Heart:
         self._scribe.close(PERSIST_PATIENCE_S)
         self._lanes.wait()
         self._beats.close()
+        self._alarm.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)
         log.info("robot %s ends; its components live on", self._me)
