@@ -6,6 +6,7 @@ from random import Random
 from unittest.mock import patch
 
 from failover.core import beat_builder
+from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
