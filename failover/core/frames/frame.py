@@ -66,9 +66,13 @@ NO_RANK: Final = -1
 
 HEADER: Final = struct.Struct("<2sBBHH8sIIQQIBBH")
 CODE_SIZE: Final = 8
+NUMBER_SIZE: Final = 2
+SEAL_SIZE: Final = NUMBER_SIZE + CODE_SIZE
+"""Of one authenticator: which key, and the code under it."""
+
 DIGEST_SIZE: Final = 32
 _PERSON: Final = b"failover-frame-1"
-_NO_CODE: Final = bytes(CODE_SIZE)
+_NO_SEAL: Final = bytes(SEAL_SIZE)
 
 PIECE_HEAD: Final = 1 + 5 + 5 + 9 + 3 + 5 + 5
 """Most bytes of an item in a frame, or of a piece of it, without its value."""
@@ -192,7 +196,7 @@ def codes(members: int) -> int:
 
 def body_size_max(members: int) -> int:
     """Bytes of a part's body in a team of so many."""
-    return FRAME_SIZE_MAX - HEADER.size - CODE_SIZE * codes(members)
+    return FRAME_SIZE_MAX - HEADER.size - SEAL_SIZE * codes(members)
 
 
 def beat_size_max(members: int) -> int:
@@ -297,7 +301,7 @@ class Sealer:
                 *(self._name, self._boot, counter, round_ & 0xFFFFFFFF, part, len(bodies), len(keys)),
             )
             digest = _digest(header, body)
-            sealed.append(b"".join((header, *[_code(digest, key) if key else _NO_CODE for key in keys], body)))
+            sealed.append(b"".join((header, *[_number(key) + _code(digest, key) if key else _NO_SEAL for key in keys], body)))
         return sealed
 
 
@@ -309,6 +313,12 @@ def name_tag(robot: str) -> int:
 
 def _digest(header: bytes, body: bytes) -> bytes:
     return blake2b(header + body, digest_size=DIGEST_SIZE, person=_PERSON).digest()
+
+
+@functools.lru_cache(4 * PEERS_MAX)
+def _number(key: bytes) -> bytes:
+    """Which key it was: a receiver tells a key that it was not given yet from a forgery."""
+    return blake2b(key, digest_size=NUMBER_SIZE, person=b"failover-key-id\x00").digest()
 
 
 def _code(digest: bytes, key: bytes) -> bytes:
@@ -381,7 +391,7 @@ class Receiver:
 
     def open(self, datagram: bytes) -> Part | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes."""
-        if not HEADER.size + CODE_SIZE < len(datagram) <= FRAME_SIZE_MAX:
+        if not HEADER.size + SEAL_SIZE < len(datagram) <= FRAME_SIZE_MAX:
             return Refused(Reason.VERSION if datagram[:2] == MAGIC_BEFORE else Reason.NOT_OURS)
         magic, version, flags, rank, medium, tag, roster, name, boot, counter, round_, part, parts, count = HEADER.unpack_from(
             datagram
@@ -392,7 +402,7 @@ class Receiver:
             return Refused(Reason.VERSION)
         if tag != self._tag:
             return Refused(Reason.TEAM)
-        start = HEADER.size + CODE_SIZE * count
+        start = HEADER.size + SEAL_SIZE * count
         if not 0 < count < RANKS_MAX or start >= len(datagram):
             return Refused(Reason.NOT_OURS)
         if not part < parts <= PARTS_MAX:
@@ -402,9 +412,11 @@ class Receiver:
         if not sender:
             return Refused(Reason.UNKNOWN_KEY)
         places = self._places(rank, count, alike, sender)
-        digest = _digest(datagram[: HEADER.size], datagram[start:])
-        if not self._is_authentic(datagram, places, digest, sender):
-            return Refused(Reason.FORGED if places else Reason.ROSTER)
+        if not places:
+            return Refused(Reason.ROSTER)
+        refusal = self._check(datagram, start, places, sender)
+        if refusal is not None:
+            return Refused(refusal)
         try:
             body = _decoder.decode(datagram[start:])
         except UNDECODABLE:
@@ -433,14 +445,18 @@ class Receiver:
         place = self._me - (self._me > rank)
         return range(place, place + 1)
 
-    def _is_authentic(self, datagram: bytes, places: range, digest: bytes, sender: str) -> bool:
+    def _check(self, datagram: bytes, start: int, places: range, sender: str) -> Reason | None:
+        """Whether one of the authenticators is ours and right."""
+        digest = b""
         for key in self._keys[sender]:
-            right = _code(digest, key)
+            number = _number(key)
             for place in places:
-                at = HEADER.size + CODE_SIZE * place
-                if hmac.compare_digest(datagram[at : at + CODE_SIZE], right):
-                    return True
-        return False
+                at = HEADER.size + SEAL_SIZE * place
+                if datagram.startswith(number, at):
+                    digest = digest or _digest(datagram[: HEADER.size], datagram[start:])
+                    if hmac.compare_digest(datagram[at + NUMBER_SIZE : at + SEAL_SIZE], _code(digest, key)):
+                        return None
+        return Reason.FORGED if digest else Reason.UNKNOWN_KEY
 
 
 def _is_sound(body: Body, boot: int, counter: int) -> bool:
