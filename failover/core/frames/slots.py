@@ -8,7 +8,7 @@ reference makes its round longer by as much: the team gives way to periodic traf
 What a robot sees of each other one, at the end of each own round (`TABLE`; a frame of a higher boot: `Slots._reborn`):
 
     NOT    -- heard -->                                            INSERT
-    INSERT -- not heard -->                                        NOT
+    INSERT -- not heard in two rounds -->                          NOT
     INSERT -- every running peer that it hears sees it -->         RUN
     INSERT -- heard for remove_at_most rounds without that -->     RUN
     RUN    -- not heard in this round -->                          REMOVE
@@ -38,6 +38,9 @@ HOLD_US_MAX = (1 << 32) - 1
 
 WHOLE_ROUND = 3 / 4
 """A round of less than this part of T_tup, cut short by a move of the slot or by own lateness, accuses nobody of silence."""
+
+WIDE = 2 / 3
+"""A gap of this part of the widest one is wide, too: jitter makes no choice."""
 
 ECHO_ROUNDS = 2
 """Rounds for which a frame is echoed."""
@@ -86,9 +89,14 @@ def _is_missed(_terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
     return not peer.heard
 
 
+def _is_missed_twice(_terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
+    """A newcomer speaks in a gap: one frame that the medium delays beyond the end of our round is not missing yet."""
+    return peer.missed > 1
+
+
 def _is_agreed(_terms: Terms, peer: Peer, running: tuple[Peer, ...]) -> bool:
-    """Every running peer that it hears sees it, too; whom it does not hear is not asked."""
-    return all(one.sees(peer.rank) in _THERE for one in running if peer.sees(one.rank) != Seen.NOT)
+    """Heard, and every running peer that it hears sees it, too; whom it does not hear is not asked."""
+    return peer.heard and all(one.sees(peer.rank) != Seen.NOT for one in running if peer.sees(one.rank) != Seen.NOT)
 
 
 def _waited_enough(terms: Terms, peer: Peer, _running: tuple[Peer, ...]) -> bool:
@@ -107,13 +115,12 @@ Condition = Callable[[Terms, Peer, tuple[Peer, ...]], bool]
 
 TABLE: dict[Seen, tuple[tuple[Condition, Seen], ...]] = {
     Seen.NOT: ((_is_heard, Seen.INSERT),),
-    Seen.INSERT: ((_is_missed, Seen.NOT), (_is_agreed, Seen.RUN), (_waited_enough, Seen.RUN)),
+    Seen.INSERT: ((_is_missed_twice, Seen.NOT), (_is_agreed, Seen.RUN), (_waited_enough, Seen.RUN)),
     Seen.RUN: ((_is_missed, Seen.REMOVE),),
     Seen.REMOVE: ((_is_heard, Seen.RUN), (_is_missed_by_all, Seen.NOT), (_is_missed_for_long, Seen.NOT)),
 }
 """Every arrow; the first whose condition holds is taken."""
 
-_THERE = frozenset({Seen.INSERT, Seen.RUN})
 _AWAY = frozenset({Seen.REMOVE, Seen.NOT})
 _COUNTED = frozenset({Seen.RUN, Seen.REMOVE})
 
@@ -199,23 +206,20 @@ class Slots:
         """Where the first frame goes: into a team's largest gap; among robots that begin like us, by rank."""
         lowest = min((peer for peer in self.peers.values() if peer.heard), key=_rank)
         if lowest.set.bit_count() > 1:
-            first_ns = self._widest_gap(self._listened_ns)
+            first_ns = self._widest_gap(lowest)
         elif self.terms.spread:
             first_ns = lowest.left_ns + self._spread_ns(lowest.rank)
         else:
             return
         self._next_ns = self._listened_ns + (first_ns - self._listened_ns) % self._t_ns
 
-    def _widest_gap(self, at_ns: int) -> int:
-        """The middle of the widest gap between the sends that were heard in the last two rounds; of equal gaps one by rank."""
-        fresh_ns = at_ns - ECHO_ROUNDS * self._t_ns
-        phases = sorted(peer.left_ns % self._t_ns for peer in self.peers.values() if peer.heard and peer.left_ns > fresh_ns)
-        gaps = [
-            (after - before) % self._t_ns or self._t_ns for before, after in zip(phases, phases[1:] + phases[:1], strict=True)
-        ]
-        wide = [place for place, gap in enumerate(gaps) if gap + self.terms.delta_min_us * US >= max(gaps)]
+    def _widest_gap(self, first: Peer) -> int:
+        """The middle of a wide gap between the sends that were heard; which, is told by rank, as others may join with us."""
+        phases = sorted((peer.left_ns - first.left_ns) % self._t_ns for peer in self.peers.values() if peer.heard)
+        gaps = [after - before for before, after in zip(phases, [*phases[1:], self._t_ns], strict=True)]
+        wide = [place for place, gap in enumerate(gaps) if gap >= WIDE * max(gaps)]
         place = wide[self.me % len(wide)]
-        return phases[place] + gaps[place] // 2
+        return first.left_ns + phases[place] + gaps[place] // 2
 
     def _adapt(self, peer: Peer) -> None:
         """As the reference: the longest delay that is worth following makes this round longer."""
@@ -244,8 +248,8 @@ class Slots:
             self.set, self.set_round = lead.set, lead.set_round
         elif self._left_out < self.terms.remove_at_most:
             return  # it has not accepted us yet: we keep our phase, and move once only
-        if not self.set >> lead.rank & 1 or self._sent_ns is None:
-            return
+        if not self.set >> lead.rank & 1 or self._sent_ns is None or lead.came_ns >= self._next_ns:
+            return  # the last: our frame is due already, and leaves now
         target_ns = lead.left_ns + self._apart(self.me, lead.rank) * self._slot_ns()
         if target_ns - self._sent_ns < self._t_ns // 2:  # we have spoken in this round
             target_ns += self._t_ns
@@ -332,9 +336,11 @@ class Slots:
 
     def _vouched(self) -> list[int]:
         """Ranks that we hear no longer, but a running peer does: they send, so a slot is theirs."""
-        running = [peer for peer in self.peers.values() if peer.seen is Seen.RUN]
         lost = [rank for rank, peer in self.peers.items() if peer.seen is Seen.NOT or peer.missed >= self.terms.remove_after]
-        return [rank for rank in lost if any(peer.sees(rank) == Seen.RUN for peer in running)]
+        return [rank for rank in lost if self._is_run_by_one(rank)]
+
+    def _is_run_by_one(self, rank: int) -> bool:
+        return any(peer.seen is Seen.RUN and peer.sees(rank) == Seen.RUN for peer in self.peers.values())
 
     def _choose_set(self) -> None:
         """The reference makes the set; a follower takes it from the reference's frames, and makes its own only when left out."""
@@ -343,14 +349,16 @@ class Slots:
             self._use(self._own_view())
         elif self._is_in(self.peers[self._lead]):
             self._left_out = 0
+            self.set, self.set_round = self.peers[self._lead].set, self.peers[self._lead].set_round
         else:
             self._left_out += 1
             if self._left_out >= self.terms.remove_at_most:
                 self._use(self._own_view())
 
     def _own_view(self) -> int:
-        counted = [rank for rank, peer in self.peers.items() if peer.seen in _COUNTED]
-        return word([*([self.me] if self.terms.transmit else []), *counted, *self._vouched()])
+        """Who has a slot, as far as we know: ourselves, whom we run, and whom a running peer runs."""
+        members = [rank for rank, peer in self.peers.items() if peer.seen in _COUNTED or self._is_run_by_one(rank)]
+        return word([self.me, *members] if self.terms.transmit else members)
 
     def _use(self, members: int) -> None:
         if members != self.set:
