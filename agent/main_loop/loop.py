@@ -48,9 +48,11 @@ from checkpoint.keeper.messages import ChannelClosedError, ChannelError
 from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
+from failover.core.frames.frame import Part, Reason, Refused
+from failover.core.frames.lane import FrameLane
+from failover.core.frames.roster import roster
 from failover.core.node import Node
 from failover.core.types import Ballot
-from failover.core.wire import codec
 from failover.core.wire.messages import Beat
 
 NANOSECONDS_A_SECOND: Final = 1_000_000_000
@@ -80,6 +82,11 @@ LANES_TRIES: Final = 5
 
 STARTED: Final = "protecting this robot and its neighbours"
 
+UNLIKE: Final = (
+    "{} has another team.toml: its heartbeats are read, and items of its board are not; copy the same file to both, and start "
+    "their agents again"
+)
+
 OUTLIVED: Final = (
     "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy. Its votes and checkpoints since "
     "then are lost; it begins again as life %d"
@@ -102,9 +109,10 @@ class Heart:
         self._ballot = ballot
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
-        self._hearing = codec.Receiver(settings.team.team)
+        self._frames = FrameLane(
+            self._me, settings.team.team, roster(settings.team.robots), ballot.record.boot, settings.config.beat_ms * 1_000
+        )
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
-        self._keys: dict[str, bytes] = {}
         self._lanes = LanesProcess(settings)
         self._node: Node | None = None
         durable = core_vote_record.decode(ballot.record.core)
@@ -129,7 +137,8 @@ class Heart:
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
         self._copies = Copies()
-        self._newest_beat: dict[str, tuple[int, int]] = {}
+        self._newest_part: dict[str, tuple[int, int]] = {}
+        self._unlike: set[str] = set()
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
         self._remembered = 0
@@ -261,13 +270,10 @@ class Heart:
         taken = refused = 0
         for frame, link, wall_ns, sender in self._beats.receive():
             taken += 1
-            opened = self._hearing.open(frame)
-            if isinstance(opened, Beat):
-                came_ns = self._came_ns(wall_ns)
-                self._count(opened, came_ns or clock.now_ns())
-                self._mind_earlier_lives(opened)
-                self._copies.heard(opened, link)
-                self._step(Received(opened, link, self._copies.take(opened.sender), came_ns))
+            opened = self._frames.open(frame, arrived_ns(wall_ns))
+            if not isinstance(opened, Refused):
+                self._copies.heard(opened.part, link)
+                self._take_part(opened.part, link, self._came_ns(wall_ns))
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
                 refused += 1
@@ -275,6 +281,14 @@ class Heart:
                     self._step(sign)
         if taken >= TURN_LIMIT and refused > taken // 2:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
+
+    def _take_part(self, part: Part, link: str, came_ns: int) -> None:
+        self._count_part(part)
+        beat = part.beat
+        if beat is not None:
+            self._count_beat(beat, came_ns or clock.now_ns())
+            self._mind_earlier_lives(beat)
+            self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 
     def _came_ns(self, wall_ns: int) -> int:
         """When a beat came that waited because this heart rests: its sender was not late. 0: now, or a stall of ours."""
@@ -291,14 +305,22 @@ class Heart:
             log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
-    def _count(self, beat: Beat, now_ns: int) -> None:
-        """Note how long the peer was silent before this beat, and how many were lost in between."""
-        peer = beat.sender
-        boot, counter = self._newest_beat.get(peer, (beat.boot, beat.counter - 1))
-        missing = beat.counter - counter - 1 if beat.boot == boot else 0
+    def _count_part(self, part: Part) -> None:
+        """Note how many parts of the peer's frames were lost before this one, and whether its ranks are ours."""
+        peer = part.sender
+        boot, counter = self._newest_part.get(peer, (part.boot, part.counter - 1))
+        missing = part.counter - counter - 1 if part.boot == boot else 0
         self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
-        if beat.boot != boot or missing >= 0:
-            self._newest_beat[peer] = (beat.boot, beat.counter)
+        if part.boot != boot or missing >= 0:
+            self._newest_part[peer] = (part.boot, part.counter)
+        if not part.alike:
+            self._unlike.add(peer)
+        elif self._unlike:
+            self._unlike.discard(peer)
+
+    def _count_beat(self, beat: Beat, now_ns: int) -> None:
+        """Note how long the peer was silent before this beat."""
+        peer = beat.sender
         gap_us = (now_ns - self._heard_at.get(peer, now_ns)) // 1_000
         self._heard_at[peer] = now_ns
         self._heard += 1
@@ -326,9 +348,9 @@ class Heart:
             case Inventory():
                 self._take_inventory(message)
             case SpeakKey(peer, key):
-                self._keys[peer] = key
+                self._frames.speak(peer, key)
             case HearKey(peer, key):
-                self._hearing.accept(peer, key)
+                self._frames.hear(peer, key)
             case Alive():
                 pass
             case _:
@@ -370,11 +392,18 @@ class Heart:
         if due.persist is not None:
             self._persister.submit(*due.persist)
         for beat in due.beats:
-            for peer, key in self._keys.items():
-                self._beats.send(peer, codec.seal(beat, self._settings.team.team, key))
+            self._send(beat)
             self._sent += 1
         for act in due.acts:
             self._act(act)
+
+    def _send(self, beat: Beat) -> None:
+        """One frame, to everybody over every link."""
+        made, _ = self._frames.seal(beat, (), clock.now_ns())
+        for sealed in made:
+            for peer in sealed.to:
+                for datagram in sealed.datagrams:
+                    self._beats.send(peer, datagram)
 
     def _act(self, act: Act) -> None:
         self._lanes.order(act)
@@ -382,7 +411,7 @@ class Heart:
     def _told(self, question: messages.Ask) -> ToLanes:
         now_ns = clock.now_ns()
         refused = Counter(self._refused)
-        refused[str(codec.Reason.NOT_OURS)] += self._beats.dropped()
+        refused[str(Reason.NOT_OURS)] += self._beats.dropped()
         counts = BeatCounts(
             self._sent,
             self._heard,
@@ -393,7 +422,7 @@ class Heart:
             self._gaps,
             dict(self._lost),
         )
-        troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble)))
+        troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble, *map(UNLIKE.format, sorted(self._unlike)))))
         if question.what == "why":
             return Told(question.number, now_ns, story=self._scribe.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
@@ -410,6 +439,13 @@ class Heart:
         self._poll.close()
         signal.set_wakeup_fd(-1)
         log.info("robot %s ends; its components live on", self._me)
+
+
+def arrived_ns(wall_ns: int) -> int:
+    """When a datagram came that the kernel stamped with this instant of the calendar (0: it did not); now, if in doubt."""
+    now_ns = clock.now_ns()
+    came_ns = clock.of_wall_ns(wall_ns) if wall_ns else now_ns
+    return came_ns if 0 <= now_ns - came_ns <= NANOSECONDS_A_SECOND else now_ns
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:

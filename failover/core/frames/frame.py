@@ -15,7 +15,6 @@ import functools
 import hmac
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Annotated, Any, Final
 
@@ -105,8 +104,7 @@ class Reason(enum.StrEnum):
     EARLIER_LIFE = "from an earlier life of its sender"
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
+class Refused(Struct, frozen=True):
     """A datagram that was not believed.
 
     Attributes:
@@ -116,7 +114,7 @@ class Refused:
 
     reason: Reason
     sender: str = ""
-    counter: int = field(default=0, compare=False)
+    counter: int = 0
 
 
 class Portion(Struct, frozen=True, array_like=True):

@@ -98,7 +98,7 @@ def test_the_samples_of_the_document_are_what_we_send_and_read() -> None:
 def test_a_part_is_believed_once() -> None:
     opened, datagram = receiver(), sealed()
     opened.open(datagram)
-    assert opened.open(datagram) == Refused(Reason.REPLAYED, "robot1")
+    assert opened.open(datagram) == Refused(Reason.REPLAYED, "robot1", 100)
 
 
 def counted(counter: int, boot: int = 1) -> bytes:
@@ -112,15 +112,15 @@ def test_late_parts_inside_the_window_are_believed_and_older_ones_are_not() -> N
     opened = receiver()
     opened.open(counted(100))
     assert isinstance(opened.open(counted(37)), Part)
-    assert opened.open(counted(36)) == Refused(Reason.REPLAYED, "robot1")
+    assert opened.open(counted(36)) == Refused(Reason.REPLAYED, "robot1", 36)
 
 
 def test_an_earlier_life_is_refused_and_a_later_one_begins_anew() -> None:
     opened = receiver()
     opened.open(counted(100, 5))
-    assert opened.open(counted(101, 4)) == Refused(Reason.EARLIER_LIFE, "robot1")
+    assert opened.open(counted(101, 4)) == Refused(Reason.EARLIER_LIFE, "robot1", 101)
     assert isinstance(opened.open(counted(1, 6)), Part)
-    assert opened.open(counted(102, 5)) == Refused(Reason.EARLIER_LIFE, "robot1")
+    assert opened.open(counted(102, 5)) == Refused(Reason.EARLIER_LIFE, "robot1", 102)
 
 
 def test_a_forged_boot_count_does_not_reset_the_window() -> None:
@@ -129,7 +129,7 @@ def test_a_forged_boot_count_does_not_reset_the_window() -> None:
     forged = bytearray(counted(1, 9))
     forged[HEADER.size + SEAL_SIZE - 1] ^= 1
     assert opened.open(bytes(forged)) == Refused(Reason.FORGED)
-    assert opened.open(datagram) == Refused(Reason.REPLAYED, "robot1")
+    assert opened.open(datagram) == Refused(Reason.REPLAYED, "robot1", 100)
 
 
 def test_the_key_before_the_present_one_stays_valid_and_the_one_before_that_does_not() -> None:
