@@ -299,7 +299,7 @@ class Sealer:
                 *(self._name, self._boot, counter, round_ & 0xFFFFFFFF, part, len(bodies), len(keys)),
             )
             digest = _digest(header, body)
-            sealed.append(b"".join((header, *[_number(key) + _code(digest, key) if key else _NO_SEAL for key in keys], body)))
+            sealed.append(b"".join((header, *[_authenticator(digest, key) if key else _NO_SEAL for key in keys], body)))
         return sealed
 
 
@@ -314,21 +314,17 @@ def _digest(header: bytes, body: bytes) -> bytes:
 
 
 @functools.lru_cache(4 * PEERS_MAX)
-def _number(key: bytes) -> bytes:
-    """Which key it was: a receiver tells a key that it was not given yet from a forgery."""
-    return blake2b(key, digest_size=NUMBER_SIZE, person=b"failover-key-id\x00").digest()
+def _prepared(key: bytes) -> tuple[bytes, blake2b]:
+    """Number of a key, by which a receiver tells one that it was not given yet from a forgery; and what has taken in the key."""
+    number = blake2b(key, digest_size=NUMBER_SIZE, person=b"failover-key-id\x00").digest()
+    return number, blake2b(digest_size=CODE_SIZE, key=key[:64], person=_PERSON)
 
 
-def _code(digest: bytes, key: bytes) -> bytes:
-    keyed = _keyed(key).copy()
-    keyed.update(digest)
-    return keyed.digest()
-
-
-@functools.lru_cache(4 * PEERS_MAX)
-def _keyed(key: bytes) -> blake2b:
-    """What has taken in the key already: half of the work."""
-    return blake2b(digest_size=CODE_SIZE, key=key[:64], person=_PERSON)
+def _authenticator(digest: bytes, key: bytes) -> bytes:
+    number, keyed = _prepared(key)
+    code = keyed.copy()
+    code.update(digest)
+    return number + code.digest()
 
 
 # --- Opening ---------------------------------------------------------------------------------------------------------
@@ -447,12 +443,12 @@ class Receiver:
         """Whether one of the authenticators is ours and right."""
         digest = b""
         for key in self._keys[sender]:
-            number = _number(key)
+            number = _prepared(key)[0]
             for place in places:
                 at = HEADER.size + SEAL_SIZE * place
                 if datagram.startswith(number, at):
                     digest = digest or _digest(datagram[: HEADER.size], datagram[start:])
-                    if hmac.compare_digest(datagram[at + NUMBER_SIZE : at + SEAL_SIZE], _code(digest, key)):
+                    if hmac.compare_digest(datagram[at : at + SEAL_SIZE], _authenticator(digest, key)):
                         return None
         return Reason.FORGED if digest else Reason.UNKNOWN_KEY
 
@@ -464,5 +460,5 @@ def _is_sound(body: Body, boot: int, counter: int) -> bool:
         0 < boot < NUMBER_MAX
         and 0 < counter < NUMBER_MAX
         and (beat is None or (beat.boot == boot and is_sound(beat)))
-        and all(item.is_sound for item in body.items)
+        and all([item.is_sound for item in body.items if item.total or item.offset])
     )

@@ -52,7 +52,7 @@ class Heard(Struct, frozen=True):
     """
 
     part: Part
-    items: list[Portion]
+    items: Sequence[Portion]
     way_ns: int | None
 
 
@@ -152,15 +152,20 @@ class FrameLane:
             return part
         peer = self._peers.get(part.rank)
         if peer is None or not part.alike:
-            return Heard(part, [], None)
+            return Heard(part, (), None)
         if part.boot > peer.boot:
             peer = self._peers[part.rank] = _Peer(ClockOffset(), part.boot)
             self.assembly.forget(part.sender)
         if part.counter > peer.counter:
             peer.counter, peer.came_ns = part.counter, came_ns
         way_ns = self._way_ns(peer, part, came_ns)
-        whole = [self.assembly.take(part.sender, item) if item.total else item for item in part.items]
-        return Heard(part, [item for item in whole if item is not None], way_ns)
+        return Heard(part, self._whole(part), way_ns)
+
+    def _whole(self, part: Part) -> Sequence[Portion]:
+        if not any([item.total for item in part.items]):
+            return part.items
+        whole = [self.assembly.take(part.sender, item) for item in part.items]
+        return [item for item in whole if item is not None]
 
     def clock_of(self, rank: int) -> ClockOffset:
         """What is known of a peer's clock. For people and for messages, never for a rule."""

@@ -149,7 +149,7 @@ def test_the_key_before_the_present_one_stays_valid_and_the_one_before_that_does
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_receiver_cannot_make_what_another_receiver_believes(count: int) -> None:
     """robot2 knows its own key of robot1, and the number of robot3's; it seals a frame in robot1's name with all that it has."""
-    stolen, number = KEYS["robot1", "robot2"], frame._number(KEYS["robot1", "robot3"])
+    stolen, number = KEYS["robot1", "robot2"], frame._prepared(KEYS["robot1", "robot3"])[0]
     (datagram,) = sealer().seal(bodies(SAID, BEAT, (), LEFT_US, body_size_max(3))[0], [stolen] * count)
     assert receiver("robot3").open(datagram) == Refused(Reason.UNKNOWN_KEY)
     for place in range(count):

@@ -92,7 +92,7 @@ def test_a_frame_that_waits_is_told_to_have_waited() -> None:
 def test_an_item_comes_whole_in_as_many_parts_as_it_needs() -> None:
     talk = Talk()
     item = Portion(3, 12, 7, bytes(range(256)) * 20)
-    assert talk.there((item,)).items == [Portion(3, 12, 7, item.value)]
+    assert list(talk.there((item,)).items) == [Portion(3, 12, 7, item.value)]
 
 
 def test_echoes_of_an_earlier_life_are_no_round_trips_of_this_one() -> None:
