@@ -15,6 +15,13 @@ and a program that says what must survive:
     for _ in failover.every(0.1):
         state["n"] += 1
         print(state["n"], flush=True)
+
+and one that shares values with other programs and robots:
+
+    board = failover.board()
+    ball = board.add(failover.Item("ball", {"x": "f4", "y": "f4"}))
+    ball.put({"x": 1.0, "y": 2.0})
+    print(ball.get().age_ns)
 """
 
 from __future__ import annotations
@@ -23,17 +30,24 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failover.boards.board import board
     from failover.client.control import Control
+    from failover.core.board.items import Item
     from failover.errors import (
         AgentRefusedError,
+        BoardError,
         FailoverError,
         GatewayError,
         LostAgentError,
+        NeverWrittenError,
         NoAgentError,
         NotCommittedError,
+        OvertakenError,
         StaleEpochError,
         StateTakenError,
         TaskError,
+        ValueMisfitError,
+        WriterTakenError,
     )
     from failover.fencing.epoch import epoch
     from failover.fencing.gateway import Gateway
@@ -47,6 +61,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "board": "failover.boards.board",
+    "Item": "failover.core.board.items",
     "Control": "failover.client.control",
     "Resumed": "failover.task.api",
     "activations": "failover.task.api",
@@ -65,6 +81,11 @@ _HOMES = {
     "resumable": "failover.task.resumable",
     "scratch": "failover.task.scratch",
     "AgentRefusedError": "failover.errors",
+    "BoardError": "failover.errors",
+    "NeverWrittenError": "failover.errors",
+    "OvertakenError": "failover.errors",
+    "ValueMisfitError": "failover.errors",
+    "WriterTakenError": "failover.errors",
     "FailoverError": "failover.errors",
     "GatewayError": "failover.errors",
     "StaleEpochError": "failover.errors",
@@ -78,19 +99,26 @@ _HOMES = {
 __all__ = [
     "FINISHED",
     "AgentRefusedError",
+    "BoardError",
     "Control",
     "FailoverError",
     "Gateway",
     "GatewayError",
+    "Item",
     "LostAgentError",
+    "NeverWrittenError",
     "NoAgentError",
     "NotCommittedError",
+    "OvertakenError",
     "Resumed",
     "StaleEpochError",
     "StateTakenError",
     "TaskError",
+    "ValueMisfitError",
+    "WriterTakenError",
     "__version__",
     "activations",
+    "board",
     "commit",
     "component",
     "epoch",

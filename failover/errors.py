@@ -45,6 +45,42 @@ class RulesError(FailoverError):
     """A setting contradicts another one or leaves its range; the message names the setting and the cure."""
 
 
+class BoardError(FailoverError):
+    """Something about the team's board does not work; the message says what, on which file or item, and what to do."""
+
+
+class BoardGoneError(BoardError):
+    """The board that was open was removed or made anew; a program that calls again works with the new one."""
+
+
+class NeverWrittenError(BoardError):
+    """An item has no value yet: its writer has not put one."""
+
+
+class OvertakenError(BoardError):
+    """An item is written so fast that it cannot be read whole; it needs more banks, or fewer puts."""
+
+
+class WriterTakenError(BoardError):
+    """Another process writes this item; the message names its pid."""
+
+
+class ItemError(FailoverError):
+    """An item of the board is declared in a way that cannot work; nothing was changed.
+
+    Attributes:
+        key: the key of the declaration that is wrong ("type", "period" …); "" for the declaration as a whole.
+    """
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
+
+
+class ValueMisfitError(FailoverError):
+    """A value does not fit the declared type of its item; the item keeps the value that it has."""
+
+
 class NameFormatError(FailoverError):
     """A name of a robot, a team or a component is not of the documented form."""
 

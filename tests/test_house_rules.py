@@ -31,7 +31,7 @@ PURE_FILES = (
 
 PURE_IMPORTS = frozenset(
     """
-    __future__ abc bisect binascii blake3 collections contextlib dataclasses enum functools hashlib heapq hmac itertools
+    __future__ abc bisect binascii blake3 collections contextlib dataclasses enum fractions functools hashlib heapq hmac itertools
     math msgspec numpy operator re string struct types typing unicodedata xxhash zlib
     """.split()  # noqa: SIM905
 )

@@ -1,0 +1,429 @@
+"""The board of this robot, opened by a program: `failover.board()`."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import os
+import sys
+import threading
+import weakref
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+from msgspec import Struct
+
+from failover.boards import boottime, directory
+from failover.boards.fence import FENCE
+from failover.boards.item import Item, ItemWriter, Source, values_for
+from failover.boards.mapping import MappedFile
+from failover.core.board import ages, layout
+from failover.core.board.banks import Reading, get_carefully
+from failover.core.board.items import Item as Declaration
+from failover.core.board.layout import Record, wanted_of
+from failover.errors import BoardError, BoardGoneError, NeverWrittenError
+
+COMPONENT_VARIABLE: Final = "FAILOVER_COMPONENT"
+
+
+class RobotState(Struct, frozen=True):
+    """One robot, as the board tells.
+
+    Attributes:
+        state: "run", "insert" and "remove" are robots that are heard, or were a moment ago; "not": it is not there.
+        age_ns: since its newest frame came; None: none has. 0 for this robot.
+        rank: its place in the order of the team's robots.
+    """
+
+    state: str
+    age_ns: int | None
+    rank: int
+
+
+class _Opened:
+    """The files of one board, and this program as a user of it."""
+
+    def __init__(self, place: Path, name: str) -> None:
+        self.directory = place.resolve() if place.exists() else place
+        self.own, self.index = directory.enter(self.directory, name)
+        self.robot = self.own.header.robot
+        self.pid = os.getpid()
+        self.files = [self.own]
+        self.peers: dict[str, MappedFile] = {}
+        try:
+            self._open_others()
+        except BaseException:
+            self.leave()
+            raise
+
+    def _open_others(self) -> None:
+        paths = [self.directory / directory.PRIVATE_NAME, *sorted(self.directory.glob(f"{directory.OWN_NAME}+*"))]
+        for path in paths:
+            with contextlib.suppress(FileNotFoundError):
+                self.files.append(MappedFile.open(path))
+
+    def peer(self, robot: str) -> MappedFile:
+        """Another robot's file.
+
+        Raises:
+            BoardError: there is none; names those that there are.
+        """
+        file = self.peers.get(robot)
+        if file is None or file.is_gone:
+            path = self.directory / f"{directory.PEER_PREFIX}{robot}"
+            try:
+                if "/" in robot:
+                    raise FileNotFoundError
+                file = self.peers[robot] = MappedFile.open(path, writable=False)
+            except FileNotFoundError:
+                known = ", ".join((self.robot, *self.peer_names()))
+                raise BoardError(f"there is no robot {robot!r} on the board {self.directory}; it has {known}") from None
+        return file
+
+    def peer_names(self) -> list[str]:
+        """The other robots."""
+        prefix = directory.PEER_PREFIX
+        return sorted(path.name.removeprefix(prefix) for path in self.directory.glob(f"{prefix}*"))
+
+    def leave(self) -> None:
+        """Give everything back; the last user without an agent removes the board. A forked child only closes what it has."""
+        for file in self.files[1:]:
+            file.close()
+        if self.pid != os.getpid():
+            self.own.close()
+        elif self.own.descriptor >= 0:
+            directory.leave(self.directory, self.own, self.index)
+
+    def drop(self) -> None:
+        """Close all without being the last user: the board is another one now, or this is a forked child."""
+        for file in self.files:
+            file.close()
+
+
+class _Holder:
+    """What is open now; survives its `Board` until that is collected, or the program ends."""
+
+    opened: _Opened | None = None
+
+    def leave(self) -> None:
+        opened, self.opened = self.opened, None
+        if opened is not None:
+            opened.leave()
+
+
+class Board:
+    """The board of this robot: items to put and get, the other robots' items to get. A context manager, or call `close`.
+
+    Attributes:
+        guard: held while files are opened, mapped or examined; never while a program waits.
+        skew_ns: what this process's CLOCK_BOOTTIME is ahead of the machine's.
+    """
+
+    def __init__(self, place: Path | None, name: str) -> None:
+        self._place = place
+        self._name = name
+        self.guard: AbstractContextManager[Any] = threading.RLock()
+        self.skew_ns = 0
+        self._is_closed = False
+        self._items: weakref.WeakSet[Item] = weakref.WeakSet()
+        self._writers: dict[str, ItemWriter] = {}
+        self._sources: dict[str, Source] = {}
+        self._holder = _Holder()
+        self._finalizer = weakref.finalize(self, self._holder.leave)
+        self.ensured()
+        _BOARDS.add(self)
+
+    def __enter__(self) -> Board:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Use the board no more. The last user of one without an agent removes it."""
+        with self.guard:
+            self._is_closed = True
+            self._forget()
+            self._finalizer()
+
+    # --- Items ---
+
+    def item(self, name: str, type: Any = None) -> Item:
+        """A handle of an item.
+
+        Args:
+            type: what the program puts and gets: ``bytes``, "msgpack", "json", a dataclass, a `msgspec.Struct`, a numpy dtype;
+                None: dictionaries and numbers, as the item is declared.
+
+        Raises:
+            BoardError: it is not declared; names the nearest.
+            ItemError: it is declared as another type; says both.
+        """
+        with self.guard:
+            self.ensured()
+            values_for(self._declared(name), type)
+            item = Item(self, name, type)
+            self._items.add(item)
+            return item
+
+    def names(self) -> list[str]:
+        """The items of this robot."""
+        with self.guard:
+            return [record.name for file in self.ensured().files for record in file.records()]
+
+    def add(self, declaration: Declaration) -> Item:
+        """Declare an item while the board is in use; one that is declared alike already stays.
+
+        Raises:
+            BoardError: it is declared otherwise already, or there is no room.
+        """
+        with self.guard:
+            opened = self.ensured()
+            file = opened.own if declaration.is_shared_by(opened.robot) else self._private(opened)
+            if not file.is_writable:
+                raise BoardError(f"cannot add item {declaration.name!r}: {file.path} may only be read by uid {os.geteuid()}")
+            with file.changing():
+                wanted = wanted_of(declaration, file.next_id(), layout.ADDED)
+                there = self._where(opened, declaration.name)
+                if there is None:
+                    file.add(wanted)
+                elif there[0] is not file or not _is_alike(there[1], wanted):
+                    raise BoardError(
+                        f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, "
+                        f"period {there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
+                    )
+            return self.item(declaration.name)
+
+    def remove(self, name: str) -> None:
+        """Take an item off the board; its name is free then.
+
+        Raises:
+            BoardError: it is not declared, or may not be removed by this user.
+        """
+        with self.guard:
+            file, record = self.found(name, self.ensured().robot)
+            if not file.is_writable:
+                raise BoardError(f"cannot remove item {name!r}: {file.path} may only be read by uid {os.geteuid()}")
+            with file.changing():
+                file.remove(record)
+
+    # --- The whole ---
+
+    @property
+    def robot(self) -> str:
+        """The name of this robot."""
+        return self.ensured().robot
+
+    @property
+    def directory(self) -> Path:
+        """Where the files are."""
+        return self.ensured().directory
+
+    def robots(self) -> dict[str, RobotState]:
+        """Each robot of the board, this one first."""
+        with self.guard:
+            opened = self.ensured()
+            found = {opened.robot: RobotState(layout.STATES[layout.RUN], 0, opened.own.header.rank)}
+            now = boottime.now_ns(self.skew_ns)
+            for robot in opened.peer_names():
+                with contextlib.suppress(BoardGoneError):
+                    header = opened.peer(robot).read_header()
+                    age = now - header.heard_ns if header.heard_ns else None
+                    found[robot] = RobotState(layout.STATES[header.state], age, header.rank)
+            return found
+
+    def living(self) -> list[str]:
+        """This robot, and those that are running."""
+        return [robot for robot, state in self.robots().items() if state.state == layout.STATES[layout.RUN]]
+
+    def snapshot(self) -> dict[str, dict[str, Reading]]:
+        """Robot → item → reading, of all that was ever put; each value whole, all ages at one instant."""
+        with self.guard:
+            opened = self.ensured()
+            found = [(opened.robot, one) for file in opened.files for one in _all_found(file)]
+            for robot in opened.peer_names():
+                with contextlib.suppress(BoardGoneError):
+                    found += [(robot, one) for one in _all_found(opened.peer(robot))]
+            now = boottime.now_ns(self.skew_ns)
+        readings: dict[str, dict[str, Reading]] = {robot: {} for robot in (opened.robot, *opened.peer_names())}
+        for robot, (record, bank, formula_ns) in found:
+            age_ns = now - bank.stamp_ns
+            age_max_ns = ages.age_max_ns(age_ns, bank.error_us)
+            stale = ages.is_stale(age_max_ns, record.bound_ns or formula_ns)
+            value = values_for(record, None).unpack(bank.value)
+            readings[robot][record.name] = Reading(value, age_ns, age_max_ns, robot, bank.number, stale)
+        return readings
+
+    def users(self) -> list[tuple[int, int, str]]:
+        """Pid as it sees itself, uid and name of each program that has the board open."""
+        with self.guard:
+            opened = self.ensured()
+            return opened.own.users(opened.index)
+
+    # --- For items ---
+
+    def writer(self, name: str) -> ItemWriter:
+        """All puts of an item by this process."""
+        with self.guard:
+            return self._writers.setdefault(name, ItemWriter(self, name))
+
+    def own_source(self, name: str) -> Source:
+        """Where this robot's item lies now; the same object for as long as it lies there."""
+        source = self._sources.get(name)
+        if source is None or not self.is_good(source):
+            file, record = self.found(name, self.ensured().robot)
+            source = Source(file, record, values_for(record, None))
+            source.generation = file.generation
+            self._sources[name] = source
+        return source
+
+    def is_good(self, source: Source) -> bool:
+        """Whether an item still lies where it did; opens the board anew if it was made anew. The guard is held."""
+        file = source.file
+        generation = file.generation
+        if generation == source.generation:
+            return True
+        if file.is_gone:
+            self.ensured()
+            return False
+        if not file.holds(source.record):
+            return False
+        if generation % 2:
+            file.mend()
+        source.remember(generation if generation % 2 == 0 else source.generation)
+        return True
+
+    def found(self, name: str, robot: str) -> tuple[MappedFile, Record]:
+        """The file and the record of a robot's item; the guard is held.
+
+        Raises:
+            BoardError: it is not declared there.
+        """
+        opened = self.ensured()
+        if robot == opened.robot:
+            there = self._where(opened, name)
+        else:
+            file = opened.peer(robot)
+            record = file.record(name)
+            there = None if record is None else (file, record)
+        if there is None:
+            raise BoardError(self._unknown(name, robot))
+        return there
+
+    def has(self, name: str, robot: str) -> bool:
+        """Whether a robot has an item."""
+        with self.guard, contextlib.suppress(BoardError):
+            return bool(self.found(name, robot))
+        return False
+
+    def whose(self, file: MappedFile, record: Record) -> str:
+        """Why an item cannot be put."""
+        pid = file.word32(record.at + layout.PID_FIELD)
+        name = next((f" ({name})" for user, _, name in self.users() if user == pid and name), "")
+        same = " in another opening of the board" if pid == os.getpid() else ""
+        return f"item {record.name!r} is written by pid {pid}{name}{same}; one process writes an item: end that one first"
+
+    def ensured(self) -> _Opened:
+        """The open board; opened anew if it was made anew, or this is a forked child.
+
+        Raises:
+            BoardError: it is closed, or cannot be opened.
+        """
+        with self.guard:
+            if self._is_closed:
+                raise BoardError("the board is closed; open it again with failover.board()")
+            opened = self._holder.opened
+            if opened is None or opened.own.is_gone or opened.pid != os.getpid():
+                if opened is not None:
+                    opened.drop()
+                    self._holder.opened = None
+                self._forget()
+                self.skew_ns = boottime.skew_ns()
+                opened = self._holder.opened = _Opened(self._place or directory.find(), self._name)
+            return opened
+
+    def _forget(self) -> None:
+        for item in list(self._items):
+            item.forget()
+        for writer in self._writers.values():
+            writer.forget()
+        self._sources = {}
+
+    def forget_after_fork(self) -> None:
+        """In the child: the locks are the parent's, and so is the place among the users."""
+        self.guard = threading.RLock()  # a thread that held it is not here
+        opened = self._holder.opened
+        self._forget()
+        if opened is not None:
+            opened.drop()
+
+    # --- Records ---
+
+    def _where(self, opened: _Opened, name: str) -> tuple[MappedFile, Record] | None:
+        found = ((file, file.record(name)) for file in opened.files)
+        return next(((file, record) for file, record in found if record is not None), None)
+
+    def _declared(self, name: str) -> Record:
+        """An item's record here, or at any other robot."""
+        opened = self.ensured()
+        there = self._where(opened, name)
+        if there is not None:
+            return there[1]
+        for robot in opened.peer_names():
+            record = opened.peer(robot).record(name)
+            if record is not None:
+                return record
+        raise BoardError(self._unknown(name, opened.robot))
+
+    def _unknown(self, name: str, robot: str) -> str:
+        nearest = difflib.get_close_matches(name, self.names(), 1)
+        cure = f"; did you mean {nearest[0]!r}?" if nearest else "; declare it in team.toml, or with board.add()"
+        return f"{robot} has no item {name!r} on the board {self.ensured().directory}{cure}"
+
+    def _private(self, opened: _Opened) -> MappedFile:
+        for file in opened.files:
+            if file.header.flags & layout.PRIVATE:
+                return file
+        raise BoardError(f"the board {opened.directory} has no file for private items")
+
+
+def _is_alike(record: Record, wanted: layout.Wanted) -> bool:
+    """Whether a table has an item as it is wanted: all but its number and how it came."""
+    names = ("kind", "size", "banks", "period", "phase", "digest", "bound_ns")
+    return all(getattr(record, name) == getattr(wanted, name) for name in names)
+
+
+def _all_found(file: MappedFile) -> Iterator[tuple[Record, Any, int]]:
+    """Record, bank and bound by the formula, of all items of a file that were ever put."""
+    for record in file.records():
+        place = file.place(record)
+        with contextlib.suppress(NeverWrittenError):
+            yield record, get_carefully(place, FENCE), place.words[place.formula]
+
+
+_BOARDS: weakref.WeakSet[Board] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for board in list(_BOARDS):
+        board.forget_after_fork()
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+def board(place: str | os.PathLike[str] | None = None, name: str = "") -> Board:
+    """Open the board of this robot.
+
+    Args:
+        place: its directory; None: ``$FAILOVER_BOARD``, the agent's, or one that this user's programs share without an agent.
+        name: of this program, for people who ask who uses the board; "": its component's, or its file's.
+
+    Raises:
+        BoardError: it cannot be opened or made; says why, and what to do.
+    """
+    said = name or os.environ.get(COMPONENT_VARIABLE) or os.path.basename(sys.argv[0] if sys.argv else "") or "python"
+    return Board(None if place is None else Path(place), said)

@@ -1,0 +1,248 @@
+"""The directory of a board: where it is, and, without an agent, how its first user makes it and its last one removes it.
+
+Each file appears whole: it is made without a name (O_TMPFILE), filled, and then linked to its place. `own` is linked last and
+unlinked last, with its maker already counted as a user. So a directory with `own` is a board, and one without is none yet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+from typing import Final
+
+from failover.boards import boottime, locks
+from failover.boards.mapping import GENERATION, MappedFile
+from failover.client.control import socket_path
+from failover.core.board import layout
+from failover.core.board.items import ITEMS_MAX
+from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
+from failover.core.wire.names import check_robot
+from failover.errors import BoardError, BoardGoneError, NameFormatError
+
+VARIABLE: Final = "FAILOVER_BOARD"
+LINK_NAME: Final = "board"
+"""A symbolic link in the agent's runtime directory, to the board of its robot."""
+SHARED_MEMORY: Final = Path("/dev/shm")
+
+OWN_NAME: Final = "own"
+PRIVATE_NAME: Final = "private"
+PEER_PREFIX: Final = "peer-"
+
+TURNS: Final = 1000
+"""Of making or opening a board that others make and remove at the same time."""
+
+
+def find() -> Path:
+    """Where this program's board is: ``$FAILOVER_BOARD``, the agent's, or that of this user's programs without an agent."""
+    named = os.environ.get(VARIABLE)
+    if named:
+        return Path(named)
+    link = socket_path().parent / LINK_NAME
+    if link.exists():
+        return link
+    return SHARED_MEMORY / f"failover-u{os.geteuid()}-{this_robot()}"
+
+
+def this_robot() -> str:
+    """What a robot without an agent is called: as its machine."""
+    name = os.uname().nodename
+    with contextlib.suppress(NameFormatError):
+        return check_robot(name)
+    return "robot"
+
+
+def make_file(
+    path: Path,
+    flags: int,
+    robot: str,
+    *,
+    capacity: int = ITEMS_MAX,
+    rank: int = 0,
+    state: int = layout.RUN,
+    roster_digest: int = 0,
+    mode: int = 0o600,
+    hold: bool = False,
+) -> int:
+    """Make one file of a board, without items, whole at its place.
+
+    Args:
+        flags: which area it is, and whether it is made without an agent.
+        hold: return an opening that is user 0 already and has the table lock.
+
+    Returns:
+        The opening, or -1 without ``hold``.
+
+    Raises:
+        FileExistsError: there is one.
+        OSError: it cannot be made there.
+    """
+    size = layout.names_at(capacity)
+    header = layout.new_header(
+        flags, capacity, check_robot(robot), boottime.boot_id(), rank=rank, state=state, roster_digest=roster_digest
+    )
+    made = os.open(path.parent, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, mode)
+    try:
+        os.fchmod(made, mode)  # not what the umask leaves of it
+        os.ftruncate(made, size)
+        os.pwrite(made, header, 0)
+        if hold:
+            locks.take(made, TABLE_LOCK)
+            locks.take(made, USER_LOCKS)
+        os.link(f"/proc/self/fd/{made}", path, src_dir_fd=made)  # with a descriptor Python follows the link, linkat(2)
+    except BaseException:
+        os.close(made)
+        raise
+    if hold:
+        return made
+    os.close(made)
+    return -1
+
+
+def make_peer(directory: Path, robot: str, *, rank: int = 0, state: int = layout.NOT, mode: int = 0o640) -> MappedFile:
+    """The file of another robot's items, for the one process that receives them.
+
+    Raises:
+        OSError: it cannot be made, or is there already.
+    """
+    path = directory / f"{PEER_PREFIX}{robot}"
+    make_file(path, PEER, robot, rank=rank, state=state, mode=mode)
+    return MappedFile.open(path, writable=True)
+
+
+def enter(directory: Path, name: str) -> tuple[MappedFile, int]:
+    """Open a board's ``own`` as a user of it; make the board if there is none, or one that its last user left by being killed.
+
+    Args:
+        name: of this program, for people.
+
+    Returns:
+        The file, and the user's index.
+
+    Raises:
+        BoardError: it is no board, cannot be made, or has too many users.
+    """
+    for _ in range(TURNS):
+        try:
+            entered = _try_to_enter(directory, name)
+        except BoardGoneError:
+            entered = None  # removed between two steps
+        if entered is not None:
+            return entered
+    raise BoardError(f"cannot open the board {directory}: others have made and removed it {TURNS} times meanwhile; try again")
+
+
+def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
+    path = directory / OWN_NAME
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return _made(directory, name)
+    except OSError as error:
+        raise BoardError(
+            f"cannot open the board {directory}: {path.name}: {error.strerror}; its user or group may (board_group of agent.toml)"
+        ) from error
+    keep = False
+    try:
+        with locks.table(descriptor, f"cannot open the board {directory}"):
+            if not _is_still(path, descriptor):
+                return None
+            if _is_abandoned(path, descriptor):
+                _remove(directory, descriptor)
+                return None
+            file = MappedFile.open(path, descriptor, writable=True)
+            index = file.enter(os.getpid(), os.geteuid(), name)
+            keep = True
+            return file, index
+    finally:
+        if not keep:
+            os.close(descriptor)
+
+
+def _made(directory: Path, name: str) -> tuple[MappedFile, int] | None:
+    """Make the board; None if another one was quicker."""
+    robot = this_robot()
+    try:
+        _make_directory(directory)
+        _examine(directory)
+        with contextlib.suppress(FileExistsError):
+            make_file(directory / PRIVATE_NAME, PRIVATE + ALONE, robot)
+        descriptor = make_file(directory / OWN_NAME, OWN + ALONE, robot, hold=True)
+    except (FileExistsError, FileNotFoundError):
+        return None
+    except OSError as error:
+        raise BoardError(f"cannot make the board {directory}: {error.strerror}; {VARIABLE} names another place") from error
+    file = MappedFile.open(directory / OWN_NAME, descriptor, writable=True)
+    index = file.enter(os.getpid(), os.geteuid(), name)  # its own lock does not stand in the way: 0
+    locks.give(descriptor, TABLE_LOCK)
+    return file, index
+
+
+def _make_directory(directory: Path) -> None:
+    try:
+        directory.mkdir(mode=0o700)
+    except FileExistsError:
+        pass
+    except FileNotFoundError:
+        raise BoardError(f"cannot make the board {directory}: no directory can be made in {directory.parent}") from None
+
+
+def _examine(directory: Path) -> None:
+    """Refuse a directory below /dev/shm that another user has put there."""
+    found = directory.lstat()
+    if VARIABLE in os.environ or (found.st_uid in (0, os.geteuid()) and stat.S_ISDIR(found.st_mode)):
+        return
+    raise BoardError(
+        f"cannot make the board {directory}: it belongs to uid {found.st_uid}; remove it, or name another place in {VARIABLE}"
+    )
+
+
+def leave(directory: Path, file: MappedFile, index: int) -> None:
+    """Be no user any more; the last one without an agent removes the board."""
+    path = directory / OWN_NAME
+    try:
+        with locks.table(file.descriptor, f"cannot close the board {directory}"):
+            locks.give(file.descriptor, USER_LOCKS + index)
+            if _is_still(path, file.descriptor) and _is_abandoned(path, file.descriptor):
+                _remove(directory, file.descriptor)
+    finally:
+        file.close()
+
+
+def _is_still(path: Path, descriptor: int) -> bool:
+    """Whether an open file is the one of that name."""
+    opened = os.fstat(descriptor)
+    try:
+        there = os.lstat(path)
+    except FileNotFoundError:
+        return False
+    return (opened.st_dev, opened.st_ino) == (there.st_dev, there.st_ino)
+
+
+def _is_abandoned(path: Path, descriptor: int) -> bool:
+    """Whether a board is to be removed: made without an agent and without users, of an earlier boot, or gone already."""
+    head = os.pread(descriptor, layout.RECORDS_AT, 0)
+    if len(head) < layout.HEADER.size or head[:8] != layout.MAGIC:
+        return False  # not ours: what it is will be said when it is mapped
+    fields = layout.HEADER.unpack_from(head)
+    flags, generation, boot_id = fields[2], fields[3], fields[7]
+    if not flags & ALONE:
+        return False
+    if generation == GONE or boot_id != boottime.boot_id():
+        return True
+    return not any(locks.is_taken(descriptor, USER_LOCKS + index) for index in range(USERS_MAX))
+
+
+def _remove(directory: Path, own: int) -> None:
+    """Tell all who have the files open, and unlink them, ``own`` last; the table lock of ``own`` is held."""
+    os.pwrite(own, layout.WORD.pack(GONE), layout.GENERATION_AT)
+    for path in (directory / PRIVATE_NAME, *directory.glob(f"{OWN_NAME}+*"), *directory.glob(f"{PEER_PREFIX}*")):
+        with contextlib.suppress(OSError, BoardError):
+            file = MappedFile.open(path, writable=True)
+            file.words[GENERATION] = GONE
+            file.close()
+        path.unlink(missing_ok=True)
+    (directory / OWN_NAME).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        directory.rmdir()

@@ -1,0 +1,70 @@
+"""Sleep until a word of a mapped file changes, and wake those that do, also from another process.
+
+Source: futex(2), FUTEX_WAIT and FUTEX_WAKE without FUTEX_PRIVATE_FLAG; Python's C API, buffer protocol.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+from functools import lru_cache
+from typing import Any, Final
+
+from failover.errors import BoardError
+
+NUMBERS: Final = {"x86_64": 202, "aarch64": 98, "riscv64": 98}
+"""Machine → number of the call futex. Source: asm/unistd.h."""
+
+_WAIT: Final = 0
+_WAKE: Final = 1
+_ALL: Final = 2**31 - 1
+_NS_PER_S: Final = 1_000_000_000
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+class _Buffer(ctypes.Structure):
+    """Py_buffer, as far as it is read here; the rest is room."""
+
+    _fields_ = (("address", ctypes.c_void_p), ("object", ctypes.py_object), ("rest", ctypes.c_byte * 128))
+
+
+def address_of(mapping: Any) -> int:
+    """Where a mapping begins in this process, also one that may only be read. The mapping must outlive the use of it."""
+    found = _Buffer()
+    ctypes.pythonapi.PyObject_GetBuffer(ctypes.py_object(mapping), ctypes.byref(found), 0)
+    address = found.address
+    ctypes.pythonapi.PyBuffer_Release(ctypes.byref(found))
+    assert address is not None
+    return int(address)
+
+
+def wait(address: int, value: int, timeout_s: float) -> None:
+    """Sleep until woken, as long as the 32 bits at ``address`` are ``value``; not longer than ``timeout_s``. May wake early."""
+    nanoseconds = max(int(timeout_s * _NS_PER_S), 0)
+    limit = _Timespec(*divmod(nanoseconds, _NS_PER_S))
+    if _call()(_number(), ctypes.c_void_p(address), _WAIT, ctypes.c_uint32(value), ctypes.byref(limit), None, 0) == -1:
+        wrong = ctypes.get_errno()
+        if wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
+            raise BoardError(f"cannot wait for the board: {os.strerror(wrong)}")
+
+
+def wake(address: int) -> None:
+    """Wake all that sleep on the 32 bits at ``address``."""
+    _call()(_number(), ctypes.c_void_p(address), _WAKE, _ALL, None, None, 0)
+
+
+@lru_cache(maxsize=1)
+def _call() -> Any:
+    return ctypes.CDLL(None, use_errno=True).syscall
+
+
+@lru_cache(maxsize=1)
+def _number() -> int:
+    machine = os.uname().machine
+    if machine not in NUMBERS:
+        raise BoardError(f"cannot wait for the board on a {machine}: the number of futex(2) is not known there; poll with get()")
+    return NUMBERS[machine]
