@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 
 
@@ -11,9 +10,11 @@ def in_words(error: BaseException) -> str:
     if not isinstance(error, OSError) or not error.strerror:
         return str(error)
     named = [
-        name if isinstance(name, int) else os.fsdecode(name) for name in (error.filename, error.filename2) if name is not None
+        name.decode(errors="surrogateescape") if isinstance(name, bytes) else str(name)
+        for name in (error.filename, error.filename2)
+        if name is not None
     ]
-    return error.strerror + (f" ({', '.join(map(str, named))})" if named else "")
+    return error.strerror + (f" ({', '.join(named)})" if named else "")
 
 
 def near(said: str, choices: Iterable[str]) -> str:

@@ -77,6 +77,18 @@ class ItemError(FailoverError):
         self.key = key
 
 
+class ImportFailedError(FailoverError):
+    """A file of items was read, and the sizes of its C types cannot be learnt; nothing was written.
+
+    Attributes:
+        reasons: the compiler's own sentences.
+    """
+
+    def __init__(self, message: str, reasons: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.reasons = reasons
+
+
 class ValueMisfitError(FailoverError):
     """A value does not fit the declared type of its item; the item keeps the value that it has."""
 

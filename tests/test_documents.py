@@ -19,6 +19,7 @@ from agent.config import ComponentConfig, Config, HooksConfig
 from agent.worker.control import status_view
 from agent.worker.network.replication_link import LinkState
 from failover.cli import parser
+from failover.config.board import BoardConfig, ItemConfig
 from failover.config.team import Robot
 
 ROOT = Path(__file__).parent.parent
@@ -117,7 +118,8 @@ def rows(path: Path, heading: str) -> dict[str, str]:
 
 def defaults(kind: type[Any]) -> dict[str, object]:
     """Of a frozen dataclass of settings; a key that must be given has none."""
-    return {one.name: one.default for one in dataclasses.fields(kind) if one.default is not dataclasses.MISSING}
+    found = {one.name: one.default for one in dataclasses.fields(kind) if one.default is not dataclasses.MISSING}
+    return {name: list(default) if isinstance(default, tuple) else default for name, default in found.items()}
 
 
 @pytest.mark.parametrize(
@@ -127,6 +129,8 @@ def defaults(kind: type[Any]) -> dict[str, object]:
         ("agent.toml: one component", ComponentConfig),
         ("agent.toml: hooks of one component", HooksConfig),
         ("team.toml: who belongs", Robot),
+        ("team.toml: the board", BoardConfig),
+        ("team.toml: one item of the board", ItemConfig),
     ],
 )
 def test_every_key_and_its_default_are_told(heading: str, kind: type[Any]) -> None:

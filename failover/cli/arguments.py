@@ -391,6 +391,73 @@ ENROL_STORY: Final = """
     """
 
 
+# --- The board -------------------------------------------------------------------------------------------------------
+
+
+def board(room: argparse.ArgumentParser) -> None:
+    """Of ``failover board`` and its acts."""
+    shared = argparse.ArgumentParser(add_help=False)
+    _json(shared)
+    _json(room)
+    acts = room.add_subparsers(dest="act", metavar="ACT", title="acts")
+    of_team = argparse.ArgumentParser(add_help=False, parents=[shared])
+    of_team.add_argument(
+        "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
+    )
+    header = _act(acts, "header", of_team, "the items as a C header", HEADER_STORY)
+    header.add_argument(
+        "--rtdb", action="store_true", help="also numbers of items and agents under their own names, for failover_rtdb.h"
+    )
+    header.set_defaults(function="failover.cli.verbs.board_files:header")
+    imported = _act(acts, "import", shared, "an rtdb.conf as a table of team.toml", IMPORT_STORY)
+    imported.add_argument("file", metavar="FILE", help="CAMBADA's rtdb.conf, or RTDB2's rtdb2_configuration.xml")
+    imported.add_argument(
+        "-I", dest="include", metavar="DIR", action="append", default=[], help="a folder with headers; may be given again"
+    )
+    imported.add_argument("--cc", metavar="COMMAND", help="the C++ compiler (default: $CXX, else g++, c++ or clang++)")
+    imported.add_argument(
+        "--robot", metavar="AGENT=ROBOT", type=_pair, action="append", default=[], help="the robot that is this agent of the file"
+    )
+    imported.add_argument(
+        "--size", metavar="BYTES", type=_whole, default=1024, help="the most bytes of a key of an XML file (default: %(default)s)"
+    )
+    imported.set_defaults(function="failover.cli.verbs.board_files:import_file")
+
+
+def _pair(text: str) -> tuple[str, str]:
+    agent, separator, robot = text.partition("=")
+    if not separator or not agent or not robot:
+        raise argparse.ArgumentTypeError(f"{text!r} is no AGENT=ROBOT")
+    return agent, robot
+
+
+def _whole(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 0 < int(text[:10]) <= NUMBER_MAX:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 1 to {NUMBER_MAX}")
+    return int(text)
+
+
+HEADER_STORY: Final = """
+    Print the items of team.toml as a C header: a struct for each, its number, size and digest, and assertions that the compiler
+    lays the structs out as the board does. It compiles as C11 and as C++11.
+
+      failover board header > items.h
+      failover board header --directory ~/team --rtdb > items.h
+    """
+
+IMPORT_STORY: Final = """
+    Read CAMBADA's rtdb.conf and print its items as the table [board] of team.toml, with the sizes of their C types. This command
+    compiles a file that only names the types, and reads the sizes from the object file: it runs nothing of yours, and works with
+    a compiler for the robots' processor. An agent needs no compiler. A mistake in the file is told with line and column.
+
+    RTDB2's XML has no types: its keys become msgpack items of 1024 bytes.
+
+      failover board import rtdb.conf -I include >> team.toml
+      failover board import rtdb.conf -I include --cc "aarch64-linux-gnu-g++" --robot BASE_STATION=base
+      failover board import rtdb2_configuration.xml >> team.toml
+    """
+
+
 def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, story: str) -> argparse.ArgumentParser:
     """One act of ``failover team``."""
     room: argparse.ArgumentParser = acts.add_parser(

@@ -284,6 +284,19 @@ VERBS: Final = (
         "failover.cli.verbs.team:show",
     ),
     Verb(
+        "board",
+        "the team's board: its items as a C header, and from an rtdb.conf",
+        """
+        The board holds named values, items, that each robot of the team writes for itself and every robot reads. team.toml
+        declares them (docs/configuration.md). failover board ACT --help explains an act.
+
+          failover board header > items.h
+          failover board import rtdb.conf -I include
+        """,
+        arguments.board,
+        "failover.cli.verbs.board_files:header",
+    ),
+    Verb(
         "check",
         "can failover protect programs here, or this process; and what to change",
         """

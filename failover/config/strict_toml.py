@@ -52,6 +52,11 @@ def read(path: Path, kind: type[T]) -> T:
         raise FileMistakeError(_wrong_value(path, text, str(error))) from error
 
 
+def place_of(path: Path, keys: tuple[str, ...]) -> str:
+    """ "file:line: key" of a key in a file that was read, for what its reader finds out afterwards."""
+    return f"{path}:{line_of(_text(path), keys)}: {_spelled(keys)}"
+
+
 def _text(path: Path) -> str:
     try:
         with path.open("rb") as file:

@@ -14,13 +14,18 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from failover.config import strict_toml
+from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
 from failover.core.wire import names
 from failover.errors import NameFormatError, TeamFileError
+
+if TYPE_CHECKING:
+    from failover.core.board.items import Board
 
 Role = Literal["robot", "server", "witness"]
 """Robots run components; servers keep checkpoints and vote; witnesses vote."""
@@ -56,10 +61,18 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Team:
-    """The members, by name."""
+    """The members, by name, and what lies on their board."""
 
     team: str
     robots: dict[str, Robot] = field(default_factory=dict)
+    board: BoardConfig = field(default_factory=BoardConfig)
+
+    def items(self) -> Board:
+        """The board's declarations, checked when the file was read.
+
+        Its `Board.terms` are part of the roster's digest: robots with different boards do not read each other's frames.
+        """
+        return board_of(self.board, lambda keys: f"{TEAM_FILE}: {'.'.join(keys)}")
 
 
 def read(directory: Path) -> Team:
@@ -77,6 +90,8 @@ def read(directory: Path) -> Team:
         raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
     for name, robot in team.robots.items():
         check_robot(str(path), name, robot)
+    if team.board.items:
+        board_of(team.board, lambda keys: strict_toml.place_of(path, keys))
     return team
 
 
@@ -129,11 +144,23 @@ def for_lookup(host: str) -> str | bytes:
 
 
 def write(directory: Path, team: Team) -> None:
-    """Write the team file whole: aside, then renamed."""
+    """Write the team file whole: aside, then renamed. What an operator wrote below ``[board]`` stays as it is."""
     directory.mkdir(parents=True, exist_ok=True)
-    aside = directory / (TEAM_FILE + ".new")
-    aside.write_text(_as_toml(team))
-    aside.replace(directory / TEAM_FILE)
+    path, aside = directory / TEAM_FILE, directory / (TEAM_FILE + ".new")
+    aside.write_text(_as_toml(team) + _board_text(path, team.board))
+    aside.replace(path)
+
+
+def _board_text(path: Path, board: BoardConfig) -> str:
+    """The table of the board for a file that is written anew: the lines of the one before, if they mean the same."""
+    if board == BoardConfig():
+        return ""
+    if path.exists():
+        kept = text_of_board(path.read_text())
+        with contextlib.suppress(tomllib.TOMLDecodeError):
+            if tomllib.loads(kept).get("board") == tomllib.loads(path.read_text()).get("board"):
+                return "\n" + kept
+    return "\n" + as_toml(board_of(board, ".".join))
 
 
 def enrol(team: Team, name: str, robot: Robot) -> Team:

@@ -15,7 +15,7 @@ import msgspec
 import xxhash
 from msgspec import Struct
 
-from failover.core.board.item_types import ITEM_SIZE_MAX, Opaque, Type, aligned, canonical, size_of
+from failover.core.board.item_types import ITEM_SIZE_MAX, OPAQUE, Opaque, Type, aligned, canonical, size_of
 from failover.core.board.item_values import type_of
 from failover.core.wire import names
 from failover.errors import ItemError, NameFormatError
@@ -158,7 +158,7 @@ def _typed(said: Any, size: int) -> Type:
     """The type of an item by its keys type and size."""
     if size and not 1 <= size <= ITEM_SIZE_MAX:
         raise ItemError(f"size {size} is not from 1 to {ITEM_SIZE_MAX}", "size")
-    if said is None or said in ("bytes", "msgpack", "json"):
+    if said is None or (isinstance(said, str) and said in OPAQUE):
         if not size:
             raise ItemError(f"{said or 'an item without a type'} needs a size: the most bytes of a value", "type")
         return Opaque(said or "bytes", size)
@@ -238,6 +238,11 @@ class Board(Struct, frozen=True):
         if not self.items:
             return 0
         return xxhash.xxh3_64_intdigest(msgspec.json.encode([item.as_words() for item in self.items]))
+
+    @property
+    def terms(self) -> bytes:
+        """The digest as bytes for a roster; b"" for a team without a board."""
+        return self.digest.to_bytes(8, "little") if self.items else b""
 
     def number_of(self, name: str) -> int | None:
         """An item's number; None where it is not declared."""
