@@ -460,5 +460,5 @@ def _is_sound(body: Body, boot: int, counter: int) -> bool:
         0 < boot < NUMBER_MAX
         and 0 < counter < NUMBER_MAX
         and (beat is None or (beat.boot == boot and is_sound(beat)))
-        and all([item.is_sound for item in body.items if item.total or item.offset])
+        and all(item.is_sound for item in body.items if item.total or item.offset)
     )

@@ -162,7 +162,7 @@ class FrameLane:
         return Heard(part, self._whole(part), way_ns)
 
     def _whole(self, part: Part) -> Sequence[Portion]:
-        if not any([item.total for item in part.items]):
+        if not any(item.total for item in part.items):
             return part.items
         whole = [self.assembly.take(part.sender, item) for item in part.items]
         return [item for item in whole if item is not None]
