@@ -13,14 +13,15 @@ from typing import Final
 from msgspec import Struct
 
 from agent.main_loop.board_files import BoardFiles
-from agent.main_loop.own_items import OwnItems
+from agent.main_loop.own_items import OwnItems, number_in
+from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, received, sent_age_us
 from failover.core.board.banks import Place, put_carefully
-from failover.core.board.due import Sent, Turns
+from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
@@ -29,6 +30,9 @@ from failover.errors import BoardError, OvertakenError
 UNREADABLE: Final = "own items that could not be read"
 UNKNOWN: Final = "items with numbers that are not known here"
 TOO_LARGE: Final = "values larger than declared"
+
+REMOVE_ROUNDS: Final = 3
+"""Missed rounds after which a robot may have left."""
 
 WORST_FALLS: Final = 1000
 """Frames in which the longest way is forgotten by two thirds: what is longer than it is about one frame of a thousand."""
@@ -69,6 +73,7 @@ class BoardLink:
 
     Attributes:
         dropped: by reason.
+        wakes: readable when an urgent item was put.
     """
 
     def __init__(self, files: BoardFiles, round_ns: int) -> None:
@@ -77,6 +82,9 @@ class BoardLink:
         self.turns = Turns()
         self.dropped: Counter[str] = Counter()
         self._own = OwnItems(files.own)
+        self._gone: dict[int, int] = {}
+        self._buckets: dict[int, Bucket] = {}
+        self.wakes = UrgentItems(files.own, self._own)
         self._peers = {name: _Peer(file, _slots(file)) for name, file in files.peers.items()}
 
     # --- Out ---
@@ -92,9 +100,25 @@ class BoardLink:
             self.dropped[UNREADABLE] += 1
             return []
 
+    def urgent(self, now_ns: int) -> list[Portion]:
+        """Urgent items that were put since they last went, as often as `Bucket` allows it."""
+        try:
+            table = self._own.newest()
+        except (BoardError, OSError):
+            self.dropped[UNREADABLE] += 1
+            return []
+        put = [one.id for one in self._own.urgent if number_in(table, one) > self._gone.get(one.id, 0)]
+        allowed = [number for number in put if self._buckets.setdefault(number, Bucket()).take(now_ns)]
+        return self._portions(allowed, table, now_ns)
+
     def placed(self, portions: Sequence[Portion], count: int) -> None:
         """The first ``count`` of what was due found room in the frame."""
         self.turns.left(portion.number for portion in portions[count:])
+        self.went(portions[:count])
+
+    def went(self, portions: Sequence[Portion]) -> None:
+        """These are on their way: what is urgent of them need not go again."""
+        self._gone.update((portion.number, portion.put) for portion in portions)
 
     def _portions(self, numbers: Sequence[int], table: bytes, now_ns: int) -> list[Portion]:
         found = []
@@ -162,16 +186,24 @@ class BoardLink:
         cycle_ns = slot.record.period * self._round_ns
         words[(at + layout.FORMULA_FIELD) // 8] = bound_ns(slot.record.period, cycle_ns, peer.worst_ns, self._round_ns, 1)
 
-    def tell_states(self, states: dict[str, int]) -> None:
-        """Note of each robot whether it is there, as one of `layout.STATES`."""
-        for name, state in states.items():
-            peer = self._peers.get(name)
-            if peer is not None and peer.state != state:
+    def tell_states(self, now_ns: int, lease_ns: int) -> None:
+        """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease."""
+        for peer in self._peers.values():
+            silent_ns = now_ns - peer.heard_ns
+            state = (
+                layout.RUN
+                if silent_ns < REMOVE_ROUNDS * self._round_ns
+                else layout.REMOVE
+                if silent_ns < lease_ns
+                else layout.NOT
+            )
+            if peer.state != state and peer.heard_ns:
                 peer.state = state
                 peer.file.set_word32(layout.STATE_AT, state)
 
     def close(self) -> None:
         """Give the locks back; the files stay for the agent that comes after."""
+        self.wakes.close()
         for file in (self._files.own, *self._files.peers.values()):
             file.close()
 

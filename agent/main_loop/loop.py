@@ -15,8 +15,9 @@ import select
 import signal
 import socket
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from agent.config import Settings
 from agent.core_config import node_config
@@ -48,12 +49,15 @@ from checkpoint.keeper.messages import ChannelClosedError, ChannelError
 from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
-from failover.core.frames.frame import Part, Reason, Refused
+from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
 from failover.core.frames.roster import roster
-from failover.core.node import Node
+from failover.core.node import URGENT_GAP_NS, Node
 from failover.core.types import Ballot
 from failover.core.wire.messages import Beat
+
+if TYPE_CHECKING:
+    from agent.main_loop.board_link import BoardLink
 
 NANOSECONDS_A_SECOND: Final = 1_000_000_000
 SLEEP_LIMIT_S: Final = 0.5
@@ -92,6 +96,8 @@ OUTLIVED: Final = (
     "then are lost; it begins again as life %d"
 )
 
+WAITED: Final = "items that waited a round for room in a frame"
+
 log = logging.getLogger("failover.heart")
 
 
@@ -109,9 +115,13 @@ class Heart:
         self._ballot = ballot
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
-        self._frames = FrameLane(
-            self._me, settings.team.team, roster(settings.team.robots), ballot.record.boot, settings.config.beat_ms * 1_000
-        )
+        declared = settings.team.items() if settings.team.board.items else None
+        self._roster = roster(settings.team.robots, declared.terms if declared is not None else b"")
+        self._frames = FrameLane(self._me, settings.team.team, self._roster, ballot.record.boot, settings.config.beat_ms * 1_000)
+        self._declared, self._board_trouble = declared, ""
+        self._board: BoardLink | None = None
+        self._round = self._round_ns = self._sent_ns = 0
+        self._urgent_ns: int | None = None
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
         self._lanes = LanesProcess(settings)
         self._node: Node | None = None
@@ -172,6 +182,7 @@ class Heart:
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
         for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno(), self._alarm.fileno()):
             self._poll.register(descriptor, select.EPOLLIN)
+        self._open_board()
         gc.collect()
         syscalls.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
@@ -179,6 +190,23 @@ class Heart:
         self._start_lanes()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
+
+    def _open_board(self) -> None:
+        """Map the board of a team that has one; a robot without its board still protects its programs."""
+        if self._declared is None:
+            return
+        from agent.main_loop.board_files import open_files  # here: a team without a board does not load it
+        from agent.main_loop.board_link import BoardLink
+
+        runtime = Path(self._settings.config.runtime_directory)
+        try:
+            files = open_files(self._settings.team.team, self._me, self._roster, self._declared, runtime)
+        except AgentError as error:
+            self._board_trouble = str(error)
+            log.error("%s", error)
+            return
+        self._board = BoardLink(files, self._outbox.beat_ns)
+        self._poll.register(self._board.wakes.fileno(), select.EPOLLIN)
 
     def _start_lanes(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
@@ -207,6 +235,11 @@ class Heart:
                 self._note_persisted()
             elif descriptor == self._wake.fileno():
                 self._ending = True
+            elif self._board is not None and descriptor == self._board.wakes.fileno():
+                self._board.wakes.heed()
+                self._urgent_ns = self._sent_ns + URGENT_GAP_NS
+        if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
+            self._send_urgent()
         self._watch_lanes()
         if self._node is not None:
             late_ns = clock.now_ns() - self._node.next_deadline_ns()
@@ -220,7 +253,7 @@ class Heart:
         In a flood of what is refused the heart leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
-        self._rests = self._node is not None and self._node.rests(now_ns)
+        self._rests = self._node is not None and self._board is None and self._node.rests(now_ns)
         listens = not self._rests and now_ns >= self._deaf_until_ns
         if listens != self._listens:
             self._listens = listens
@@ -253,6 +286,8 @@ class Heart:
         if self._node is None:
             return None
         deadline_ns = self._node.next_deadline_ns()
+        if self._urgent_ns is not None:
+            deadline_ns = min(deadline_ns, self._urgent_ns)
         return deadline_ns if self._listens or self._rests else min(deadline_ns, self._deaf_until_ns)
 
     # --- events in ---
@@ -270,9 +305,12 @@ class Heart:
         taken = refused = 0
         for frame, link, wall_ns, sender in self._beats.receive():
             taken += 1
-            opened = self._frames.open(frame, arrived_ns(wall_ns))
+            came_ns = arrived_ns(wall_ns)
+            opened = self._frames.open(frame, came_ns)
             if not isinstance(opened, Refused):
                 self._copies.heard(opened.part, link)
+                if self._board is not None:
+                    self._board.take(opened, came_ns)
                 self._take_part(opened.part, link, self._came_ns(wall_ns))
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
@@ -398,12 +436,33 @@ class Heart:
             self._act(act)
 
     def _send(self, beat: Beat) -> None:
-        """One frame, to everybody over every link."""
-        made, _ = self._frames.seal(beat, (), clock.now_ns())
+        """A beat, and the items whose round it is: a beat that leaves earlier, because something changed, begins no round."""
+        now_ns = clock.now_ns()
+        if self._board is None or now_ns - self._round_ns <= self._outbox.beat_ns // 2:
+            self._send_frame(beat, (), now_ns)
+            return
+        self._round, self._round_ns = self._round + 1, now_ns
+        self._board.tell_states(now_ns, self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000)
+        items = self._board.due(self._round, now_ns)
+        self._board.placed(items, self._send_frame(beat, items, now_ns))
+
+    def _send_urgent(self) -> None:
+        """Items that cannot wait for their round, without a beat."""
+        self._urgent_ns = None
+        now_ns = clock.now_ns()
+        items = self._board.urgent(now_ns) if self._board is not None else []
+        if self._board is not None and items:
+            self._board.went(items[: self._send_frame(None, items, now_ns)])
+
+    def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:
+        """One frame, to everybody over every link; how many of the items are in it."""
+        made, placed = self._frames.seal(beat, items, now_ns, round_=self._round)
         for sealed in made:
             for peer in sealed.to:
                 for datagram in sealed.datagrams:
                     self._beats.send(peer, datagram)
+        self._sent_ns = now_ns
+        return placed
 
     def _act(self, act: Act) -> None:
         self._lanes.order(act)
@@ -421,12 +480,24 @@ class Heart:
             self._gap_us_max,
             self._gaps,
             dict(self._lost),
+            self._items_left_out(),
         )
-        troubles = tuple(filter(None, (self._persister.trouble, self._scribe.trouble, *map(UNLIKE.format, sorted(self._unlike)))))
+        troubles = tuple(
+            filter(
+                None,
+                (self._persister.trouble, self._scribe.trouble, self._board_trouble, *map(UNLIKE.format, sorted(self._unlike))),
+            )
+        )
         if question.what == "why":
             return Told(question.number, now_ns, story=self._scribe.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
+
+    def _items_left_out(self) -> dict[str, int]:
+        """Values that were not taken, by reason, and those that waited."""
+        left_out = self._frames.assembly.dropped + (self._board.dropped if self._board is not None else Counter())
+        waited = sum(self._board.turns.waited.values()) if self._board is not None else 0
+        return dict(left_out + Counter({WAITED: waited}))
 
     def _end(self) -> None:
         self._lanes.send(Farewell())
@@ -435,6 +506,8 @@ class Heart:
         self._scribe.close(PERSIST_PATIENCE_S)
         self._lanes.wait()
         self._beats.close()
+        if self._board is not None:
+            self._board.close()
         self._alarm.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)

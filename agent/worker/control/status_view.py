@@ -97,6 +97,7 @@ def team_view(
             "late_us_max": beats.late_us_max,
             "gap_us_max": beats.gap_us_max,
             "gaps": beats.gaps,
+            "items": dict(beats.items),
         },
         "lanes_pid": os.getpid(),
     }

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import select
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,7 @@ from agent.system import clock
 from failover.boards.board import Board
 from failover.core.board import layout
 from failover.core.board.ages import UNBOUNDED_NS
+from failover.core.board.due import URGENT_PER_S
 from failover.core.board.items import Board as Declared
 from failover.core.board.items import Item
 from failover.core.frames.frame import Portion
@@ -33,6 +36,7 @@ BOARD = Declared(
         Item("map", "msgpack", size=4000, period=2),
         Item("mine", size=8, shared=False),
         Item("slow", size=8, period=3, phase=1),
+        Item("alarm", size=8, period=1000, phase=999, urgent=True),
     )
 )
 TEAM = roster(["robot1", "robot2"], BOARD.terms)
@@ -234,10 +238,40 @@ def test_a_file_that_a_program_makes_shorter_ends_no_agent(pair: tuple[Robot, Ro
 
 
 def test_states_of_robots_are_told(pair: tuple[Robot, Robot]) -> None:
-    _, second = pair
+    first, second = pair
     assert second.program.robots()["robot1"].state == "not"
-    second.link.tell_states({"robot1": layout.RUN, "robot9": layout.RUN})
-    assert second.program.robots()["robot1"].state == "run"
+    second.hears(first.says())
+    now_ns = clock.now_ns()
+    for silent_ns, state in ((0, "run"), (4 * ROUND_NS, "remove"), (20 * ROUND_NS, "not")):
+        second.link.tell_states(now_ns + silent_ns, 10 * ROUND_NS)
+        assert second.program.robots()["robot1"].state == state
+
+
+def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_often(pair: tuple[Robot, Robot]) -> None:
+    first, second = pair
+    item = first.program.item("alarm", bytes)
+    first.link.due(0, clock.now_ns())  # the table is read
+    for number in range(1, 4):
+        item.put(b"%d" % number)
+        with closing(select.epoll()) as loop:
+            loop.register(first.link.wakes.fileno(), select.EPOLLIN)
+            assert loop.poll(60)
+        first.link.wakes.heed()
+        now_ns = clock.now_ns()
+        (urgent,) = first.link.urgent(now_ns)
+        made, _ = first.lane.seal(None, [urgent], now_ns)
+        first.link.went([urgent])
+        assert first.link.urgent(now_ns) == []
+        second.hears(made[0].datagrams)
+        assert second.program.item("alarm", bytes).get("robot1").value == b"%d" % number
+    now_ns = clock.now_ns()
+    sent = 0
+    for _ in range(50):
+        item.put(b"!")
+        portions = first.link.urgent(now_ns)
+        first.link.went(portions)
+        sent += len(portions)
+    assert sent <= URGENT_PER_S
 
 
 def test_a_group_that_is_not_there_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
