@@ -7,7 +7,7 @@ anything into `own`; every size is checked before it is believed, and nothing of
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from msgspec import Struct
@@ -19,8 +19,8 @@ from failover.boards import futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
-from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, received, sent_age_us
-from failover.core.board.banks import Place, put_carefully
+from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
+from failover.core.board.banks import put_carefully
 from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
@@ -34,38 +34,39 @@ TOO_LARGE: Final = "values larger than declared"
 REMOVE_ROUNDS: Final = 3
 """Missed rounds after which a robot may have left."""
 
+BOUNDS_TOLD_NS: Final = 1_000_000_000
+"""Between two computations of the bounds of a peer's items."""
+
 WORST_FALLS: Final = 1000
 """Frames in which the longest way is forgotten by two thirds: what is longer than it is about one frame of a thousand."""
 
 
-class _Slot(Struct):
-    """One item of a peer.
-
-    Attributes:
-        put: number of its newest put, as the peer counts them.
-        round: of the peer's frame that brought it last.
-    """
-
-    record: Record
-    place: Place
-    address: int
-    put: int = 0
-    round: int = -1
+Take = Callable[[Portion, int, int, int], None]
+"""``(portion, round, came_ns, way_us)``: one item of a peer came, all of it."""
 
 
 class _Peer(Struct):
     """A peer's file, and what is known of its frames.
 
     Attributes:
+        items: number → most bytes of a value, and what takes one.
         worst_ns: the longest way lately; falls slowly.
     """
 
     file: MappedFile
-    slots: dict[int, _Slot]
+    items: dict[int, tuple[int, Take]]
     boot: int = 0
     heard_ns: int = 0
     state: int = layout.NOT
     worst_ns: int = 0
+    told_ns: int = 0
+
+
+def _no_item(_portion: Portion, _round: int, _came_ns: int, _way_us: int) -> None:
+    """Of a number that is not known here; never called."""
+
+
+_NOT_HERE: Final[tuple[int, Take]] = (-1, _no_item)
 
 
 class BoardLink:
@@ -85,7 +86,7 @@ class BoardLink:
         self._gone: dict[int, int] = {}
         self._buckets: dict[int, Bucket] = {}
         self.wakes = UrgentItems(files.own, self._own)
-        self._peers = {name: _Peer(file, _slots(file)) for name, file in files.peers.items()}
+        self._peers = {name: self._peer(file) for name, file in files.peers.items()}
 
     # --- Out ---
 
@@ -141,50 +142,35 @@ class BoardLink:
         if peer is None or not part.alike:
             return
         if part.boot != peer.boot:
-            self._begin_life(peer, part.boot)
+            peer.boot = part.boot
+            peer.items = self._takers(peer.file)  # its puts are counted from any number
         self._note_frame(peer, heard.way_ns, came_ns)
-        way_us = NO_ERROR_BOUND if heard.way_ns is None else heard.way_ns // NS_PER_US + 1
+        round_, way_us = part.round, way_bound_us(heard.way_ns)
         for portion in heard.items:
-            slot = peer.slots.get(portion.number)
-            if slot is None:
-                self.dropped[UNKNOWN] += 1
-            elif len(portion.value) > slot.record.size:
-                self.dropped[TOO_LARGE] += 1
+            size, take = peer.items.get(portion.number, _NOT_HERE)
+            if len(portion.value) <= size:
+                take(portion, round_, came_ns, way_us)
             else:
-                self._note_item(peer, slot, part.round, way_us)
-                if portion.put > slot.put:
-                    slot.put = portion.put
-                    self._put(slot, portion, came_ns, way_us)
-
-    def _put(self, slot: _Slot, portion: Portion, came_ns: int, way_us: int) -> None:
-        place = slot.place
-        stamp_ns, error_us = received(portion.age_us, came_ns, way_us)
-        put_carefully(place, place.words[place.newest] + 1, portion.value, max(stamp_ns, 0), error_us, FENCE)
-        futex.wake(slot.address)
-
-    def _begin_life(self, peer: _Peer, boot: int) -> None:
-        """The peer's agent began anew, and perhaps its board with it: its puts are counted from any number."""
-        peer.boot = boot
-        for slot in peer.slots.values():
-            slot.put, slot.round = 0, -1
+                self.dropped[TOO_LARGE if size >= 0 else UNKNOWN] += 1
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
-        words = peer.file.words
-        peer.heard_ns = words[layout.HEARD_AT // 8] = max(came_ns, 1)
-        if way_ns is not None:
-            peer.worst_ns = max(way_ns, peer.worst_ns - peer.worst_ns // WORST_FALLS)
+        """Tell when it came; from time to time the bounds that follow from the longest ways."""
+        peer.heard_ns = peer.file.words[layout.HEARD_AT // 8] = max(came_ns, 1)
+        if way_ns is None:
+            return
+        peer.worst_ns = max(way_ns, peer.worst_ns - peer.worst_ns // WORST_FALLS)
+        if came_ns - peer.told_ns > BOUNDS_TOLD_NS:
+            peer.told_ns = came_ns
+            for record in peer.file.records():
+                cycle_ns = record.period * self._round_ns
+                bound = bound_ns(record.period, cycle_ns, peer.worst_ns, self._round_ns, 1)
+                peer.file.words[(record.at + layout.FORMULA_FIELD) // 8] = bound
 
-    def _note_item(self, peer: _Peer, slot: _Slot, round_: int, way_us: int) -> None:
-        """Count the frame, and those that were lost since the last one with this item; tell the bound that follows."""
-        words, at = slot.place.words, slot.record.at
-        words[(at + layout.FRAMES_FIELD) // 8] += 1
-        words[(at + layout.TRANSIT_FIELD) // 8] = round_ << 32 | way_us
-        missing = (round_ - slot.round) // slot.record.period - 1
-        if slot.round >= 0 and missing > 0:
-            words[(at + layout.LOST_FIELD) // 8] += missing
-        slot.round = round_
-        cycle_ns = slot.record.period * self._round_ns
-        words[(at + layout.FORMULA_FIELD) // 8] = bound_ns(slot.record.period, cycle_ns, peer.worst_ns, self._round_ns, 1)
+    def _peer(self, file: MappedFile) -> _Peer:
+        return _Peer(file, self._takers(file))
+
+    def _takers(self, file: MappedFile) -> dict[int, tuple[int, Take]]:
+        return {record.id: (record.size, _taker(file, record)) for record in file.records()}
 
     def tell_states(self, now_ns: int, lease_ns: int) -> None:
         """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease."""
@@ -208,6 +194,35 @@ class BoardLink:
             file.close()
 
 
-def _slots(file: MappedFile) -> dict[int, _Slot]:
-    base = file.address(0)
-    return {record.id: _Slot(record, file.place(record), base + record.at + layout.NEWEST_FIELD) for record in file.records()}
+def way_bound_us(way_ns: int | None) -> int:
+    """By how much a value can be older than told: the longest way, and what it and the age lost when they were rounded."""
+    return NO_ERROR_BOUND if way_ns is None else min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)
+
+
+def _taker(file: MappedFile, record: Record) -> Take:
+    """What puts an item of a peer: numbers of puts are this board's own, one after the other, as BOARD.md wants it."""
+    place = file.place(record)
+    words, newest, at = place.words, place.newest, record.at
+    frames, lost, transit = (at + layout.FRAMES_FIELD) // 8, (at + layout.LOST_FIELD) // 8, (at + layout.TRANSIT_FIELD) // 8
+    period, wake = record.period, futex.waker(file.address(at + layout.NEWEST_FIELD))
+    number, last_put, last_round = words[newest], 0, -1
+
+    def take(portion: Portion, round_: int, came_ns: int, way_us: int) -> None:
+        nonlocal number, last_put, last_round
+        words[frames] += 1
+        words[transit] = round_ << 32 | way_us
+        if 0 <= last_round < round_ - period:
+            words[lost] += (round_ - last_round) // period - 1
+        last_round = round_
+        put = portion.put
+        if put > last_put:
+            last_put = put
+            number += 1
+            age_us = portion.age_us
+            stamp_ns = came_ns - age_us * NS_PER_US
+            put_carefully(
+                place, number, portion.value, max(stamp_ns, 0), way_us if age_us < AGE_MAX_US else NO_ERROR_BOUND, FENCE
+            )
+            wake()
+
+    return take
