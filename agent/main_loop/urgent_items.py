@@ -61,12 +61,17 @@ class UrgentItems:
 
     def _wait(self, seen: dict[int, int]) -> None:
         urgent, descriptor = self._items.urgent, self._file.descriptor
-        changed = int.from_bytes(os.pread(descriptor, 4, layout.CHANGED_AT), "little")
+        changed = self._changed()
         for record in urgent:
             os.pwrite(descriptor, WAITS_FOR_ANY, record.at + ANY_FIELD)
         table = self._items.newest() if urgent else b""
         newest = {record.id: number_in(table, record) for record in urgent}
-        if any(seen.get(number, 0) != put for number, put in newest.items()):
+        if any(seen.get(number, 0) != put for number, put in newest.items()):  # put before it was told that we wait
             seen.update(newest)
             os.eventfd_write(self._event, 1)
         futex.wait(self._file.address(layout.CHANGED_AT), changed, LOOK_S)
+        if self._changed() != changed:  # the loop is to know first, and this thread what it was afterwards
+            os.eventfd_write(self._event, 1)
+
+    def _changed(self) -> int:
+        return int.from_bytes(os.pread(self._file.descriptor, 4, layout.CHANGED_AT), "little")
