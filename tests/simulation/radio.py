@@ -3,9 +3,10 @@
 A robot's frame goes to the access point as unicast: acknowledged, sent again up to 7 times. The access point sends it on to all
 robots as multicast at 1 Mbit/s: no acknowledgement, so a collision there loses it. Alien stations add echo requests and replies.
 
-The distributed coordination function: a station with something to send waits until the medium was idle for DIFS, then for a random
-number of idle slots, which stops counting while the medium is busy. Equal counts collide; a unicast sender then doubles its window.
-Not modelled: capture, fading, hidden stations on the air, rate adaptation, RTS/CTS, post-backoff (each frame draws its own count).
+The distributed coordination function: a station with something to send waits until the medium was idle for DIFS, then for a
+random number of idle slots; the count stops while the medium is busy. Equal counts collide; a unicast sender then doubles its
+window. Not modelled: capture, fading, stations that do not hear each other, rate adaptation, RTS/CTS, post-backoff (each frame
+draws its own count).
 
 Source: IEEE 802.11-2007, clause 9.2 (DCF) and 15.3.3 (802.11b: slot 20 µs, SIFS 10, long preamble 192).
 """
@@ -127,6 +128,7 @@ class Radio:
         self._contenders: list[Station] = []
         self._idle_ns = 0
         self._is_busy = False
+        self._spans_ns: dict[tuple[int, bool], int] = {}
         self._turn = 0
         self._turn_index = -1
         self._ack_ns = SIFS_NS + PLCP_NS + round(ACK_SIZE * 8_000 / rates.basic)
@@ -177,7 +179,7 @@ class Radio:
         if not self._contenders:
             self._turn_index = -1
             return
-        index = min(map(self._index, self._contenders))
+        index = min([self._index(station) for station in self._contenders])
         if index != self._turn_index:
             self._turn += 1
             self._turn_index = index
@@ -186,7 +188,17 @@ class Radio:
     def _transmit(self, turn: int) -> None:
         if turn != self._turn or self._is_busy:
             return
-        index = self._turn_index
+        if len(self._contenders) == 1:
+            senders, self._contenders = self._contenders, []
+        else:
+            senders = self._first_of_many(self._turn_index)
+        self._is_busy = True
+        self._turn += 1
+        end_ns = self._agenda.now_ns + max(self._on_air_ns(station.queue[0]) for station in senders)
+        self._agenda.at(end_ns, self._over, senders)
+
+    def _first_of_many(self, index: int) -> list[Station]:
+        """Who sends in this slot; the others have waited so long in vain."""
         indices = [(self._index(station), station) for station in self._contenders]
         senders = [station for at, station in indices if at == index]
         for at, station in indices:
@@ -194,15 +206,16 @@ class Radio:
                 station.count -= max(index - (at - station.count), 0)
                 station.ready_ns = 0
         self._contenders = [station for at, station in indices if at != index]
-        self._is_busy = True
-        self._turn += 1
-        end_ns = self._agenda.now_ns + max(self._on_air_ns(station.queue[0]) for station in senders)
-        self._agenda.at(end_ns, self._over, senders)
+        return senders
 
     def _on_air_ns(self, packet: Packet) -> int:
-        if packet.is_multicast:
-            return air_ns(packet.size, self._rates.multicast)
-        return air_ns(packet.size, self._rates.unicast) + self._ack_ns
+        kind = (packet.size, packet.is_multicast)
+        span_ns = self._spans_ns.get(kind)
+        if span_ns is None:
+            size, is_multicast = kind
+            unicast_ns = air_ns(size, self._rates.unicast) + self._ack_ns
+            span_ns = self._spans_ns[kind] = air_ns(size, self._rates.multicast) if is_multicast else unicast_ns
+        return span_ns
 
     def _over(self, senders: list[Station]) -> None:
         """The medium is idle again."""

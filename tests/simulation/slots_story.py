@@ -1,11 +1,11 @@
 """Scenarios of the slots that a person can read, played by the agent's own `Slots` on the radio of `radio.py`.
 
-A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment; robots are named by their numbers, ``all`` means all of the team.
+A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment; robots are named by their numbers, ``all`` are all of them.
 
     team 8                     robots in the team file; before everything else
     terms spread=false         other terms than the usual ones
     0     on all               these robots start;  off 3: their power is cut (a later on is a new life)
-    0     clocks 100           every clock is wrong by up to so many ppm; before robots start (it is ± 50, and years apart, anyway)
+    0     clocks 100           every clock is wrong by up to so many ppm; before robots start (± 50, and years apart, anyway)
     0     listens 3            from its next start it only listens;  round 3 60: from its next start its t_tup_ms is 60
     500   one-way 1 2          what 1 sends does not reach 2;  cut 1 2: both ways;  mend: all of that ends
     500   apart 1 2 / 3 4      these groups do not hear each other
@@ -17,10 +17,12 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment; robots are 
     900   agreed               all that are on use the same set: exactly those that are on
     900   agreed-within 250    they came to that within 250 ms after the last mark, and have not left it since
     900   steady               no set has changed since the mark
+    900   together 1           since the mark all robots on but the reference changed their sets at once: within so many ms
     900   set 1 1 2 3          the set that 1 uses
     900   reference 2 all      the one that these follow
     900   sees 1 3 remove      how 1 sees 3: not, insert, run, remove
     900   own 3 silent         what it does: listening, running, silent;  why 3 TEXT: its reason has these words
+    900   accuses-nobody 3     since the mark 3 has not missed any robot
     900   deaf 1 3 2           at 1 the status says that 3 does not hear 2;  hears-all: no status says such a thing
     900   gaps 5.5             no two frames since the mark (of two robots) left closer to each other, in ms
     900   sent 3 1 2           frames that it has sent since the mark: at least, at most
@@ -33,12 +35,13 @@ Every robot keeps the invariants all the time: never two frames within half a sl
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import msgspec
 
 from failover.core.frames.slots import Slots
-from failover.core.frames.terms import Terms
+from failover.core.frames.terms import Seen, Terms
 from failover.core.types import MS
 from tests.simulation.slotted import Robot, Team
 
@@ -55,6 +58,8 @@ class SlotsStory:
         self.mark_ns = 0
         self.agreed_ns: int | None = None
         self.changed_ns = 0
+        self.changes: dict[int, int] = {}
+        self.missed: dict[int, int] = {}
         self._sets: dict[int, tuple[int, int]] = {}
         self._sends: dict[int, tuple[int, int]] = {}
         self._terms: dict[int, Terms] = {}
@@ -80,7 +85,10 @@ class SlotsStory:
         life, used = self._sets.get(robot.rank, (0, 0))
         if (life, used) != (robot.boot, slots.set):
             self._sets[robot.rank] = (robot.boot, slots.set)
-            self.changed_ns = now_ns if life == robot.boot else self.changed_ns
+            if life == robot.boot:
+                self.changed_ns = self.changes[robot.rank] = now_ns
+        if any(peer.seen is Seen.REMOVE for peer in slots.peers.values()):
+            self.missed[robot.rank] = now_ns
         if not self.team.agreed():
             self.agreed_ns = None
         elif self.agreed_ns is None:
@@ -193,6 +201,9 @@ class SlotsStory:
                 deaf = self._slots(arguments[0]).view().deaf
                 pair = (f"robot{arguments[1]}", f"robot{arguments[2]}")
                 self._expect(f"{arguments[0]} says that {arguments[1]} does not hear {arguments[2]}", deaf == (pair,), deaf)
+            case "accuses-nobody":
+                at_ns = self.missed.get(int(arguments[0]) - 1, 0)
+                self._expect(f"{arguments[0]} accuses nobody", at_ns < self.mark_ns, f"it did at {at_ns / MS:.1f} ms")
             case "hears-all":
                 deaf = [robot.slots.view().deaf for robot in team.robots if robot.slots is not None]
                 self._expect("no robot tells of a deaf one", not any(deaf), deaf)
@@ -204,7 +215,7 @@ class SlotsStory:
         match verb:
             case "gaps":
                 sends = team.sends(self.mark_ns)
-                gaps = [(after[0] - before[0], before, after) for before, after in zip(sends, sends[1:], strict=False)]
+                gaps = [(after[0] - before[0], before, after) for before, after in itertools.pairwise(sends)]
                 least = min((gap for gap in gaps if gap[1][1] != gap[2][1]), default=(0, (0, 0), (0, 0)))
                 told = f"{least[0] / MS:.2f} ms between {least[1][1] + 1} and {least[2][1] + 1} at {least[1][0] / MS:.1f} ms"
                 self._expect(f"gaps of {arguments[0]} ms", least[0] >= at_least * MS, told)
@@ -213,9 +224,15 @@ class SlotsStory:
                 self._expect(f"{arguments[0]} has sent {arguments[1:]} frames", at_least <= sent <= at_most, sent)
             case "pauses":
                 sends = [at for at in team.robots[int(arguments[0]) - 1].sends if at >= self.mark_ns]
-                pauses = [(after - before) / MS for before, after in zip(sends, sends[1:], strict=False)]
+                pauses = [(after - before) / MS for before, after in itertools.pairwise(sends)]
                 is_so = bool(pauses) and at_least <= min(pauses) and max(pauses) <= at_most
                 self._expect(f"{arguments[0]} pauses for {arguments[1:]} ms", is_so, pauses)
+            case "together":
+                lowest, *followers = [robot.rank for robot in team.living()]
+                changes = [self.changes[rank] for rank in followers if self.changes.get(rank, 0) > self.mark_ns]
+                took_ms = (max(changes) - min(changes)) / MS if changes else None
+                is_so = len(changes) == len(followers) and took_ms is not None and took_ms <= at_most
+                self._expect(f"all but {lowest + 1} change their sets at once", is_so, f"it took {took_ms} ms")
             case "late":
                 late_ms = self._slots(arguments[0]).late_ns_max / MS
                 self._expect(f"{arguments[0]} was late by {arguments[1:]} ms", at_least <= late_ms <= at_most, late_ms)

@@ -251,8 +251,9 @@ class Slots:
         if not self.set >> lead.rank & 1 or self._sent_ns is None or lead.came_ns >= self._next_ns:
             return  # the last: our frame is due already, and leaves now
         target_ns = lead.left_ns + self._apart(self.me, lead.rank) * self._slot_ns()
-        if target_ns - self._sent_ns < self._t_ns // 2:  # we have spoken in this round
-            target_ns += self._t_ns
+        early_ns = self._sent_ns + self._t_ns // 2 - target_ns
+        if early_ns > 0:  # we have spoken in this round
+            target_ns += -(-early_ns // self._t_ns) * self._t_ns
         self._next_ns = max(min(target_ns, self._sent_ns + 2 * self._t_ns), lead.came_ns)
 
     def _is_in(self, lead: Peer) -> bool:
@@ -407,14 +408,12 @@ class Slots:
 
     def _peer_slot(self, peer: Peer) -> PeerSlot:
         rank = peer.rank
-        most_ns = self.transit.most_ns(rank)
         return PeerSlot(
             self.roster.names[rank],
             peer.seen,
             peer.missed,
             peer.delay_ns // US,
             self.transit.likely_ns(rank) // US,
-            None if most_ns is None else most_ns // US,
         )
 
     def _least_gap_ns(self) -> int:

@@ -94,7 +94,7 @@ class PeerSlot(Struct, frozen=True):
     Attributes:
         missed: rounds in a row in which it was not heard.
         delay_us: how much later than its slot its last frame left; as the reference measures it.
-        transit_us: half of the least round trip; ``transit_us_max``: all of it, None before the first echo.
+        transit_us: how long its frames are taken to travel.
     """
 
     robot: str
@@ -102,7 +102,6 @@ class PeerSlot(Struct, frozen=True):
     missed: int
     delay_us: int
     transit_us: int
-    transit_us_max: int | None
 
 
 class SlotsView(Struct, frozen=True):

@@ -1,8 +1,8 @@
-"""How long a frame travels, without comparing two clocks: the least round trip of the last 64, half of it each way.
+"""How long a frame travels, for the slots, without comparing two clocks: half of the least round trip of the last 64.
 
 A frame echoes the counter of each sender heard lately, and for how long it held it. Round trip = (echo came − that frame left) −
-hold; each difference is of one robot's own clock. The true one-way delay lies between 0 and the round trip, so a value's age has
-an upper bound though no two clocks agree.
+hold; each difference is of one robot's own clock. It tells when a frame is likely to have left. It bounds no age: a frame may
+have waited in a queue for much longer than the fastest of 64.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ class Transit:
         self._first_ns = first_us * 1_000
         self._left: OrderedDict[int, int] = OrderedDict()
         self._trips: dict[int, deque[int]] = {}
+        self._least: dict[int, int] = {}
 
     def left(self, counter: int, now_ns: int) -> None:
         """Our frame of this number left."""
@@ -38,18 +39,16 @@ class Transit:
         left_ns = self._left.get(counter)
         trip_ns = came_ns - left_ns - hold_us * 1_000 if left_ns is not None else -1
         if 0 <= trip_ns <= TRIP_NS_MAX:
-            self._trips.setdefault(rank, deque(maxlen=TRIPS_MAX)).append(trip_ns)
-
-    def most_ns(self, rank: int) -> int | None:
-        """The most that a frame of this peer can have travelled at its fastest; None before the first echo."""
-        trips = self._trips.get(rank)
-        return min(trips) if trips else None
+            trips = self._trips.setdefault(rank, deque(maxlen=TRIPS_MAX))
+            trips.append(trip_ns)
+            self._least[rank] = min(trips)
 
     def likely_ns(self, rank: int) -> int:
         """What is subtracted from an arrival to tell when the frame left."""
-        trips = self._trips.get(rank)
-        return min(trips) // 2 if trips else self._first_ns
+        least_ns = self._least.get(rank)
+        return self._first_ns if least_ns is None else least_ns // 2
 
     def forget(self, rank: int) -> None:
         """A peer began a new life: it may be another machine at another place."""
         self._trips.pop(rank, None)
+        self._least.pop(rank, None)
