@@ -26,6 +26,7 @@ from typing import Final
 
 from benchmarks import (
     beside,
+    board,
     chains,
     costs,
     crowd,
@@ -115,6 +116,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "lateness": lateness.lateness,
     "encoding": encoding.encoding,
     "task": task.task,
+    "board": board.board,
 }
 
 BY_ITSELF: Final = "soak"

@@ -17,11 +17,12 @@ from typing import Any, Final
 
 from agent.config import Settings
 from agent.core_config import retention
-from agent.errors import TROUBLE, GuardLostError, LaneError
+from agent.errors import TROUBLE, AgentError, GuardLostError, LaneError
 from agent.main_loop.messages import Inventory, ToLanes, Told
 from agent.system.crash import end_lanes_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
+from agent.worker import board_directory
 from agent.worker.components import launch, prerequisites
 from agent.worker.components.context import Surroundings
 from agent.worker.components.hooks import Hooks
@@ -54,6 +55,7 @@ from failover.config.quantities import size_bytes
 from failover.core import acts, events
 from failover.core.types import HISTORY_MAX, Found, Held
 from failover.core.wire.messages import Belongings, Bulk, Cancel, Chunk, Content, Credit, Lacking, Offer, Refuse, Taken
+from failover.errors import FailoverError
 
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
@@ -100,6 +102,7 @@ class Lanes(Switchboard):
         """Open the store, find what outlived the last agent."""
         for directory in (self.places.sockets, self.places.logs):
             make_directory(directory)
+        await self._provide_board()
         store = self._store = await self._open_store()
         records = Records(self._runtime / "running")
         hooks, here = Hooks(self._starter), self.settings.component
@@ -128,6 +131,16 @@ class Lanes(Switchboard):
         if found:
             self._nursery.begin()
         return Inventory(_held(store), found)
+
+    async def _provide_board(self) -> None:
+        try:
+            place = await asyncio.to_thread(board_directory.provide, self.settings)
+        except (AgentError, FailoverError, OSError) as error:
+            log.warning("no board: %s", error)
+            self._own_troubles.append(f"programs here have no board of the team: {error}")
+        else:
+            if place is not None:
+                log.info("the board is %s", place)
 
     async def _give_signs(self) -> None:
         """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""

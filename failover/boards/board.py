@@ -24,7 +24,7 @@ from failover.core.board import ages, layout
 from failover.core.board.banks import Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
-from failover.errors import BoardError, BoardGoneError, NeverWrittenError
+from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
 
 COMPONENT_VARIABLE: Final = "FAILOVER_COMPONENT"
 
@@ -253,7 +253,10 @@ class Board:
             age_ns = now - bank.stamp_ns
             age_max_ns = ages.age_max_ns(age_ns, bank.error_us)
             stale = ages.is_stale(age_max_ns, record.bound_ns or formula_ns)
-            value = values_for(record, None).unpack(bank.value)
+            try:
+                value = values_for(record, None).unpack(bank.value)
+            except ValueMisfitError as error:
+                raise ValueMisfitError(f"item {record.name!r} of {robot}: {error}") from None
             readings[robot][record.name] = Reading(value, age_ns, age_max_ns, robot, bank.number, stale)
         return readings
 
@@ -400,8 +403,12 @@ def _all_found(file: MappedFile) -> Iterator[tuple[Record, Any, int]]:
     """Record, bank and bound by the formula, of all items of a file that were ever put."""
     for record in file.records():
         place = file.place(record)
-        with contextlib.suppress(NeverWrittenError):
+        try:
             yield record, get_carefully(place, FENCE), place.words[place.formula]
+        except NeverWrittenError:
+            continue
+        except (OvertakenError, BoardError) as error:
+            raise type(error)(f"item {record.name!r} of {file.header.robot}: {error}") from None
 
 
 _BOARDS: weakref.WeakSet[Board] = weakref.WeakSet()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +17,7 @@ from failover.boards import boottime, locks
 from failover.boards.mapping import GENERATION, MappedFile
 from failover.client.control import socket_path
 from failover.core.board import layout
-from failover.core.board.items import ITEMS_MAX
+from failover.core.board.items import ITEMS_MAX, Item
 from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
 from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError
@@ -58,17 +59,22 @@ def make_file(
     flags: int,
     robot: str,
     *,
+    items: Mapping[int, Item] | None = None,
     capacity: int = ITEMS_MAX,
     rank: int = 0,
     state: int = layout.RUN,
-    roster_digest: int = 0,
+    digest: int = 0,
     mode: int = 0o600,
+    group: int = -1,
     hold: bool = False,
 ) -> int:
-    """Make one file of a board, without items, whole at its place.
+    """Make one file of a board, whole at its place.
 
     Args:
         flags: which area it is, and whether it is made without an agent.
+        items: number → declaration.
+        digest: of the team's declarations.
+        group: whose it is to be; -1: this process's.
         hold: return an opening that is user 0 already and has the table lock.
 
     Returns:
@@ -77,16 +83,23 @@ def make_file(
     Raises:
         FileExistsError: there is one.
         OSError: it cannot be made there.
+        BoardError: there is no room for so many items.
     """
-    size = layout.names_at(capacity)
     header = layout.new_header(
-        flags, capacity, check_robot(robot), boottime.boot_id(), rank=rank, state=state, roster_digest=roster_digest
+        flags, capacity, check_robot(robot), boottime.boot_id(), rank=rank, state=state, roster_digest=digest
     )
     made = os.open(path.parent, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, mode)
     try:
+        os.fchown(made, -1, group)
         os.fchmod(made, mode)  # not what the umask leaves of it
-        os.ftruncate(made, size)
+        os.ftruncate(made, layout.names_at(capacity))
         os.pwrite(made, header, 0)
+        for number, item in (items or {}).items():
+            fields = layout.read_header(os.pread(made, layout.names_at(capacity), 0))
+            addition = layout.addition(fields, layout.wanted_of(item, number))
+            os.ftruncate(made, addition.size)
+            for offset, piece in addition.pieces:
+                os.pwrite(made, piece, offset)
         if hold:
             locks.take(made, TABLE_LOCK)
             locks.take(made, USER_LOCKS)
@@ -100,15 +113,26 @@ def make_file(
     return -1
 
 
-def make_peer(directory: Path, robot: str, *, rank: int = 0, state: int = layout.NOT, mode: int = 0o640) -> MappedFile:
+def make_peer(
+    place: Path, robot: str, *, items: Mapping[int, Item] | None = None, rank: int = 0, state: int = layout.NOT
+) -> MappedFile:
     """The file of another robot's items, for the one process that receives them.
 
     Raises:
         OSError: it cannot be made, or is there already.
     """
-    path = directory / f"{PEER_PREFIX}{robot}"
-    make_file(path, PEER, robot, rank=rank, state=state, mode=mode)
+    path = place / f"{PEER_PREFIX}{robot}"
+    make_file(path, PEER, robot, items=items, rank=rank, state=state, mode=0o640)
     return MappedFile.open(path, writable=True)
+
+
+def dismiss(path: Path) -> None:
+    """Unlink a file of a board, and tell all who have it open that it is another one now."""
+    with contextlib.suppress(OSError, BoardError):
+        file = MappedFile.open(path, writable=True)
+        file.words[GENERATION] = GONE
+        file.close()
+    path.unlink(missing_ok=True)
 
 
 def enter(directory: Path, name: str) -> tuple[MappedFile, int]:
@@ -124,10 +148,7 @@ def enter(directory: Path, name: str) -> tuple[MappedFile, int]:
         BoardError: it is no board, cannot be made, or has too many users.
     """
     for _ in range(TURNS):
-        try:
-            entered = _try_to_enter(directory, name)
-        except BoardGoneError:
-            entered = None  # removed between two steps
+        entered = _try_to_enter(directory, name)
         if entered is not None:
             return entered
     raise BoardError(f"cannot open the board {directory}: others have made and removed it {TURNS} times meanwhile; try again")
@@ -140,9 +161,7 @@ def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
     except FileNotFoundError:
         return _made(directory, name)
     except OSError as error:
-        raise BoardError(
-            f"cannot open the board {directory}: {path.name}: {error.strerror}; its user or group may (board_group of agent.toml)"
-        ) from error
+        raise BoardError(f"cannot open {path}: {error.strerror}; its owner may, and the group of [board] in team.toml") from error
     keep = False
     try:
         with locks.table(descriptor, f"cannot open the board {directory}"):
@@ -151,7 +170,10 @@ def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
             if _is_abandoned(path, descriptor):
                 _remove(directory, descriptor)
                 return None
-            file = MappedFile.open(path, descriptor, writable=True)
+            try:
+                file = MappedFile.open(path, descriptor, writable=True)
+            except BoardGoneError as error:
+                raise BoardError(f"{error}, and not replaced yet; is its agent running?") from None
             index = file.enter(os.getpid(), os.geteuid(), name)
             keep = True
             return file, index
@@ -238,11 +260,7 @@ def _remove(directory: Path, own: int) -> None:
     """Tell all who have the files open, and unlink them, ``own`` last; the table lock of ``own`` is held."""
     os.pwrite(own, layout.WORD.pack(GONE), layout.GENERATION_AT)
     for path in (directory / PRIVATE_NAME, *directory.glob(f"{OWN_NAME}+*"), *directory.glob(f"{PEER_PREFIX}*")):
-        with contextlib.suppress(OSError, BoardError):
-            file = MappedFile.open(path, writable=True)
-            file.words[GENERATION] = GONE
-            file.close()
-        path.unlink(missing_ok=True)
+        dismiss(path)
     (directory / OWN_NAME).unlink(missing_ok=True)
     with contextlib.suppress(OSError):
         directory.rmdir()

@@ -26,7 +26,7 @@ from failover.core.board import ages, layout
 from failover.core.board.banks import EPOCH_SHIFT, LOW_HALF, UNKNOWN, Found, Get, Put, Reading, Remember, Writer, get_carefully
 from failover.core.board.banks import reader as reader_of
 from failover.core.board.banks import writer as writer_of
-from failover.core.board.item_types import OPAQUE, Opaque, canonical, parse
+from failover.core.board.item_types import OPAQUE, Opaque, canonical, parse, size_of
 from failover.core.board.item_values import Values, values_of
 from failover.core.board.layout import Record
 from failover.errors import (
@@ -74,11 +74,12 @@ def values_for(record: Record, shape: Any) -> Values:
     """
     where = f"item {record.name!r}"
     try:
-        declared = parse(record.text) if record.text else Opaque("bytes", record.size)
+        declared = parse(record.text or f"bytes[{record.size}]")
     except ItemError as error:
         raise BoardError(f"damaged: {where}: {error}") from None
-    if declared_size(declared) != record.size:
-        raise BoardError(f"damaged: {where}: {record.text} for values of {record.size} bytes")
+    kind = layout.KINDS.index(declared.kind) if isinstance(declared, Opaque) else layout.STRUCT
+    if (size_of(declared), kind) != (record.size, record.kind):
+        raise BoardError(f"damaged: {where}: {record.text} for {record.size} bytes of the kind {layout.KINDS[record.kind]}")
     meant = "bytes" if shape is bytes else shape
     opaque = declared.kind if isinstance(declared, Opaque) else ""
     if isinstance(meant, str) and meant in OPAQUE:
@@ -91,13 +92,6 @@ def values_for(record: Record, shape: Any) -> Values:
         return values_of(declared, meant, bool(record.flags & layout.FINITE))
     except ItemError as error:
         raise ItemError(f"{where}: {error}", error.key) from None
-
-
-def declared_size(declared: Any) -> int:
-    """Bytes of a value of a type."""
-    from failover.core.board.item_types import size_of
-
-    return size_of(declared)
 
 
 class Source:

@@ -398,8 +398,25 @@ def board(room: argparse.ArgumentParser) -> None:
     """Of ``failover board`` and its acts."""
     shared = argparse.ArgumentParser(add_help=False)
     _json(shared)
+    _place_of_board(room)
+    _repeated(room, 500)
     _json(room)
     acts = room.add_subparsers(dest="act", metavar="ACT", title="acts")
+    of_board = argparse.ArgumentParser(add_help=False, parents=[shared])
+    _place_of_board(of_board)
+    get = _act(acts, "get", of_board, "one item's value, how old it is, and how old it can be at most", GET_STORY)
+    get.add_argument("path", metavar="ROBOT/ITEM", help="an item of a robot; ITEM alone: of this robot")
+    get.add_argument("--watch", action="store_true", help="print each new value until Ctrl-C")
+    get.set_defaults(function="failover.cli.verbs.board:get")
+    put = _act(acts, "put", of_board, "put a value of this robot", PUT_STORY)
+    put.add_argument("path", metavar="ITEM", help="an item of this robot")
+    put.add_argument("value", metavar="JSON", help="the value; bytes in hexadecimal; - reads it from standard input")
+    put.set_defaults(function="failover.cli.verbs.board:put")
+    top = _act(acts, "top", of_board, "rates, sizes, ages and losses of every item", TOP_STORY)
+    _repeated(top, 1000)
+    top.set_defaults(function="failover.cli.verbs.board:top")
+    users = _act(acts, "users", of_board, "the programs that have the board open", USERS_STORY)
+    users.set_defaults(function="failover.cli.verbs.board:users")
     of_team = argparse.ArgumentParser(add_help=False, parents=[shared])
     of_team.add_argument(
         "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
@@ -424,6 +441,23 @@ def board(room: argparse.ArgumentParser) -> None:
     imported.set_defaults(function="failover.cli.verbs.board_files:import_file")
 
 
+def _place_of_board(room: argparse.ArgumentParser) -> None:
+    room.add_argument(
+        "--board", metavar="DIR", help="the board's directory (default: $FAILOVER_BOARD, else the agent's, else this user's)"
+    )
+
+
+def _repeated(room: argparse.ArgumentParser, every_ms: int) -> None:
+    room.add_argument("--watch", action="store_true", help="again and again until Ctrl-C")
+    room.add_argument(
+        "--every-ms",
+        metavar="MS",
+        type=_whole,
+        default=every_ms,
+        help="the span over which rates are taken (default: %(default)s)",
+    )
+
+
 def _pair(text: str) -> tuple[str, str]:
     agent, separator, robot = text.partition("=")
     if not separator or not agent or not robot:
@@ -436,6 +470,37 @@ def _whole(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r} is no number from 1 to {NUMBER_MAX}")
     return int(text)
 
+
+GET_STORY: Final = """
+    Print the newest value of an item as JSON, its age, and the age that it can have at most. Exit status 1: the value may be
+    older than its bound.
+
+      failover board get ball
+      failover board get robot2/ball --json | jq .value.x
+      failover board get robot2/ball --watch
+    """
+
+PUT_STORY: Final = """
+    Put a value by hand, for a test or from a shell script. One process at a time writes an item: while a program writes it, this
+    command is refused and names the program.
+
+      failover board put ball '{"x": 1.0, "y": 2.5, "v": [0, 0], "seen": 1}'
+      failover board put goal '"00ff"'
+    """
+
+TOP_STORY: Final = """
+    Show, over a span, how often each item is put, how old its newest value was at half and at 99 of 100 looks, and how many
+    frames carried it or were lost.
+
+      failover board top
+      failover board top --every-ms 5000 --json
+    """
+
+USERS_STORY: Final = """
+    List the programs that have this robot's board open. The kernel tells: a program that was killed is not in the list.
+
+      failover board users
+    """
 
 HEADER_STORY: Final = """
     Print the items of team.toml as a C header: a struct for each, its number, size and digest, and assertions that the compiler

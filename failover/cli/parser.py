@@ -285,16 +285,22 @@ VERBS: Final = (
     ),
     Verb(
         "board",
-        "the team's board: its items as a C header, and from an rtdb.conf",
+        "the team's board: the robots' items with value, age and rate; get and put one",
         """
-        The board holds named values, items, that each robot of the team writes for itself and every robot reads. team.toml
-        declares them (docs/configuration.md). failover board ACT --help explains an act.
+        The board holds named values, items, that each robot of the team writes for itself and every robot reads at its own.
+        team.toml declares them (docs/configuration.md); a program adds others. This command shows those of all robots: the
+        newest value, its age, how much of its bound the age has used, and the puts in a second. Exit status 1: an item is older
+        than its bound, or its value cannot be read. No agent is needed. failover board ACT --help explains an act.
 
+          failover board
+          failover board --watch
+          failover board get robot2/ball
+          failover board put ball '{"x": 1.0, "y": 2.5}'
           failover board header > items.h
           failover board import rtdb.conf -I include
         """,
         arguments.board,
-        "failover.cli.verbs.board_files:header",
+        "failover.cli.verbs.board:show",
     ),
     Verb(
         "check",

@@ -7,8 +7,8 @@ import json
 import re
 import sys
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -84,6 +84,32 @@ def table(columns: Sequence[str], lines: Sequence[Sequence[str]], title: str = "
     if title:
         print(title)
     print(plain_table(columns, lines))
+
+
+def painted(columns: Sequence[str], rows: Sequence[team_tree.Row], title: str) -> None:
+    """Print a table whose lines have moods: framed and coloured on a terminal, aligned elsewhere."""
+    if is_terminal():
+        _console().print(_painted(columns, rows, title))
+    else:
+        print(spoken(f"{title}\n{plain_table(columns, [row.cells for row in rows])}"), flush=True)
+
+
+def _painted(columns: Sequence[str], rows: Sequence[team_tree.Row], title: str) -> Any:
+    lines = [(tuple(map(spoken, row.cells)), COLOURS[row.mood]) for row in rows]
+    return _drawn(_console().width, columns, lines, spoken(title))
+
+
+@contextmanager
+def live_table() -> Iterator[Callable[[Sequence[str], Sequence[team_tree.Row], str], None]]:
+    """As `painted`, again and again: in place on a terminal, one below the other elsewhere. Ctrl-C ends the body quietly."""
+    with suppress(KeyboardInterrupt):
+        if not is_terminal():
+            yield painted
+            return
+        from rich.live import Live
+
+        with Live(console=_console(), auto_refresh=False) as live:
+            yield lambda columns, rows, title: live.update(_painted(columns, rows, title), refresh=True)
 
 
 def tree(status: dict[str, Any]) -> None:

@@ -29,6 +29,7 @@ from failover.core.board.layout import (
     NUMBER_WORD,
     SIZE_WORD,
     STAMP_WORD,
+    STRUCT,
     SUM_WORD,
     WAITERS_FIELD,
     Record,
@@ -74,7 +75,7 @@ class Place(Struct, frozen=True):
     Attributes:
         halves: the file's words of two bytes: one of them says whether a process waits.
         banks: offset of each.
-        limit: most bytes of a value.
+        least, limit: bytes of a value; of a struct they are the same.
         newest, formula: indexes of words.
         wake: index of a word of two bytes.
     """
@@ -83,6 +84,7 @@ class Place(Struct, frozen=True):
     area: Area
     halves: Words
     banks: tuple[int, ...]
+    least: int
     limit: int
     newest: int
     formula: int
@@ -123,7 +125,7 @@ def place_of(record: Record, words: Words, area: Area, halves: Words) -> Place:
     banks = tuple(record.offset + index * record.stride for index in range(record.banks))
     at = record.at
     return Place(
-        *(words, area, halves, banks, record.size),
+        *(words, area, halves, banks, record.size if record.kind == STRUCT else 0, record.size),
         *((at + NEWEST_FIELD) // 8, (at + FORMULA_FIELD) // 8, (at + WAITERS_FIELD) // 2),
     )
 
@@ -184,8 +186,10 @@ def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRI
             fence()
         if words[word + NUMBER_WORD] != number:
             continue
-        if size > place.limit:
-            raise BoardError(f"damaged: a value of {size} bytes where {place.limit} are the most; its writer must put it anew")
+        if not place.least <= size <= place.limit:
+            raise BoardError(
+                f"damaged: a value of {size} bytes where {place.least} to {place.limit} are possible; its writer must put it anew"
+            )
         if total == 0 or total == sum_of(value, stamp_ns, number):
             return Found(value, stamp_ns, said >> 32, number)
     raise OvertakenError(
@@ -195,6 +199,11 @@ def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRI
 
 
 # --- The fast form ---------------------------------------------------------------------------------------------------
+
+
+def _bank_words(place: Place) -> tuple[tuple[int, int, int, int], ...]:
+    """Of each bank the indexes of the words of its number, its stamp and its size, and the offset of its value."""
+    return tuple((at // 8, at // 8 + STAMP_WORD, at // 8 + SIZE_WORD, at + BANK_HEAD) for at in place.banks)
 
 
 Put = Callable[..., None]
@@ -245,10 +254,12 @@ def writer(
         woken: wakes those that wait; is given the stamp.
         always_wake: readers cannot say that they wait.
     """
-    words, area, halves, banks = place.words, place.area, place.halves, place.banks
+    words, area, halves, banks = place.words, place.area, place.halves, _bank_words(place)
     limit, newest, wake, count = place.limit, place.newest, place.wake, len(place.banks)
     generation = UNKNOWN
     busy = False
+    for head, *_ in banks if fence is None else ():
+        words[head + SUM_WORD] = 0  # none is needed: once and for all
 
     def put(value: Any, at: int | None = None) -> None:
         """Put a value; ``at``: nanoseconds of CLOCK_BOOTTIME at which it was produced, unless that is now."""
@@ -260,15 +271,12 @@ def writer(
             busy = True
             try:
                 following = number + 1
-                bank = banks[following % count]
-                word = bank >> 3
-                words[word] = 0
-                words[word + 1] = stamp = clock(7) - skew_ns
-                words[word + 2] = 0
-                words[word + 3] = size
-                bank += 32
-                area[bank : bank + size] = value
-                words[word] = following
+                head, stamped, sized, begin = banks[following % count]
+                words[head] = 0
+                words[stamped] = stamp = clock(7) - skew_ns
+                words[sized] = size
+                area[begin : begin + size] = value
+                words[head] = following
                 words[newest] = number = following
                 if halves[wake] or always_wake:
                     woken(stamp)
@@ -315,11 +323,12 @@ def reader(
         unpack: bytes to a value; None: the bytes themselves.
         bound_ns: as declared; 0: none is, and if the item ``is_received`` from another robot its word says it.
         slow: is called instead, with the robot that the caller named: when the generation differs, a robot is named, the
-            item was never written or is overtaken, its value does not unpack, no bound of its error is known, or there is a sum.
+            item was never written or is overtaken, its value does not unpack, or no bound of its error is known.
     """
-    words, area, banks = place.words, place.area, place.banks
-    limit, newest, count = place.limit, place.newest, len(place.banks)
+    words, area, banks = place.words, place.area, _bank_words(place)
+    least, limit, newest, count = place.least, place.limit, place.newest, len(place.banks)
     learned = 0 if bound_ns or not is_received else place.formula
+    bounded = bool(bound_ns or learned)
     generation = UNKNOWN
 
     def get(of: str | None = None) -> Reading:
@@ -327,17 +336,15 @@ def reader(
         if of is not None or words[2] != generation:
             return slow(of)
         number = words[newest]
-        bank = banks[number % count]
-        word = bank >> 3
-        size, error_ns = words[word + 3], 0
+        head, stamped, sized, begin = banks[number % count]
+        size, error_ns = words[sized], 0
         if size > limit:
             size, error_ns = size & LOW_HALF, (size >> 32) * NS_PER_US
             if size > limit or error_ns >= NO_ERROR_NS:
                 return slow(of)
-        stamp, total = words[word + 1], words[word + 2]
-        bank += 32
-        value: Any = area[bank : bank + size]
-        if words[word] != number or total or not number:
+        stamp = words[stamped]
+        value: Any = area[begin : begin + size]
+        if words[head] != number or not number or size < least:
             return slow(of)
         if unpack is not None:
             try:
@@ -345,6 +352,8 @@ def reader(
             except ValueMisfitError:
                 return slow(of)
         age = clock(7) - skew_ns - stamp
+        if not error_ns and not bounded:
+            return Reading(value, age, age, robot, number, False)
         age_max = age + error_ns
         bound = words[learned] if learned else bound_ns
         return Reading(value, age, age_max, robot, number, 0 < bound < age_max)

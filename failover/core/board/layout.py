@@ -41,6 +41,8 @@ NOT, INSERT, RUN, REMOVE = range(4)
 STATES: Final = ("not", "insert", "run", "remove")
 """States of a robot, as the header has them and as people read them."""
 
+RANKS: Final = 1 << 16
+"""More than robots of any team; numbers of items are multiples of it."""
 USERS_MAX: Final = 256
 """Processes of one robot that have its board open: their rows lie between the header and the records."""
 TEXT_SIZE_MAX: Final = 0xFFFF
@@ -217,6 +219,8 @@ def read_header(view: Buffer) -> Header:
         raise BoardError(f"damaged: {count} records where there is room for {capacity}")
     if not names_at(capacity) <= size <= BLOCK_SIZE_MAX:
         raise BoardError(f"damaged: it says that it has {size} bytes; {names_at(capacity)} to {BLOCK_SIZE_MAX} are possible")
+    if rank >= RANKS:
+        raise BoardError(f"damaged: the robot's rank is {rank}; 0 to {RANKS - 1} are possible")
     if state >= len(STATES):
         raise BoardError(f"damaged: the robot's state is {state}; 0 to {len(STATES) - 1} are possible")
     name = _text(robot.rstrip(b"\0"), "the robot's name")
@@ -369,7 +373,7 @@ def next_id(view: Buffer, header: Header) -> int:
     """Number of the next item that this robot adds at run time: above those of its table, holes included."""
     first = ITEMS_MAX * (header.rank + 1)
     ids = (COUNT.unpack_from(view, record_at(index))[0] for index in range(header.count))
-    return max((id_ + 1 for id_ in ids if id_ >= first), default=first)
+    return max((id_ + 1 for id_ in ids if first <= id_ < first + ITEMS_MAX), default=first)
 
 
 def packed_user(pid: int, uid: int, name: str) -> bytes:

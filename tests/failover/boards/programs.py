@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -44,16 +44,15 @@ class Program:
 
 
 @contextmanager
-def program(text: str, **options: object) -> Iterator[Program]:
-    """Run a text after `BEGIN`; killed at the end if it has not ended."""
+def program(text: str, before: Sequence[str] = ()) -> Iterator[Program]:
+    """Run a text after `BEGIN`, by a command that stands before it; killed at the end if it has not ended."""
     process = subprocess.Popen(
-        [sys.executable, "-c", BEGIN + text],
+        [*before, sys.executable, "-c", BEGIN + text],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         cwd=ROOT,
         env=os.environ.copy(),
-        **options,  # type: ignore[call-overload]
     )
     running = Program(process)
     try:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 
 import failover
-from failover.boards import directory
+from failover.boards import directory, fence
 from failover.boards.board import Board
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
@@ -25,6 +27,7 @@ from failover.errors import (
     BoardError,
     ItemError,
     NeverWrittenError,
+    OvertakenError,
     ValueMisfitError,
     WriterTakenError,
 )
@@ -403,11 +406,7 @@ own.close(); board.close()
 
 def peer(board: Board, robot: str, *items: Item, state: int = layout.RUN) -> MappedFile:
     """What an agent has received from another robot."""
-    file = directory.make_peer(board.directory, robot, rank=1, state=state)
-    for item in items:
-        with file.changing():
-            file.add(layout.wanted_of(item, file.next_id()))
-    return file
+    return directory.make_peer(board.directory, robot, items=dict(enumerate(items)), rank=1, state=state)
 
 
 def receive(file: MappedFile, name: str, number: int, value: bytes, age_ns: int = 0, error_us: int = 0) -> None:
@@ -577,6 +576,80 @@ def test_take_gives_each_put_once_to_each_handle(board: Board) -> None:
         assert [reading and reading.value for reading in (item.take(), item.take(), other.take())] == [b"a", None, b"a"]
         item.put(b"b")
         assert item.take().value == b"b"  # type: ignore[union-attr]
+
+
+# --- Processors that reorder -----------------------------------------------------------------------------------------
+
+
+def test_with_fences_every_put_has_a_sum_and_every_get_examines_it(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on aarch64; that the fences are enough there is argued in BOARD.md, not shown here."""
+    for module in ("item", "board"):
+        monkeypatch.setattr(f"failover.boards.{module}.FENCE", fence._fence)
+    with failover.board() as board:
+        declaration = Item("x", size=64)
+        item = board.add(declaration)
+        for number in range(1, 6):
+            item.put(b"%d" % number * 8)
+            assert (item.get().value, item.get().number) == (b"%d" % number * 8, number)
+        peer(board, "robot2", declaration)
+        with pytest.raises(NeverWrittenError):
+            item.get("robot2")
+        source = item.source()
+        bank = source.place.banks[5 % 2]
+        assert source.place.words[bank // 8 + 2] != 0
+        source.file.area[bank + 32] ^= 1
+        with pytest.raises(OvertakenError, match="or by two at once"):
+            item.get()
+        item.put(b"whole")
+        assert item.get().value == b"whole"
+
+
+# --- Time namespaces -------------------------------------------------------------------------------------------------
+
+
+YEARS_3_S = 3 * 365 * 86_400
+
+
+def years_apart(seconds: int) -> list[str]:
+    """A command that runs another one with its CLOCK_BOOTTIME so far ahead; skips where the kernel lets nobody."""
+    for command in (["unshare", "--time", "--fork"], ["unshare", "--map-root-user", "--time", "--fork"]):
+        whole = [*command, "--kill-child", "--boottime", str(seconds)]
+        with contextlib.suppress(OSError):
+            if subprocess.run([*whole, "true"], capture_output=True, check=False).returncode == 0:
+                return whole
+    pytest.skip("no time namespace can be made here")
+
+
+def test_two_programs_whose_clocks_are_years_apart_tell_the_same_ages(place: Path) -> None:
+    """One is three years ahead, this one is not; each tells the true age of the other's value."""
+    text = """
+item = board.item('x')
+while hear() == 'tell':
+    before = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    reading = item.get()
+    say(before, reading.age_ns)
+    before_put = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    board.item('theirs').put(b'y', at=before_put)
+    say(before_put)
+"""
+    skew_ns = YEARS_3_S * 10**9
+    with failover.board() as board:
+        item, theirs = board.add(Item("x", size=8)), board.add(Item("theirs", size=8))
+        with program(text, years_apart(YEARS_3_S)) as other:
+            for _ in range(3):
+                stamp = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+                item.put(b"x", at=stamp)
+                other.tell("tell")
+                begun, age_ns = map(int, other.hear().split())
+                assert begun - skew_ns > stamp, "the clock inside is ahead by as much as was asked for"
+                assert age_ns >= begun - skew_ns - stamp
+                put_at = int(other.hear()) - skew_ns
+                before = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+                reading = theirs.wait(after=0)
+                after = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+                assert before - put_at <= reading.age_ns <= after - put_at
+        while len(board.users()) > 1:  # unshare is dead, its child soon
+            time.sleep(0)
 
 
 # --- Epochs ----------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.failover.boards.torn import READERS, run
+from tests.failover.boards.torn import run
 
 OPERATIONS = int(os.environ.get("FAILOVER_BOARD_OPERATIONS", "200000"))
 KILLS = int(os.environ.get("FAILOVER_BOARD_KILLS", "20"))
@@ -21,7 +21,7 @@ def test_no_read_is_torn_whenever_the_writer_is_killed(place: Path) -> None:
     print(result)
     assert result.wrong == 0
     assert result.kills >= KILLS and result.puts + result.gets >= OPERATIONS
-    assert result.users_after == 1 + READERS  # the killed ones are not counted, as soon as they are dead
+    assert result.changes > 0
     assert not place.exists()
 
 

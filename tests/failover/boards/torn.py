@@ -1,7 +1,8 @@
-"""Torn reads: a writer that is killed again and again, readers that look at every byte, and the same with a broken protocol.
+"""Torn reads: programs that are killed again and again, readers that look at every byte, and the same with a broken protocol.
 
     python -m tests.failover.boards.torn --operations 10000000 --kills 1000
-    python -m tests.failover.boards.torn --broken        # the zeroing of the bank's number taken out: must find torn reads
+    python -m tests.failover.boards.torn --for 600       # kills of writers, readers and programs that change the table
+    python -m tests.failover.boards.torn --broken --size 65536 # the zeroing of the bank's number taken out: must find torn reads
 
 Every value says the number of its put in each of its words. So a read is *torn* when two words differ, and *mixed* when they
 differ from the number of the reading; a number that is below an earlier one *goes back*.
@@ -20,8 +21,8 @@ import tempfile
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -35,7 +36,7 @@ from failover.core.board.items import Item
 from failover.errors import NeverWrittenError, OvertakenError
 
 READERS = 2
-PUTS, FIRST_READER = 0, 1
+PUTS, CHANGES, FIRST_READER = 0, 1, 2
 GETS, TORN, MIXED, BACK, OVERTAKEN = range(5)
 LIFE_PUTS_MAX = 4000
 """Puts of one writer before it may be killed, at random."""
@@ -50,8 +51,8 @@ class Result(Struct):
     mixed: int
     back: int
     overtaken: int
+    changes: int
     kills: int
-    users_after: int
 
     @property
     def wrong(self) -> int:
@@ -62,7 +63,7 @@ class Result(Struct):
 def without_zeroing() -> Callable[..., banks.Writer]:
     """The writer of `banks` as it would be without the first step of a put."""
     source = textwrap.dedent(inspect.getsource(banks.writer))
-    line = "words[word] = 0\n"
+    line = "words[head] = 0\n"
     assert source.count(line) == 1
     namespace: dict[str, Any] = dict(vars(banks))
     exec(compile(source.replace(line, "pass\n"), "<banks.writer without zeroing>", "exec"), namespace)
@@ -79,6 +80,10 @@ class Counters:
     def of_reader(self, reader: int, what: int) -> int:
         """Index of one of a reader's counters."""
         return FIRST_READER + reader * 8 + what
+
+    def looks(self, reader: int) -> int:
+        """How often a reader has tried."""
+        return self.words[self.of_reader(reader, GETS)] + self.words[self.of_reader(reader, OVERTAKEN)]
 
     def total(self, what: int) -> int:
         """Of all readers."""
@@ -126,59 +131,92 @@ def read(counters: Counters, reader: int, size: int) -> None:
             count[at + GETS] += 1
 
 
-@contextmanager
-def child(work: Callable[[], None]) -> Iterator[int]:
-    """A forked process that works until it is killed."""
-    pid = os.fork()
-    if pid == 0:
-        try:
-            work()
-        finally:
-            traceback.print_exc()
-            os._exit(1)
-    try:
-        yield pid
-    finally:
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
+def change(counters: Counters) -> None:
+    """Change the table for ever: an item that is there already is declared again, and the generation moves each time."""
+    with failover.board(name="changer") as board:
+        while True:
+            board.add(Item("extra", size=8, shared=False))
+            counters.words[CHANGES] = counters.words[CHANGES] + 1
 
 
-def run(operations: int, kills: int, size: int, seed: int, *, broken: bool = False, until_wrong: bool = False) -> Result:
-    """So many puts and gets together, and so many killed writers; or until something is wrong.
+class Killable:
+    """A forked process that works until it is killed; it can be begun again."""
 
-    The environment says where the board is; it is made, and gone afterwards.
+    def __init__(self, work: Callable[[], None], progress: Callable[[], int]) -> None:
+        self._work = work
+        self._progress = progress
+        self._pid = 0
+
+    def begin(self) -> None:
+        """It works when this returns."""
+        before = self._progress()
+        self._pid = os.fork()
+        if self._pid == 0:
+            try:
+                self._work()
+            finally:
+                traceback.print_exc()
+                os._exit(1)
+        while self._progress() == before:
+            self.check()
+            time.sleep(0.0001)
+
+    def check(self) -> None:
+        """It has not ended by itself."""
+        assert os.waitpid(self._pid, os.WNOHANG) == (0, 0), "a program ended by itself"
+
+    def kill(self) -> None:
+        """At whatever instruction it is."""
+        if self._pid:
+            os.kill(self._pid, signal.SIGKILL)
+            os.waitpid(self._pid, 0)
+            self._pid = 0
+
+
+def run(
+    operations: int, kills: int, size: int, seed: int, *, seconds: float = 0, broken: bool = False, until_wrong: bool = False
+) -> Result:
+    """So many puts and gets together, so many killed writers, and so long; or until something is wrong.
+
+    With each fifth writer a reader or the program that changes the table is killed, too. The environment says where the board
+    is; it is made, and gone afterwards.
     """
     dice = random.Random(seed)
     counters = Counters()
     right = board_item.writer_of
     if broken:
         board_item.writer_of = without_zeroing()  # type: ignore[assignment]
+    writer = Killable(lambda: write(counters, size, broken), lambda: counters.words[PUTS])
+    readers = [Killable(partial(read, counters, reader, size), partial(counters.looks, reader)) for reader in range(READERS)]
+    changer = Killable(lambda: change(counters), lambda: counters.words[CHANGES])
+    end = time.monotonic() + seconds
     try:
         with failover.board(name="torn") as board:
             board.add(Item("value", size=size, shared=False))
             done = 0
-            readers = [child(lambda reader=reader: read(counters, reader, size)) for reader in range(READERS)]  # type: ignore[misc]
-            for reader in readers:
-                reader.__enter__()
             try:
-                while done < kills or counters.words[PUTS] + counters.total(GETS) < operations:
+                for one in (writer, *readers, changer):
+                    one.begin()
+                while done < kills or counters.words[PUTS] + counters.total(GETS) < operations or time.monotonic() < end:
                     begun, life = counters.words[PUTS], dice.randrange(1, LIFE_PUTS_MAX)
-                    with child(lambda: write(counters, size, broken)) as writer:
-                        while counters.words[PUTS] - begun < life:
-                            assert os.waitpid(writer, os.WNOHANG) == (0, 0), "the writer ended by itself"
-                            time.sleep(dice.random() * 0.001)
+                    while counters.words[PUTS] - begun < life:
+                        writer.check()
+                        time.sleep(dice.random() * 0.001)
+                    for one in (writer, *([dice.choice((*readers, changer))] if dice.random() < 0.2 else [])):
+                        one.kill()
+                        one.begin()
                     done += 1
+                    assert len(board.users()) == 3 + READERS, board.users()  # the killed ones are not counted
                     if until_wrong and counters.total(TORN):
                         break
-                users = len(board.users())
             finally:
-                for reader in readers:
-                    reader.__exit__(None, None, None)
+                for one in (writer, *readers, changer):
+                    one.kill()
             assert len(board.users()) == 1, board.users()
     finally:
         board_item.writer_of = right
     totals = [counters.total(what) for what in range(5)]
-    return Result(counters.words[PUTS], *totals, done, users)
+    return Result(counters.words[PUTS], *totals, counters.words[CHANGES], done)
 
 
 def main() -> int:
@@ -186,6 +224,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--operations", type=int, default=1_000_000)
     parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--for", dest="seconds", type=float, default=0, metavar="SECONDS", help="at least so long")
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--seed", type=int, default=random.randrange(1 << 32))
     parser.add_argument("--broken", action="store_true")
@@ -194,7 +233,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="failover-torn-", dir="/dev/shm") as folder:
         os.environ["FAILOVER_BOARD"] = f"{folder}/board"
         started = time.monotonic()
-        result = run(arguments.operations, arguments.kills, arguments.size, arguments.seed, broken=arguments.broken)
+        wanted = (arguments.operations, arguments.kills, arguments.size, arguments.seed)
+        result = run(*wanted, seconds=arguments.seconds, broken=arguments.broken, until_wrong=arguments.broken)
         left = list(Path(folder).rglob("*"))
     print(f"{result} in {time.monotonic() - started:.0f} s; left in /dev/shm: {left}")
     is_right = (result.torn > 0 if arguments.broken else result.wrong == 0) and not left

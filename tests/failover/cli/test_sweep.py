@@ -26,9 +26,11 @@ UNDER_AN_AGENT = {
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")
 TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
+BOARDS = ([], ["get", "ball"], ["put", "ball", "1"], ["top"], ["users"], ["header"], ["import", "missing"], ["import", "junk"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
+    *(["board", "fly"], ["board", "get"], ["board", "--every-ms", "0"], ["board", "import", "f", "--robot", "a"]),
     *(["check", pid] for pid in NO_PIDS),
     ["check", "1", "--table"],
     *(["protect", pid] for pid in NO_PIDS),
@@ -51,7 +53,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        statuses.append(main.main([*verb, *asked, *rest] if verb != ("team",) else [*argv, *asked]))
+        statuses.append(main.main([*verb, *asked, *rest] if verb not in (("team",), ("board",)) else [*argv, *asked]))
         said = capsys.readouterr()
         if asked:
             assert said.err == ""
@@ -91,6 +93,14 @@ def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixtur
     assert told(capsys, "team", *act, *directory) == main.FAILED
 
 
+@pytest.mark.parametrize("at", ["nowhere", "directory", "junk"])
+@pytest.mark.parametrize("act", BOARDS, ids=" ".join)
+def test_with_a_board_that_is_none(act: list[str], at: str, capsys: pytest.CaptureFixture[str]) -> None:
+    where = {"header": ["--directory", at], "import": []}.get(act[0] if act else "", ["--board", at])
+    assert told(capsys, "board", *act, *where) == main.FAILED
+    assert sorted(Path("directory").iterdir()) == []
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -100,5 +110,5 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 
 def test_the_sweep_leaves_no_verb_out() -> None:
-    swept = {*UNDER_AN_AGENT, "restore", "inspect", "capture", "check", "team", "completion"}
+    swept = {*UNDER_AN_AGENT, "restore", "inspect", "capture", "check", "team", "board", "completion"}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}

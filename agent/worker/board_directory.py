@@ -1,0 +1,130 @@
+"""This robot's board as the team file declares it: made when the agent starts, or taken over as it was left.
+
+The memory outlives the agent: programs go on with it, and an agent that starts again finds it. Only if the declarations or the
+kernel's boot are others it is made anew; programs that have the old one open are told so, and open the new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import grp
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from agent.config import Settings
+from agent.errors import AgentError
+from failover.boards import boottime, directory
+from failover.boards.mapping import MappedFile
+from failover.core.board import layout
+from failover.core.board.items import Item
+from failover.core.wire.codec import team_tag
+from failover.core.wire.names import weight
+from failover.errors import BoardError
+
+DIRECTORY_MODE: Final = 0o755
+PROGRAMS_MODE: Final = 0o660
+PEERS_MODE: Final = 0o640
+
+
+def place_of(settings: Settings) -> Path:
+    """Where this robot's board is."""
+    tag = team_tag(settings.team.team).hex()
+    return directory.SHARED_MEMORY / f"failover-{tag}-{settings.config.robot}"
+
+
+def provide(settings: Settings) -> Path | None:
+    """Have every file of the board at its place, and a link to it beside the control socket; None for a team without a board.
+
+    Raises:
+        AgentError, BoardError, OSError: it cannot be had.
+    """
+    board = settings.team.items()
+    link = Path(settings.config.runtime_directory) / directory.LINK_NAME
+    if not board.items or settings.me.role != "robot":
+        link.unlink(missing_ok=True)
+        return None
+    place, me = place_of(settings), settings.config.robot
+    _make_directory(place)
+    robots = sorted((name for name, robot in settings.team.robots.items() if robot.role == "robot"), key=weight)
+    files = _Files(place, board.digest, _group(board.group), {name: rank for rank, name in enumerate(robots)})
+    for name in robots:
+        if name != me:
+            files.have(f"{directory.PEER_PREFIX}{name}", layout.PEER, name, board.shared_by(name))
+    for path in place.glob(f"{directory.PEER_PREFIX}*"):
+        if path.name.removeprefix(directory.PEER_PREFIX) not in set(robots) - {me}:
+            directory.dismiss(path)
+    files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me))
+    files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me))
+    _point(link, place)
+    return place
+
+
+class _Files:
+    """The files of one board."""
+
+    def __init__(self, place: Path, digest: int, group: int, ranks: Mapping[str, int]) -> None:
+        self._place = place
+        self._digest = digest
+        self._group = group
+        self._ranks = ranks
+
+    def have(self, name: str, area: int, robot: str, items: Mapping[int, Item]) -> None:
+        """Keep a file that fits; make it otherwise."""
+        path = self._place / name
+        mode = PEERS_MODE if area == layout.PEER else PROGRAMS_MODE
+        if self._fits(path, area, robot):
+            os.chown(path, -1, self._group)
+            path.chmod(mode)
+            return
+        directory.dismiss(path)
+        directory.make_file(
+            path,
+            area,
+            robot,
+            items=items,
+            rank=self._ranks[robot],
+            state=layout.NOT if area == layout.PEER else layout.RUN,
+            digest=self._digest,
+            mode=mode,
+            group=self._group,
+        )
+
+    def _fits(self, path: Path, area: int, robot: str) -> bool:
+        try:
+            file = MappedFile.open(path, writable=True)
+        except (BoardError, FileNotFoundError):
+            return False
+        header = file.header
+        file.close()
+        found = (header.flags, header.roster_digest, header.boot_id, header.robot, header.rank)
+        return found == (area, self._digest, boottime.boot_id(), robot, self._ranks[robot])
+
+
+def _make_directory(place: Path) -> None:
+    with contextlib.suppress(FileExistsError):
+        place.mkdir()
+    found = place.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        raise AgentError(f"{place} belongs to uid {found.st_uid}, so this robot has no board; remove it, and restart the agent")
+    place.chmod(DIRECTORY_MODE)
+
+
+def _group(name: str) -> int:
+    if not name:
+        return os.getegid()
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError as error:
+        raise AgentError(
+            f"group = {name!r} of [board] in team.toml: this system has no such group, so this robot has no board; make the group"
+        ) from error
+
+
+def _point(link: Path, place: Path) -> None:
+    aside = link.with_name(f"{link.name}.new")
+    aside.unlink(missing_ok=True)
+    aside.symlink_to(place)
+    aside.replace(link)

@@ -1,0 +1,183 @@
+"""The agent's board: made as the team file declares it, adopted by the next agent, made anew when the declarations change."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import failover
+from agent import config as configuration
+from agent.worker import board_directory
+from failover.boards.mapping import MappedFile
+from failover.config import team
+from failover.config.team import Robot, Team
+from failover.core.board import layout
+from failover.core.board.items import Item
+
+BALL = """
+[board.items.ball]
+type = { x = "f4", y = "f4" }
+[board.items.notes]
+type = "msgpack"
+size = 100
+shared = false
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """robot1's configuration, in a team of two robots and a witness that no other test has."""
+    members = {
+        "robot2": Robot(("127.0.0.1:7440",), "127.0.0.1:7441"),
+        "robot1": Robot(("127.0.0.1:7420",), "127.0.0.1:7421"),
+        "gate": Robot(("127.0.0.1:7430",), "127.0.0.1:7431", "witness"),
+    }
+    team.write(tmp_path / "team", Team(f"lab{uuid.uuid4().hex}", members))
+    for part in ("state", "runtime"):
+        (tmp_path / part).mkdir()
+    places = "".join(f'{part}_directory = "{tmp_path / part}"\n' for part in ("team", "state", "runtime"))
+    (tmp_path / "agent.toml").write_text(f'robot = "robot1"\ninsecure = true\n{places}')
+    place = board_directory.place_of(loaded(tmp_path))
+    yield tmp_path
+    shutil.rmtree(place, ignore_errors=True)
+
+
+def loaded(folder: Path, board: str | None = None) -> configuration.Settings:
+    """The settings, with this board declared; None: as it was."""
+    path = folder / "team" / team.TEAM_FILE
+    if board is not None:
+        path.write_text(path.read_text().partition("\n[board")[0] + "\n" + board)
+    return configuration.load(folder / "agent.toml")
+
+
+@pytest.fixture
+def found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs find this agent's runtime directory, and so its board."""
+    monkeypatch.delenv("FAILOVER_BOARD", raising=False)
+    monkeypatch.setenv("FAILOVER_SOCKET", str(folder / "runtime" / "control.sock"))
+
+
+def test_a_team_without_a_board_has_no_directory(folder: Path) -> None:
+    settings = loaded(folder)
+    assert board_directory.provide(settings) is None
+    assert not board_directory.place_of(settings).exists()
+
+
+@pytest.mark.usefixtures("found")
+def test_the_declared_items_lie_in_the_files_of_their_robots(folder: Path) -> None:
+    place = board_directory.provide(loaded(folder, BALL))
+    assert place is not None
+    modes = {path.name: oct(path.stat().st_mode & 0o777) for path in place.iterdir()}
+    assert modes == {"own": "0o660", "private": "0o660", "peer-robot2": "0o640"}
+    names = {path.name: [record.name for record in MappedFile.open(path).records()] for path in place.iterdir()}
+    assert names == {"own": ["ball"], "private": ["notes"], "peer-robot2": ["ball"]}
+    with failover.board() as board:
+        assert (board.robot, board.directory) == ("robot1", place)
+        board.item("ball").put({"x": 1.0, "y": 2.0})
+        board.item("notes").put(["a"])
+        assert {name: (robot.state, robot.rank) for name, robot in board.robots().items()} == {
+            "robot1": ("run", 0),
+            "robot2": ("not", 1),
+        }
+        with pytest.raises(failover.NeverWrittenError):
+            board.item("ball").get("robot2")
+    assert (place / "own").exists()  # it is the agent's, not its users'
+
+
+@pytest.mark.usefixtures("found")
+def test_the_next_agent_takes_the_board_over_and_its_users_notice_nothing(folder: Path) -> None:
+    board_directory.provide(loaded(folder, BALL))
+    with failover.board() as board:
+        item = board.item("ball")
+        item.put({"x": 1.0, "y": 2.0})
+        board.add(Item("later", size=8)).put(b"x")
+        generation = board.ensured().own.generation
+        board_directory.provide(loaded(folder))
+        assert board.ensured().own.generation == generation
+        assert item.get().number == 1
+        assert board.item("later").get().value == b"x"
+
+
+@pytest.mark.usefixtures("found")
+def test_other_declarations_make_the_board_anew_and_its_users_go_there(folder: Path) -> None:
+    board_directory.provide(loaded(folder, BALL))
+    with failover.board() as board:
+        item = board.item("ball")
+        item.put({"x": 1.0, "y": 2.0})
+        board_directory.provide(loaded(folder, BALL + '[board.items.goal]\ntype = "bytes"\nsize = 4\n'))
+        with pytest.raises(failover.NeverWrittenError):
+            item.get()
+        item.put({"x": 3.0, "y": 4.0})
+        assert item.get().value == {"x": 3.0, "y": 4.0}
+        board.item("goal").put(b"x")
+        assert len(board.users()) == 1
+
+
+def test_a_robot_that_left_the_team_leaves_the_board(folder: Path) -> None:
+    settings = loaded(folder, BALL)
+    place = board_directory.provide(settings)
+    assert place is not None
+    directory = folder / "team"
+    members = {"robot1": settings.team.robots["robot1"], "robot3": settings.team.robots["robot2"]}
+    team.write(directory, Team(settings.team.team, members, settings.team.board))
+    board_directory.provide(loaded(folder))
+    assert {path.name for path in place.iterdir()} == {"own", "private", "peer-robot3"}
+
+
+def test_a_file_that_is_damaged_is_made_anew(folder: Path) -> None:
+    settings = loaded(folder, BALL)
+    place = board_directory.provide(settings)
+    assert place is not None
+    for name, content in (("own", b"garbage" * 5000), ("private", b""), ("peer-robot2", bytes(40000))):
+        (place / name).write_bytes(content)
+    board_directory.provide(settings)
+    assert all(MappedFile.open(path).header.flags in layout.AREAS for path in place.iterdir())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory to another user")
+def test_another_users_directory_is_refused(folder: Path) -> None:
+    settings = loaded(folder, BALL)
+    place = board_directory.place_of(settings)
+    place.mkdir()
+    os.chown(place, 12345, -1)
+    with pytest.raises(Exception, match="belongs to uid 12345"):
+        board_directory.provide(settings)
+
+
+def test_a_group_that_does_not_exist_is_named(folder: Path) -> None:
+    settings = loaded(folder, '[board]\ngroup = "no-such-group"\n' + BALL)
+    with pytest.raises(Exception, match="no such group"):
+        board_directory.provide(settings)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs two users and a group")
+def test_members_of_the_group_use_it_and_others_do_not(folder: Path) -> None:
+    import grp
+
+    group = grp.getgrnam("games")
+    place = board_directory.provide(loaded(folder, '[board]\ngroup = "games"\n' + BALL))
+    assert place is not None
+
+    def tried(groups: list[int]) -> int:
+        pid = os.fork()
+        if pid == 0:
+            os.setgroups(groups)
+            os.setgid(65534)
+            os.setuid(65534)
+            try:
+                with failover.board(place) as board:
+                    board.item("ball").put({"x": 1.0, "y": 2.0})
+                    os._exit(0 if not os.access(place / "peer-robot2", os.W_OK) else 3)
+            except failover.BoardError:
+                os._exit(1)
+            finally:
+                os._exit(2)
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+    assert tried([group.gr_gid]) == 0
+    assert tried([]) == 1

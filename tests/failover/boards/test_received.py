@@ -1,0 +1,104 @@
+"""Items of another robot, as its receiver puts them: read with both bounds, woken for, refused when they do not fit."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import failover
+from failover.boards import directory
+from failover.boards.received import ReceivedItems
+from failover.core.board import ages, layout
+from failover.core.board.items import Item
+from failover.errors import NeverWrittenError
+
+BALL = Item("ball", {"x": "f8"})
+ONE, TWO = (layout.struct.pack("<d", number) for number in (1.0, 2.0))
+
+
+def now() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+def test_a_frame_brings_a_value_with_its_age_and_an_upper_bound(place: Path) -> None:
+    with failover.board() as board:
+        ball = board.add(BALL)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}, rank=1))
+        came = now()
+        received.heard(layout.RUN, came)
+        stamp_ns, error_us = ages.received(20_000, came, transit_max_us=500)
+        assert received.put(7, 1, ONE, stamp_ns, error_us, lost=2, round=9)
+        reading = ball.get("robot2")
+        assert reading.value == {"x": 1.0} and not reading.stale
+        assert 20_000_000 <= reading.age_ns <= now() - came + 20_000_000
+        assert reading.age_max_ns == reading.age_ns + 501_000
+        received.bound(7, 20_000_001)
+        assert ball.get("robot2").stale
+        state = board.robots()["robot2"]
+        assert state.state == "run" and state.age_ns is not None and state.age_ns <= now() - came
+
+
+@pytest.mark.parametrize(
+    ("item", "number", "value"), [(8, 2, TWO), (7, 2, TWO + b"x"), (7, 2, TWO[:4]), (7, 1, TWO), (7, 0, TWO)]
+)
+def test_what_does_not_fit_changes_nothing(place: Path, item: int, number: int, value: bytes) -> None:
+    with failover.board() as board:
+        ball = board.add(BALL)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        assert received.put(7, 1, ONE, now(), 0)
+        assert not received.put(item, number, value, now(), 0)
+        assert (ball.get("robot2").value, ball.get("robot2").number) == ({"x": 1.0}, 1)
+
+
+def test_an_item_that_is_added_to_the_file_is_known_at_once(place: Path) -> None:
+    with failover.board() as board:
+        later = board.add(Item("later", size=4))
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        assert not received.put(8, 1, b"x", now(), 0)
+        with pytest.raises(failover.BoardError, match="no item 'later'"):
+            later.get("robot2")
+        with received.file.changing():
+            received.file.add(layout.wanted_of(Item("later", size=4), 8))
+        assert received.put(8, 1, b"x", now(), 0)
+        assert later.get("robot2").value == b"x"
+
+
+def test_a_robot_that_started_anew_has_a_new_file_and_its_readers_go_there(place: Path) -> None:
+    with failover.board() as board:
+        ball = board.add(BALL)
+        first = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        assert first.put(7, 1000, ONE, now(), 0)
+        assert ball.get("robot2").number == 1000
+        directory.dismiss(board.directory / "peer-robot2")
+        again = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        with pytest.raises(NeverWrittenError):
+            ball.get("robot2")
+        assert again.put(7, 1, TWO, now(), 0)
+        assert (ball.get("robot2").number, ball.wait("robot2", after=1000, timeout=60).value) == (1, {"x": 2.0})
+
+
+def test_a_frame_wakes_who_waits_for_it(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a slice of an hour only the wake-up can end the wait."""
+    monkeypatch.setattr("failover.boards.item.SLICE_S", 3600.0)
+    with failover.board() as board:
+        ball = board.add(BALL)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        with pytest.raises(NeverWrittenError):
+            ball.get("robot2")
+        got: list[object] = []
+        thread = threading.Thread(target=lambda: got.append(ball.wait("robot2", after=0).value))
+        thread.start()
+        asleep = Path(f"/proc/self/task/{thread.native_id}/wchan")
+        while "futex" not in asleep.read_text():
+            time.sleep(0)
+        assert received.put(7, 1, ONE, now(), 0)
+        thread.join(0.5)
+        number = 1
+        while thread.is_alive():  # it may have slept in a lock of Python's when we looked
+            number += 1
+            received.put(7, number, ONE, now(), 0)
+            thread.join(0.5)
+        assert got == [{"x": 1.0}]
