@@ -7,29 +7,26 @@ anything into `own`; every size is checked before it is believed, and nothing of
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Final
 
 from msgspec import Struct
 
-from agent.main_loop.board_files import BoardFiles
 from agent.main_loop.own_items import OwnItems, number_in
 from agent.main_loop.urgent_items import UrgentItems
-from failover.boards import futex
-from failover.boards.fence import FENCE
+from failover.boards import directory
 from failover.boards.mapping import MappedFile
+from failover.boards.received import ReceivedItems
 from failover.core.board import layout
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
-from failover.core.board.banks import put_carefully
 from failover.core.board.due import Bucket, Sent, Turns
-from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
 from failover.errors import BoardError, OvertakenError
 
 UNREADABLE: Final = "own items that could not be read"
-UNKNOWN: Final = "items with numbers that are not known here"
-TOO_LARGE: Final = "values larger than declared"
+WAITED: Final = "items that waited a round for room in a frame"
 
 REMOVE_ROUNDS: Final = 3
 """Missed rounds after which a robot may have left."""
@@ -41,32 +38,19 @@ WORST_FALLS: Final = 1000
 """Frames in which the longest way is forgotten by two thirds: what is longer than it is about one frame of a thousand."""
 
 
-Take = Callable[[Portion, int, int, int], None]
-"""``(portion, round, came_ns, way_us)``: one item of a peer came, all of it."""
-
-
 class _Peer(Struct):
     """A peer's file, and what is known of its frames.
 
     Attributes:
-        items: number → most bytes of a value, and what takes one.
         worst_ns: the longest way lately; falls slowly.
     """
 
-    file: MappedFile
-    items: dict[int, tuple[int, Take]]
+    items: ReceivedItems
     boot: int = 0
     heard_ns: int = 0
     state: int = layout.NOT
     worst_ns: int = 0
     told_ns: int = 0
-
-
-def _no_item(_portion: Portion, _round: int, _came_ns: int, _way_us: int) -> None:
-    """Of a number that is not known here; never called."""
-
-
-_NOT_HERE: Final[tuple[int, Take]] = (-1, _no_item)
 
 
 class BoardLink:
@@ -77,16 +61,28 @@ class BoardLink:
         wakes: readable when an urgent item was put.
     """
 
-    def __init__(self, files: BoardFiles, round_ns: int) -> None:
-        self._files = files
+    def __init__(self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int) -> None:
+        self._file = own
         self._round_ns = round_ns
         self.turns = Turns()
         self.dropped: Counter[str] = Counter()
-        self._own = OwnItems(files.own)
+        self._own = OwnItems(own)
         self._gone: dict[int, int] = {}
         self._buckets: dict[int, Bucket] = {}
-        self.wakes = UrgentItems(files.own, self._own)
-        self._peers = {name: self._peer(file) for name, file in files.peers.items()}
+        self.wakes = UrgentItems(own, self._own)
+        self._peers = {name: _Peer(items) for name, items in peers.items()}
+
+    @classmethod
+    def open(cls, place: Path, round_ns: int) -> BoardLink:
+        """The board that the worker process has made.
+
+        Raises:
+            BoardError, FileNotFoundError: there is none.
+        """
+        own = MappedFile.open(place / directory.OWN_NAME, writable=True)
+        prefix = directory.PEER_PREFIX
+        peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
+        return cls(own, peers, round_ns)
 
     # --- Out ---
 
@@ -143,86 +139,50 @@ class BoardLink:
             return
         if part.boot != peer.boot:
             peer.boot = part.boot
-            peer.items = self._takers(peer.file)  # its puts are counted from any number
+            peer.items.begin_life()
         self._note_frame(peer, heard.way_ns, came_ns)
-        round_, way_us = part.round, way_bound_us(heard.way_ns)
+        put, round_, way_us = peer.items.put, part.round, way_bound_us(heard.way_ns)
         for portion in heard.items:
-            size, take = peer.items.get(portion.number, _NOT_HERE)
-            if len(portion.value) <= size:
-                take(portion, round_, came_ns, way_us)
-            else:
-                self.dropped[TOO_LARGE if size >= 0 else UNKNOWN] += 1
+            age_us = portion.age_us
+            stamp_ns = max(came_ns - age_us * NS_PER_US, 0)
+            error_us = way_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
+            put(portion.number, portion.put, portion.value, stamp_ns, error_us, round=round_)
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
         """Tell when it came; from time to time the bounds that follow from the longest ways."""
-        peer.heard_ns = peer.file.words[layout.HEARD_AT // 8] = max(came_ns, 1)
+        peer.heard_ns = max(came_ns, 1)
+        peer.items.heard(peer.heard_ns)
         if way_ns is None:
             return
         peer.worst_ns = max(way_ns, peer.worst_ns - peer.worst_ns // WORST_FALLS)
         if came_ns - peer.told_ns > BOUNDS_TOLD_NS:
             peer.told_ns = came_ns
-            for record in peer.file.records():
-                cycle_ns = record.period * self._round_ns
-                bound = bound_ns(record.period, cycle_ns, peer.worst_ns, self._round_ns, 1)
-                peer.file.words[(record.at + layout.FORMULA_FIELD) // 8] = bound
-
-    def _peer(self, file: MappedFile) -> _Peer:
-        return _Peer(file, self._takers(file))
-
-    def _takers(self, file: MappedFile) -> dict[int, tuple[int, Take]]:
-        return {record.id: (record.size, _taker(file, record)) for record in file.records()}
+            round_ns, worst_ns = self._round_ns, peer.worst_ns
+            peer.items.bound(lambda period: bound_ns(period, period * round_ns, worst_ns, round_ns, 1))
 
     def tell_states(self, now_ns: int, lease_ns: int) -> None:
         """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease."""
         for peer in self._peers.values():
             silent_ns = now_ns - peer.heard_ns
-            state = (
-                layout.RUN
-                if silent_ns < REMOVE_ROUNDS * self._round_ns
-                else layout.REMOVE
-                if silent_ns < lease_ns
-                else layout.NOT
-            )
+            state = layout.REMOVE if silent_ns < lease_ns else layout.NOT
+            if silent_ns < REMOVE_ROUNDS * self._round_ns:
+                state = layout.RUN
             if peer.state != state and peer.heard_ns:
                 peer.state = state
-                peer.file.set_word32(layout.STATE_AT, state)
+                peer.items.tell_state(state)
 
     def close(self) -> None:
         """Give the locks back; the files stay for the agent that comes after."""
         self.wakes.close()
-        for file in (self._files.own, *self._files.peers.values()):
+        for file in (self._file, *[peer.items.file for peer in self._peers.values()]):
             file.close()
+
+    def left_out(self) -> Counter[str]:
+        """Values that were not taken, by reason, and those that waited."""
+        counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped)
+        return counts + Counter({WAITED: sum(self.turns.waited.values())})
 
 
 def way_bound_us(way_ns: int | None) -> int:
     """By how much a value can be older than told: the longest way, and what it and the age lost when they were rounded."""
     return NO_ERROR_BOUND if way_ns is None else min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)
-
-
-def _taker(file: MappedFile, record: Record) -> Take:
-    """What puts an item of a peer: numbers of puts are this board's own, one after the other, as BOARD.md wants it."""
-    place = file.place(record)
-    words, newest, at = place.words, place.newest, record.at
-    frames, lost, transit = (at + layout.FRAMES_FIELD) // 8, (at + layout.LOST_FIELD) // 8, (at + layout.TRANSIT_FIELD) // 8
-    period, wake = record.period, futex.waker(file.address(at + layout.NEWEST_FIELD))
-    number, last_put, last_round = words[newest], 0, -1
-
-    def take(portion: Portion, round_: int, came_ns: int, way_us: int) -> None:
-        nonlocal number, last_put, last_round
-        words[frames] += 1
-        words[transit] = round_ << 32 | way_us
-        if 0 <= last_round < round_ - period:
-            words[lost] += (round_ - last_round) // period - 1
-        last_round = round_
-        put = portion.put
-        if put > last_put:
-            last_put = put
-            number += 1
-            age_us = portion.age_us
-            stamp_ns = came_ns - age_us * NS_PER_US
-            put_carefully(
-                place, number, portion.value, max(stamp_ns, 0), way_us if age_us < AGE_MAX_US else NO_ERROR_BOUND, FENCE
-            )
-            wake()
-
-    return take

@@ -55,6 +55,7 @@ from failover.core.frames.roster import roster
 from failover.core.node import URGENT_GAP_NS, Node
 from failover.core.types import Ballot
 from failover.core.wire.messages import Beat
+from failover.errors import FailoverError
 
 if TYPE_CHECKING:
     from agent.main_loop.board_link import BoardLink
@@ -96,8 +97,6 @@ OUTLIVED: Final = (
     "then are lost; it begins again as life %d"
 )
 
-WAITED: Final = "items that waited a round for room in a frame"
-
 log = logging.getLogger("failover.heart")
 
 
@@ -115,10 +114,10 @@ class Heart:
         self._ballot = ballot
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
-        declared = settings.team.items() if settings.team.board.items else None
-        self._roster = roster(settings.team.robots, declared.terms if declared is not None else b"")
-        self._frames = FrameLane(self._me, settings.team.team, self._roster, ballot.record.boot, settings.config.beat_ms * 1_000)
-        self._declared, self._board_trouble = declared, ""
+        terms = settings.team.items().terms if settings.team.board.items else b""
+        everybody = roster(settings.team.robots, terms)
+        self._frames = FrameLane(self._me, settings.team.team, everybody, ballot.record.boot, settings.config.beat_ms * 1_000)
+        self._has_board = bool(terms) and settings.me.role == "robot"
         self._board: BoardLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
         self._urgent_ns: int | None = None
@@ -182,7 +181,6 @@ class Heart:
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
         for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno(), self._alarm.fileno()):
             self._poll.register(descriptor, select.EPOLLIN)
-        self._open_board()
         gc.collect()
         syscalls.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
@@ -192,21 +190,25 @@ class Heart:
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
 
     def _open_board(self) -> None:
-        """Map the board of a team that has one; a robot without its board still protects its programs."""
-        if self._declared is None:
+        """Map the board that the worker process has made; a robot without its board still protects its programs."""
+        self._close_board()
+        if not self._has_board:
             return
-        from agent.main_loop.board_files import open_files  # here: a team without a board does not load it
-        from agent.main_loop.board_link import BoardLink
+        from agent.main_loop.board_link import BoardLink  # here: a team without a board does not load it
+        from failover.boards.directory import agents_place
 
-        runtime = Path(self._settings.config.runtime_directory)
         try:
-            files = open_files(self._settings.team.team, self._me, self._roster, self._declared, runtime)
-        except AgentError as error:
-            self._board_trouble = str(error)
-            log.error("%s", error)
+            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._outbox.beat_ns)
+        except (FailoverError, OSError) as error:
+            log.warning("frames carry no items: %s", error)  # the worker process says in status why there is no board
             return
-        self._board = BoardLink(files, self._outbox.beat_ns)
         self._poll.register(self._board.wakes.fileno(), select.EPOLLIN)
+
+    def _close_board(self) -> None:
+        if self._board is not None:
+            self._poll.unregister(self._board.wakes.fileno())
+            self._board.close()
+        self._board = None
 
     def _start_lanes(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
@@ -397,6 +399,7 @@ class Heart:
     def _take_inventory(self, inventory: Inventory) -> None:
         """The node is born with what was found; a node that lives already is told what the old lanes took with them."""
         self._lanes_deaths = 0
+        self._open_board()
         if self._node is not None:
             for event in self._lanes.lost(inventory):
                 self._step(event)
@@ -485,7 +488,7 @@ class Heart:
         troubles = tuple(
             filter(
                 None,
-                (self._persister.trouble, self._scribe.trouble, self._board_trouble, *map(UNLIKE.format, sorted(self._unlike))),
+                (self._persister.trouble, self._scribe.trouble, *map(UNLIKE.format, sorted(self._unlike))),
             )
         )
         if question.what == "why":
@@ -495,9 +498,8 @@ class Heart:
 
     def _items_left_out(self) -> dict[str, int]:
         """Values that were not taken, by reason, and those that waited."""
-        left_out = self._frames.assembly.dropped + (self._board.dropped if self._board is not None else Counter())
-        waited = sum(self._board.turns.waited.values()) if self._board is not None else 0
-        return dict(left_out + Counter({WAITED: waited}))
+        left_out = self._board.left_out() if self._board is not None else Counter()
+        return dict(self._frames.assembly.dropped + left_out)
 
     def _end(self) -> None:
         self._lanes.send(Farewell())
@@ -506,8 +508,7 @@ class Heart:
         self._scribe.close(PERSIST_PATIENCE_S)
         self._lanes.wait()
         self._beats.close()
-        if self._board is not None:
-            self._board.close()
+        self._close_board()
         self._alarm.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)

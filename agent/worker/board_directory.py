@@ -20,7 +20,6 @@ from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.items import Item
-from failover.core.wire.codec import team_tag
 from failover.core.wire.names import weight
 from failover.errors import BoardError
 
@@ -31,8 +30,7 @@ PEERS_MODE: Final = 0o640
 
 def place_of(settings: Settings) -> Path:
     """Where this robot's board is."""
-    tag = team_tag(settings.team.team).hex()
-    return directory.SHARED_MEMORY / f"failover-{tag}-{settings.config.robot}"
+    return directory.agents_place(settings.team.team, settings.config.robot)
 
 
 def provide(settings: Settings) -> Path | None:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.main_loop.board_files import place_of
 from failover.boards.board import Board
+from failover.boards.directory import agents_place
 from failover.config import team
 from failover.config.team import Team
 from failover.core.board.ages import UNBOUNDED_NS
@@ -54,7 +54,7 @@ def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Robo
             yield both
     finally:
         for name in ("robot1", "robot2"):
-            shutil.rmtree(place_of(TEAM, name), ignore_errors=True)
+            shutil.rmtree(agents_place(TEAM, name), ignore_errors=True)
 
 
 def test_what_a_program_puts_at_one_robot_a_program_gets_at_the_other(pair: tuple[RobotMachine, RobotMachine]) -> None:

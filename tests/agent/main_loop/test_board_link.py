@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from agent.errors import AgentError
-from agent.main_loop import board_files
-from agent.main_loop.board_files import open_files, place_of
-from agent.main_loop.board_link import TOO_LARGE, UNKNOWN, UNREADABLE, BoardLink
+from agent.main_loop.board_link import UNREADABLE, BoardLink
 from agent.main_loop.own_items import LOOK_NS
 from agent.system import clock
+from failover.boards import directory
 from failover.boards.board import Board
+from failover.boards.directory import OWN_NAME, PEER_PREFIX, PRIVATE_NAME, make_file
+from failover.boards.received import MISFIT, UNKNOWN
 from failover.core.board import layout
 from failover.core.board.ages import UNBOUNDED_NS
 from failover.core.board.due import URGENT_PER_S
@@ -43,19 +43,35 @@ TEAM = roster(["robot1", "robot2"], BOARD.terms)
 ROUND_NS = 20_000_000
 
 
+def place_of(robot: str) -> Path:
+    return directory.agents_place("team", robot)
+
+
+def made(place: Path, me: str) -> Path:
+    """The files as the worker process makes them, if they are not there."""
+    if not place.exists():
+        place.mkdir()
+        make_file(place / PRIVATE_NAME, layout.PRIVATE, me, items=BOARD.private_of(me))
+        for other in TEAM.names:
+            if other != me:
+                make_file(place / f"{PEER_PREFIX}{other}", layout.PEER, other, items=BOARD.shared_by(other), state=layout.NOT)
+        make_file(place / OWN_NAME, layout.OWN, me, items=BOARD.shared_by(me))
+    return place
+
+
 class Robot:
     """One robot: its board, its frames, and a program that has the board open."""
 
-    def __init__(self, me: str, runtime: Path, boot: int = 1) -> None:
-        self.me, self.boot, self.runtime = me, boot, runtime
-        self.link = BoardLink(open_files("team", me, TEAM, BOARD, runtime), ROUND_NS)
+    def __init__(self, me: str, boot: int = 1) -> None:
+        self.me, self.boot = me, boot
+        self.link = BoardLink.open(made(place_of(me), me), ROUND_NS)
         self.lane = FrameLane(me, "team", TEAM, boot, ROUND_NS // 1000)
         for other in TEAM.names:
             if other != me:
                 self.lane.speak(other, f"{me} to {other}".ljust(16).encode())
                 self.lane.hear(other, f"{other} to {me}".ljust(16).encode())
         self.round = self.beats = 0
-        self.program = Board(place_of("team", me), "test")
+        self.program = Board(place_of(me), "test")
 
     def says(self) -> list[bytes]:
         """The datagrams of its next frame."""
@@ -82,8 +98,8 @@ class Robot:
 
 @pytest.fixture
 def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Robot, Robot]]:
-    monkeypatch.setattr(board_files, "SHARED_MEMORY", tmp_path)
-    both = tuple(Robot(name, tmp_path / f"run-{name}") for name in TEAM.names)
+    monkeypatch.setattr(directory, "SHARED_MEMORY", tmp_path)
+    both = tuple(Robot(name) for name in TEAM.names)
     yield both[0], both[1]
     for robot in both:
         robot.close()
@@ -162,7 +178,7 @@ def test_a_program_that_waits_is_woken(pair: tuple[Robot, Robot]) -> None:
             "import failover\nball = failover.board().item('ball')\nprint('waits', flush=True)\n"
             "print(ball.wait('robot1', after=0, timeout=60).value['x'])",
         ],
-        env=os.environ | {"FAILOVER_BOARD": str(place_of("team", "robot2"))},
+        env=os.environ | {"FAILOVER_BOARD": str(place_of("robot2"))},
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -179,38 +195,17 @@ def test_an_agent_that_begins_anew_takes_the_board_over_and_programs_go_on(pair:
     item.put({"x": 1.0, "y": 0.0})
     second.hears(first.says())
     first.link.close()
-    again = Robot("robot1", first.runtime, boot=2)
+    again = Robot("robot1", boot=2)
     item.put({"x": 2.0, "y": 0.0})
     second.hears(again.says())
     assert (there.get("robot1").value["x"], there.get("robot1").number) == (2.0, 2)
     second.link.close()
-    other = Robot("robot2", second.runtime, boot=2)
+    other = Robot("robot2", boot=2)
     item.put({"x": 3.0, "y": 0.0})
     other.hears(again.says())
     assert (there.get("robot1").value["x"], there.get("robot1").number) == (3.0, 3)
     again.close()
     other.close()
-
-
-def test_a_board_of_another_team_file_is_made_anew_and_programs_find_it(
-    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, _ = pair
-    item = first.program.item("ball")
-    item.put({"x": 1.0, "y": 0.0})
-    first.link.close()
-    more = Declared((*BOARD.items, Item("goal", size=1)))
-    files = open_files("team", "robot1", roster(["robot1", "robot3"], more.terms), more, first.runtime)
-    assert sorted(files.peers) == ["robot3"]
-    assert sorted(path.name for path in files.directory.iterdir()) == ["own", "peer-robot3", "private"]
-    item.put({"x": 2.0, "y": 0.0})
-    assert first.program.item("goal", bytes).put(b"!") is None
-    assert BoardLink(files, ROUND_NS).due(0, clock.now_ns())[0].value != b""
-
-
-def test_programs_find_the_board_beside_the_agents_socket(pair: tuple[Robot, Robot]) -> None:
-    first, _ = pair
-    assert (first.runtime / "board").resolve() == place_of("team", "robot1").resolve()
 
 
 def test_what_does_not_belong_here_is_counted(pair: tuple[Robot, Robot]) -> None:
@@ -219,7 +214,7 @@ def test_what_does_not_belong_here_is_counted(pair: tuple[Robot, Robot]) -> None
         None, [Portion(99, 0, 1, b"?"), Portion(0, 0, 1, bytes(9)), Portion(3, 0, 1, b"12345678")], clock.now_ns()
     )
     second.hears(made[0].datagrams)
-    assert second.link.dropped == {UNKNOWN: 1, TOO_LARGE: 1}
+    assert second.link.left_out() == {UNKNOWN: 1, MISFIT: 1}
     assert second.program.item("slow", bytes).get("robot1").value == b"12345678"
 
 
@@ -229,7 +224,7 @@ def test_a_file_that_a_program_makes_shorter_ends_no_agent(pair: tuple[Robot, Ro
     first, _ = pair
     first.program.item("ball").put({"x": 1.0, "y": 0.0})
     assert len(first.link.due(0, clock.now_ns())) == 1
-    own = place_of("team", "robot1") / "own"
+    own = place_of("robot1") / "own"
     os.truncate(own, size)
     for round_ in range(3):
         first.link.due(round_, clock.now_ns() + round_ * 2 * LOOK_NS)
@@ -272,9 +267,3 @@ def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_of
         first.link.went(portions)
         sent += len(portions)
     assert sent <= URGENT_PER_S
-
-
-def test_a_group_that_is_not_there_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(board_files, "SHARED_MEMORY", tmp_path)
-    with pytest.raises(AgentError, match="no group 'no-such-group' on this robot"):
-        open_files("team", "robot1", TEAM, Declared(BOARD.items, "no-such-group"), tmp_path / "run")
