@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -206,6 +207,20 @@ def test_an_agent_that_begins_anew_takes_the_board_over_and_programs_go_on(pair:
     assert (there.get("robot1").value["x"], there.get("robot1").number) == (3.0, 3)
     again.close()
     other.close()
+
+
+def test_a_robot_that_lost_its_board_counts_its_puts_anew(pair: tuple[Robot, Robot]) -> None:
+    first, second = pair
+    for number in range(5):
+        first.program.item("ball").put({"x": float(number), "y": 0.0})
+    second.hears(first.says())
+    first.close()
+    shutil.rmtree(place_of("robot1"))
+    again = Robot("robot1", boot=2)
+    again.program.item("ball").put({"x": 9.0, "y": 0.0})
+    second.hears(again.says())
+    assert second.program.item("ball").get("robot1").value["x"] == 9.0
+    again.close()
 
 
 def test_what_does_not_belong_here_is_counted(pair: tuple[Robot, Robot]) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import random
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
 import pytest
 
 from failover.core.frames.clock_offset import MILLION, ClockOffset
-from failover.core.frames.transit import Transit
 
 MS: Final = 1_000_000
 HOUR_NS: Final = 3_600_000 * MS
@@ -48,7 +48,8 @@ class Trial:
     def __init__(self, seed: int, there: Delay, back: Delay, ppm: tuple[int, int], apart_ns: int, round_ns: int = 50 * MS):
         dice = random.Random(seed)
         ours, theirs = Clock(YEAR_NS, ppm[0]), Clock(YEAR_NS + apart_ns, ppm[1])
-        self.offset, self.transit = ClockOffset(), Transit(2000)
+        self.offset = ClockOffset()
+        trips: deque[int] = deque(maxlen=64)
         self.least: list[int] = []
         self.slack: list[int] = []
         self.below = self.below_by_round_trips = 0
@@ -57,12 +58,11 @@ class Trial:
             left = number * round_ns + dice.randrange(0, 300_000)
             if dice.random() > 0.01:
                 arrivals.append((left + there(dice), number, ours.read(left)))
-            self.transit.left(number, ours.read(left))
             answer = left + round_ns // 2
             heard = [one for one in arrivals if one[0] <= answer]
             if not heard:
                 continue
-            came, echoed, ours_left = heard[-1]
+            came, _, ours_left = heard[-1]
             arrivals = [one for one in arrivals if one[0] >= came]
             left_us, hold_us = theirs.read(answer) // 1000, (theirs.read(answer) - theirs.read(came)) // 1000
             if dice.random() < 0.01:
@@ -71,13 +71,13 @@ class Trial:
             arrived = ours.read(answer + way)
             self.offset.heard(left_us * 1000, arrived)
             self.offset.echoed(ours_left, left_us * 1000, hold_us * 1000, arrived)
-            self.transit.echoed(1, echoed, hold_us, arrived)
+            trips.append(arrived - ours_left - hold_us * 1000)
             most = self.offset.most_ns(left_us * 1000, arrived)
             assert most is not None
             true = arrived - ours.read(answer)
             self.below += most < true
             self.slack.append(most - true)
-            self.below_by_round_trips += (self.transit.most_ns(1) or 0) < true
+            self.below_by_round_trips += min(trips) < true
         self.between = self.offset.between(arrived)
         self.truth = arrived - theirs.read(answer + way)
 
