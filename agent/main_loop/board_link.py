@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from agent.main_loop.own_items import OwnItems, number_in
 from agent.main_loop.urgent_items import UrgentItems
-from failover.boards import directory
+from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.boards.received import ReceivedItems
 from failover.core.board import layout
@@ -54,7 +54,7 @@ class _Peer(Struct):
 
 
 class BoardLink:
-    """This robot's board.
+    """This robot's board. Instants are those of this process's clock; in the files they are the machine's (`boottime`).
 
     Attributes:
         dropped: by reason.
@@ -63,7 +63,7 @@ class BoardLink:
 
     def __init__(self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int) -> None:
         self._file = own
-        self._round_ns = round_ns
+        self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
         self.turns = Turns()
         self.dropped: Counter[str] = Counter()
         self._own = OwnItems(own)
@@ -126,7 +126,7 @@ class BoardLink:
                 self.dropped[UNREADABLE] += 1
                 continue
             if bank is not None:
-                found.append(Portion(number, sent_age_us(bank.stamp_ns, now_ns), bank.number, bank.value))
+                found.append(Portion(number, sent_age_us(bank.stamp_ns, now_ns - self._skew_ns), bank.number, bank.value))
         return found
 
     # --- In ---
@@ -140,6 +140,7 @@ class BoardLink:
         if part.boot != peer.boot:
             peer.boot = part.boot
             peer.items.begin_life()
+        came_ns -= self._skew_ns
         self._note_frame(peer, heard.way_ns, came_ns)
         put, round_, way_us = peer.items.put, part.round, way_bound_us(heard.way_ns)
         for portion in heard.items:
@@ -163,7 +164,7 @@ class BoardLink:
     def tell_states(self, now_ns: int, lease_ns: int) -> None:
         """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease."""
         for peer in self._peers.values():
-            silent_ns = now_ns - peer.heard_ns
+            silent_ns = now_ns - self._skew_ns - peer.heard_ns
             state = layout.REMOVE if silent_ns < lease_ns else layout.NOT
             if silent_ns < REMOVE_ROUNDS * self._round_ns:
                 state = layout.RUN
