@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
@@ -114,6 +113,8 @@ def _type(kind: Type) -> str:
 
 
 def _value(said: object) -> str:
+    import json  # here: a process that only reads team.toml does not need it
+
     if isinstance(said, str | bool):
         return json.dumps(said, ensure_ascii=False)
     if isinstance(said, tuple):
@@ -122,6 +123,8 @@ def _value(said: object) -> str:
 
 
 def _key(name: str) -> str:
+    import json
+
     return name if _BARE.fullmatch(name) else json.dumps(name, ensure_ascii=False)
 
 
