@@ -153,7 +153,7 @@ class Config:
     Attributes:
         robot: this robot's name in the team file.
         team_directory: see `failover.config.team`.
-        state_directory: what survives a power cut: ballot, snapshots, streams.
+        state_directory: what survives a power cut: vote record, snapshots, streams.
         runtime_directory: sockets; gone after a reboot.
         insecure: run without keys: anybody on the network can read memory and start programs.
         group: unix group that may use the control socket besides its owner; "" for nobody.

@@ -32,7 +32,7 @@ class ConfigError(AgentError):
 
 
 class LaneError(AgentError):
-    """The bulk lane could not be opened, or a peer on it broke the rules."""
+    """The replication link could not be opened, or a peer on it broke the rules."""
 
 
 class RefusedError(AgentError):
@@ -50,4 +50,4 @@ class RefusedError(AgentError):
 
 
 TROUBLE: Final = (CheckpointError, AgentError, OSError)
-"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the lanes."""
+"""What can go wrong with a program, its processes or a disk, and is told; anything else is our mistake and ends the worker."""

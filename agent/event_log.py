@@ -81,7 +81,7 @@ def _contents(directory: Path) -> Iterator[bytes]:
         yield from (line for line in content.split(b"\n") if line)
 
 
-class StoryFile:
+class EventLogFile:
     """The two halves, open for appending. One thread at a time.
 
     Raises (all methods): OSError, from the file system; what was written before stays readable.

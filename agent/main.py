@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _wanted(arguments: list[str]) -> tuple[str, Path]:
-    """The command and the configuration file; as services are started without argparse: the heart would keep half a megabyte."""
+    """The command and the configuration file. A service is started without argparse, which would cost half a megabyte."""
     match arguments:
         case ["--config", path] if not path.startswith("-"):
             return "run", Path(path)

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from agent.config import Settings
 from agent.errors import AgentError
-from agent.main_loop.vote_record import Ballot
+from agent.main_loop.vote_record import VoteRecordFile
 from agent.worker.components.run_records import Records
 from checkpoint.store.store import Store, open_store
 from failover.client.control import Control
@@ -43,8 +43,8 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
     directory = Path(settings.config.state_directory)
     _check_right(directory)
     _check_stopped(settings, name)
-    ballot = Ballot(directory, settings.config.robot)
-    before = core_vote_record.decode(ballot.read().core)
+    record_file = VoteRecordFile(directory, settings.config.robot)
+    before = core_vote_record.decode(record_file.read().core)
     record = next((one for one in before.records if one.name == name), None)
     if record is None:
         known = ", ".join(f"{one.name} (epoch {one.epoch})" for one in before.records) or "nothing"
@@ -63,7 +63,7 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
             store.set_aside(name, {generation for generation, _ in later})
         mended = _mended(record, epoch, has_left=held > len(later))
         records = tuple(mended if one is record else one for one in before.records)
-        ballot.keep(core_vote_record.encode(replace(before, records=records)))
+        record_file.keep(core_vote_record.encode(replace(before, records=records)))
     finally:
         if store is not None:
             store.close()
@@ -72,7 +72,7 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
 
 
 def _mended(record: Record, epoch: int, *, has_left: bool) -> Record:
-    """What is left of the record: the program and its owner, but no vote, no primary, and nobody entrusted."""
+    """What is left of the record: the program and its owner, but no vote, no primary, and no robot entrusted."""
     state = State.STANDBY if has_left else State.ABSENT
     return Record(record.name, epoch, state=state, spec=record.spec, begun=record.begun or has_left)
 

@@ -27,6 +27,7 @@ from typing import Final
 from benchmarks import (
     beside,
     board,
+    board_in_c,
     chains,
     costs,
     crowd,
@@ -117,6 +118,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "encoding": encoding.encoding,
     "task": task.task,
     "board": board.board,
+    "board_in_c": board_in_c.board_in_c,
 }
 
 BY_ITSELF: Final = "soak"

@@ -14,7 +14,7 @@ from typing import Any, Final
 from benchmarks import keepalived
 from benchmarks.figures import Absent, Figure, Findings
 from benchmarks.running import BenchmarkError
-from failover.cli.demo.robots import RobotMachine, Stage, means
+from failover.cli.demo.robots import Pace, RobotMachine, Stage, means
 from failover.errors import FailoverError
 
 BEAT_MS: Final = 10
@@ -141,7 +141,7 @@ def _cuts(case: Case, count: int, directory: Path) -> tuple[list[Cut], int]:
 
 def _cut(case: Case, directory: Path) -> Cut | None:
     """One pair of robots, one program, one cut; None: it was taken over before."""
-    with Stage(directory, means(), case.settings, beat_ms=BEAT_MS, lease_ms=LEASE_MS) as stage:
+    with Stage(directory, means(), case.settings, pace=Pace(BEAT_MS, LEASE_MS)) as stage:
         stage.directory.mkdir()
         stage.start()
         primary, standby = stage.robots

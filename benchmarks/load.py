@@ -34,8 +34,14 @@ FROZEN: Final[dict[str, tuple[Any, ...]]] = {
 DELTAS: Final = 200
 QUICK_DELTAS: Final = 40
 
-KEPT: Final = ("100 MB, 400 KB written each 50 ms", "a shell loop with constant children", "300 MB written a second")
-"""Whose checkpoints' age is measured, with two agents."""
+KEPT: Final = {
+    **{
+        case: FROZEN[case]
+        for case in ("100 MB, 400 KB written each 50 ms", "a shell loop with constant children", "300 MB written a second")
+    },
+    "2 GB that do not compress, 4 MB written each 50 ms": ("resident", 2_000, 4_000, 1),
+}
+"""Programs whose checkpoints' age is measured, with two agents."""
 SPAN_S: Final = 30.0
 QUICK_SPAN_S: Final = 10.0
 POLL_S: Final = 0.05
@@ -94,9 +100,9 @@ def _freezes(case: str, program: str, arguments: list[int], count: int, deltas: 
 
 
 def _ages(case: str, count: int, span_s: float, directory: Path) -> Iterator[Figure]:
-    program, *arguments = FROZEN[case]
+    program, *arguments = KEPT[case]
     argv = ["/usr/bin/python3", str(PROGRAMS / f"{program}.py"), *map(str, arguments)]
-    with Stage(directory / f"age-{program}-{count}", means()) as stage, busy(count):
+    with Stage(directory / f"age-{program}-{arguments[:1]}-{count}", means()) as stage, busy(count):
         stage.directory.mkdir()
         stage.start()
         primary = stage.robots[0]

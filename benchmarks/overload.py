@@ -13,7 +13,6 @@ import tempfile
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +21,7 @@ from benchmarks.figures import Absent, Figure, Findings
 from benchmarks.figures import table as table_of
 from benchmarks.load import busy
 from benchmarks.running import BenchmarkError
-from failover.cli.demo.robots import RobotMachine, Stage, means, run
+from failover.cli.demo.robots import Pace, RobotMachine, Stage, means, run
 
 SPAN_S: Final = 60.0
 QUICK_SPAN_S: Final = 15.0
@@ -50,19 +49,6 @@ LEASE_OVER: Final = "freezes it"
 
 TAKEOVERS: Final = "false takeovers"
 TAKEN_FOR_DEAD: Final = "robots falsely taken for dead"
-
-
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """How quick the detector is; ``lease_ms`` at least four beats."""
-
-    beat_ms: int
-    lease_ms: int
-
-    @property
-    def name(self) -> str:
-        """For the tables."""
-        return f"beats of {self.beat_ms} ms, a lease of {self.lease_ms} ms"
 
 
 PACES: Final = (Pace(20, 200), Pace(BEAT_MS, LEASE_MS))
@@ -93,7 +79,7 @@ def measured(span_s: float, paces: tuple[Pace, ...], rates: tuple[str, ...], dir
 
 def _case(span_s: float, pace: Pace, rate: str, directory: Path) -> list[Figure]:
     with ExitStack() as stack:
-        stage = stack.enter_context(Stage(directory, means(), beat_ms=pace.beat_ms, lease_ms=pace.lease_ms))
+        stage = stack.enter_context(Stage(directory, means(), pace=pace))
         stage.directory.mkdir()
         stage.start()
         primary, standby = stage.robots
@@ -109,7 +95,7 @@ def _case(span_s: float, pace: Pace, rate: str, directory: Path) -> list[Figure]
         began, sent = time.time(), _sent(primary)
         time.sleep(span_s)
         story, beats, moved = _story(stage.robots, began), standby.status()["beats"], _sent(primary) - sent
-    case = f"{pace.name}, {rate}"
+    case = f"beats of {pace.beat_ms} ms, a lease of {pace.lease_ms} ms, {rate}"
     counts = {
         TAKEOVERS: sum(" claims epoch " in did for did in story),
         TAKEN_FOR_DEAD: sum(DEAD in did for did in story),

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Final
+
+AS_SOON_AS: Final = "failover captures it as soon as"
+"""Begins the cure of what is refused for a moment only: that moment's end follows."""
 
 
 def in_words(error: BaseException) -> str:
@@ -15,6 +19,11 @@ def in_words(error: BaseException) -> str:
         if name is not None
     ]
     return error.strerror + (f" ({', '.join(named)})" if named else "")
+
+
+def copy_outdated(why: str, component: str = "") -> str:
+    """Why the ready copy of a component cannot be brought on, and what to do."""
+    return f"the ready copy{f' of {component}' if component else ''} must be built again: {why}"
 
 
 def near(said: str, choices: Iterable[str]) -> str:

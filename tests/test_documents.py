@@ -92,7 +92,9 @@ def test_every_command_line_can_be_typed(path: Path) -> None:
 
 
 def test_examples_in_help_can_be_typed() -> None:
-    examples = [line.strip() for verb in parser.VERBS for line in verb.story.splitlines() if line.strip().startswith("failover ")]
+    examples = [
+        line.strip() for verb in parser.VERBS for line in verb.description.splitlines() if line.strip().startswith("failover ")
+    ]
     lines = command_lines("```\n" + "\n".join(line for line in examples if not re.search(r"[.;)]$|ACT", line)) + "\n```")
     assert len(lines) > 20
     assert [words for words in lines if not is_accepted(words)] == []

@@ -51,11 +51,11 @@ NOBODY_LEFT: Final = "it waited for its agent's order to begin, and that agent h
 WATCHED: Final = "failover did not start it: its exit status will not be known, its output is not kept"
 
 
-class WardError(Exception):
+class ProgramError(Exception):
     """What was asked does not fit the state; says why and what to do."""
 
 
-class Ward(Struct):
+class GuardedProgram(Struct):
     """One program, alive or ended. Made by `start`, `make_vessel` or `watch`."""
 
     component: str
@@ -80,7 +80,7 @@ class Ward(Struct):
     # --- birth ---
 
     @classmethod
-    def start(cls, order: Start, segment: tuple[int, ...] = ()) -> Ward:
+    def start(cls, order: Start, segment: tuple[int, ...] = ()) -> GuardedProgram:
         """Start a program.
 
         Args:
@@ -93,7 +93,7 @@ class Ward(Struct):
         environment = dict(os.fsdecode(item).split("=", 1) for item in order.environment if b"=" in item)
         directory = os.fsdecode(order.working_directory)
 
-        environment.pop(VARIABLE, None)  # of whoever gave the order: he may be a component himself
+        environment.pop(VARIABLE, None)  # of the process that gave the order: it may be a component itself
         task = _task_end(order, segment) if order.task is not None else None
 
         def give_birth(birth: Birth) -> Born:
@@ -106,27 +106,27 @@ class Ward(Struct):
         totals = None if waits else order.totals
         brought = tuple(BroughtFile(*file) for file in order.brought)
         birth = Birth(isolate=order.isolate, inheritance=kept, brought=brought)
-        ward = cls._bear(order, totals, birth, give_birth, user, task)
-        ward.warm, ward.committed = waits, not waits
-        ward.engine = order.task.engine if order.task is not None else PTRACE
-        return ward
+        program = cls._bear(order, totals, birth, give_birth, user, task)
+        program.warm, program.committed = waits, not waits
+        program.engine = order.task.engine if order.task is not None else PTRACE
+        return program
 
     @classmethod
-    def make_vessel(cls, order: MakeVessel) -> Ward:
+    def make_vessel(cls, order: MakeVessel) -> GuardedProgram:
         """Make a vessel for a restore; uncommitted.
 
         Raises:
             RestoreError, OSError: it could not be made; nothing is left of it.
         """
         birth = Birth(order.inner_pid, order.isolate, order.clocks, order.elapsed_ns, counted_ns=order.counted_ns)
-        ward = cls._bear(order, order.totals, birth, spawn_vessel, order.user)
-        ward.committed = False
-        ward.offered, ward.engine = order, order.task.engine if order.task is not None else PTRACE
-        return ward
+        program = cls._bear(order, order.totals, birth, spawn_vessel, order.user)
+        program.committed = False
+        program.offered, program.engine = order, order.task.engine if order.task is not None else PTRACE
+        return program
 
     @classmethod
-    def watch(cls, order: Watch, pidfd: int) -> Ward:
-        """Look after somebody else's child.
+    def watch(cls, order: Watch, pidfd: int) -> GuardedProgram:
+        """Look after a process that is another one's child.
 
         Args:
             pidfd: of it; stays the caller's.
@@ -150,7 +150,7 @@ class Ward(Struct):
         act: Callable[[Birth], Born],
         user: tuple[int, int] | None,
         task: TaskEnd | None = None,
-    ) -> Ward:
+    ) -> GuardedProgram:
         """Logs, pipes and a freezer first; the process last, into all of them.
 
         Args:
@@ -179,9 +179,9 @@ class Ward(Struct):
         pump.born()
         if pump.is_open:
             pump.begin()
-        ward = cls(order.component, born, hold, order.log_directory, pump, notes=[*notes, *born.notes], task=task)
-        ward.note_logs()
-        return ward
+        program = cls(order.component, born, hold, order.log_directory, pump, notes=[*notes, *born.notes], task=task)
+        program.note_logs()
+        return program
 
     def descriptors(self) -> tuple[int, ...]:
         """What the keeper needs of the streams: counters, two read ends, two logs. They stay ours."""
@@ -200,12 +200,12 @@ class Ward(Struct):
         """Have a program begin that waits for it, under the lease that it was given before; from here on it outlives the agent.
 
         Raises:
-            WardError: it does not wait, or has ended in the meantime.
+            ProgramError: it does not wait, or has ended in the meantime.
             OSError: its logs cannot be written; it waits as before.
         """
         self._check_alive("have it begin")
         if self.committed or not self.warm:
-            raise WardError("it does not wait to begin: it was started to run, and runs")
+            raise ProgramError("it does not wait to begin: it was started to run, and runs")
         assert self.task is not None and self.pump is not None, "what is warm was born so"
         _open(self.pump, self.log_directory, order.totals)
         self.note_logs()
@@ -219,7 +219,7 @@ class Ward(Struct):
         """The vessel is the component now.
 
         Raises:
-            WardError: it has ended in the meantime.
+            ProgramError: it has ended in the meantime.
         """
         self._check_alive("commit to it")
         self.committed = True
@@ -230,12 +230,12 @@ class Ward(Struct):
         """The vessel was a ready copy, and is the component now: its output goes on in the logs from ``totals`` on.
 
         Raises:
-            WardError: it has ended in the meantime, or its logs are open already.
+            ProgramError: it has ended in the meantime, or its logs are open already.
             OSError: they cannot be written; nothing has changed.
         """
         self._check_alive("commit to it")
         if self.offered is None or self.pump is None or self.pump.is_open:
-            raise WardError("cannot commit to it as to a ready copy: its logs are open already")
+            raise ProgramError("cannot commit to it as to a ready copy: its logs are open already")
         _open(self.pump, self.log_directory, totals)
         self.note_logs()
         self.offered = msgspec.structs.replace(self.offered, task=task)
@@ -264,7 +264,7 @@ class Ward(Struct):
             exposed: a tracer may look into it, see `Freezer.expose`.
 
         Raises:
-            WardError: it has ended.
+            ProgramError: it has ended.
         """
         self._check_alive("freeze it")
         self.freezer.freeze()
@@ -276,11 +276,11 @@ class Ward(Struct):
         """Let it go on.
 
         Raises:
-            WardError: it has ended, or its lease is over.
+            ProgramError: it has ended, or its lease is over.
         """
         self._check_alive("thaw it")
         if self._lease_is_over(now_ns()):
-            raise WardError("cannot thaw it: its lease is over, another robot may run it; give it a new lease first")
+            raise ProgramError("cannot thaw it: its lease is over, another robot may run it; give it a new lease first")
         self.freezer.thaw()
         self.frozen_by = ""
 
@@ -326,17 +326,17 @@ class Ward(Struct):
         """Send a signal with a value.
 
         Raises:
-            WardError: it would end by it, has ended, or cannot be told.
+            ProgramError: it would end by it, has ended, or cannot be told.
         """
         try:
             fields = procfs.parse_fields(procfs.read_text(self.born.pid, "status"))
             if not (int(fields["SigCgt"], 16) | int(fields["SigBlk"], 16)) >> (number - 1) & 1:
-                raise WardError(
+                raise ProgramError(
                     f"it neither handles nor blocks {signal.Signals(number).name}, which may end it: the guard does not send it"
                 )
             queue_signal(self.born.pid, number, value)
         except (OSError, ProbeError) as error:
-            raise WardError(f"the guard cannot send it {signal.Signals(number).name}: {in_words(error)}") from error
+            raise ProgramError(f"the guard cannot send it {signal.Signals(number).name}: {in_words(error)}") from error
 
     def abandon(self) -> None:
         """Agent or keeper are gone before it was the component: nothing of it stays."""
@@ -355,7 +355,7 @@ class Ward(Struct):
         return just_ended
 
     def watched_end(self) -> None:
-        """The pidfd of somebody else's child says that it has ended."""
+        """The pidfd of a program that is not our child says that it has ended."""
         self._end(None)
 
     def _end(self, status: int | None) -> None:
@@ -413,7 +413,7 @@ class Ward(Struct):
 
     def _check_alive(self, what: str) -> None:
         if self.exited is not None:
-            raise WardError(f"cannot {what}: the program has ended; ask for its status, then forget it")
+            raise ProgramError(f"cannot {what}: the program has ended; ask for its status, then forget it")
 
 
 def _task_end(order: Start, segment: tuple[int, ...]) -> TaskEnd:

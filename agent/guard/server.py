@@ -55,7 +55,7 @@ from agent.guard.messages import (
     Watch,
     Watching,
 )
-from agent.guard.program import Ward, WardError
+from agent.guard.program import GuardedProgram, ProgramError
 from agent.guard.task_socket import TaskEnd
 from agent.system import syscalls, timers
 from agent.system.clock import now_ns
@@ -74,7 +74,7 @@ _PEER: Final = struct.Struct("3i")
 
 
 class Guard:
-    """The loop and what it was told. One thread; the pump of `Ward` is the only other one."""
+    """The loop and what it was told. One thread; the pump of `GuardedProgram` is the only other one."""
 
     def __init__(self, listener: socket.socket, path: str, notes: tuple[str, ...]) -> None:
         """
@@ -85,10 +85,10 @@ class Guard:
         self._path = path
         self._notes = notes
         self._agent: Channel[Any] | None = None
-        self._ward: Ward | None = None
+        self._program: GuardedProgram | None = None
         self._keeper: int | None = None
         self._over = False
-        self._ends_with_ward = False
+        self._ends_with_program = False
         self._told_to_end = False
         self._is_unfinished = False
         self._started_at = time.monotonic()
@@ -101,13 +101,15 @@ class Guard:
             Watch: self._watch,
             Commit: self._commit,
             Lease: self._lease,
-            Freeze: lambda request, _: self._act(lambda ward: ward.freeze(exposed=request.exposed)),
-            Thaw: lambda _, __: self._act(lambda ward: ward.thaw()),
+            Freeze: lambda request, _: self._act(lambda program: program.freeze(exposed=request.exposed)),
+            Thaw: lambda _, __: self._act(lambda program: program.thaw()),
             CommitSafe: self._commit_safe,
             LimitOutput: self._limit_output,
-            Kill: lambda request, _: self._act(lambda ward: ward.kill(request.signal)),
-            Tell: lambda request, _: self._act(lambda ward: ward.tell(request.signal, request.value)),
-            Describe: lambda _, __: self._reply(self._description(), self._ward.descriptors() if self._ward is not None else ()),
+            Kill: lambda request, _: self._act(lambda program: program.kill(request.signal)),
+            Tell: lambda request, _: self._act(lambda program: program.tell(request.signal, request.value)),
+            Describe: lambda _, __: self._reply(
+                self._description(), self._program.descriptors() if self._program is not None else ()
+            ),
             LetGo: self._let_go,
             Forget: self._forget,
         }
@@ -116,41 +118,41 @@ class Guard:
         """Serve until there is nothing left to guard."""
         while not self._over:
             ready = self._wait()
-            if self._ward is not None and self._ward.lapse(now_ns()):  # first: a lease waits for nobody
+            if self._program is not None and self._program.lapse(now_ns()):  # first: a lease does not wait
                 self._tell(FrozenByLease())
             for act in ready:
                 act()
             self._over |= self._agent is None and self._is_of_no_use()
-        if self._ward is not None:
-            self._ward.close()
+        if self._program is not None:
+            self._program.close()
 
     def _is_of_no_use(self) -> bool:
         """Whether no agent will ask for what this guard knows."""
-        if self._ward is None:
+        if self._program is None:
             return time.monotonic() > self._started_at + FIRST_CALL_S
-        return (self._told_to_end or self._is_unfinished) and self._ward.exited is not None
+        return (self._told_to_end or self._is_unfinished) and self._program.exited is not None
 
     def _wait(self) -> list[Callable[[], None]]:
         """Sleep until something is to be done, or a deadline passes; returns what is to be done."""
         watched: dict[int, Callable[[], None]] = {self._signals.fileno(): self._heed_signals, self._alarm.fileno(): _wake_up}
-        self._alarm.set(self._ward.deadline_ns() if self._ward is not None else None)
+        self._alarm.set(self._program.deadline_ns() if self._program is not None else None)
         if self._listener.fileno() >= 0:  # it was not let go
             watched[self._listener.fileno()] = self._accept
         if self._agent is not None:
             watched[self._agent.fileno()] = functools.partial(self._receive, self._agent)
         if self._keeper is not None:
             watched[self._keeper] = self._lose_keeper
-        if self._ward is not None and self._ward.pidfd is not None and self._ward.exited is None:
-            watched[self._ward.pidfd] = self._watched_end
-        if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
-            watched[self._ward.task.fileno()] = functools.partial(self._heed_task, self._ward.task)
+        if self._program is not None and self._program.pidfd is not None and self._program.exited is None:
+            watched[self._program.pidfd] = self._watched_end
+        if self._program is not None and self._program.task is not None and self._program.exited is None:
+            watched[self._program.task.fileno()] = functools.partial(self._heed_task, self._program.task)
         poll = select.poll()
         for descriptor in watched:
             poll.register(descriptor, select.POLLIN)
         return [watched[descriptor] for descriptor, _ in poll.poll(self._patience_ms())]
 
     def _patience_ms(self) -> float | None:
-        return FIRST_CALL_S * 1000 if self._ward is None and self._agent is None else None
+        return FIRST_CALL_S * 1000 if self._program is None and self._agent is None else None
 
     # --- the agent ---
 
@@ -168,8 +170,8 @@ class Guard:
             return
         end.settimeout(SEND_TIMEOUT_S)
         self._agent = Channel(end, Request)
-        if self._ward is not None and self._ward.exited is not None:
-            self._tell(self._ward.exited)
+        if self._program is not None and self._program.exited is not None:
+            self._tell(self._program.exited)
 
     def _receive(self, agent: Channel[Any]) -> None:
         if agent is not self._agent:  # in this same turn it was found to have gone, or another one came
@@ -181,7 +183,7 @@ class Guard:
             return
         try:
             self._answers[type(request)](request, descriptors)
-        except (WardError, OSError, CheckpointError) as error:
+        except (ProgramError, OSError, CheckpointError) as error:
             self._reply(Refused(_sentence(request, error)))
         finally:
             close_all(tuple(descriptor for descriptor in descriptors if descriptor != self._keeper))
@@ -191,22 +193,22 @@ class Guard:
         assert self._agent is not None
         self._agent.close()
         self._agent = None
-        if self._ward is None:
+        if self._program is None:
             self._over = True
         else:
-            self._undo_unfinished(self._ward)
+            self._undo_unfinished(self._program)
 
     def _lose_keeper(self) -> None:
         """The pidfd of the keeper says that it has ended in the middle of a restore."""
         self._drop_keeper()
-        if self._ward is not None:
-            self._undo_unfinished(self._ward)
+        if self._program is not None:
+            self._undo_unfinished(self._program)
 
-    def _undo_unfinished(self, ward: Ward) -> None:
-        if not ward.committed:
-            ward.abandon()
+    def _undo_unfinished(self, program: GuardedProgram) -> None:
+        if not program.committed:
+            program.abandon()
             self._is_unfinished = True  # its end is no component's: the next agent must not find it
-            self._ends_with_ward = self._agent is None  # nobody is left to be told
+            self._ends_with_program = self._agent is None  # no agent is left to be told
 
     def _drop_keeper(self) -> None:
         if self._keeper is not None:
@@ -229,63 +231,63 @@ class Guard:
 
     def _start(self, request: Start, descriptors: tuple[int, ...]) -> None:
         self._check_free()
-        self._ward = ward = Ward.start(request, descriptors)
-        born = ward.born
-        self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+        self._program = program = GuardedProgram.start(request, descriptors)
+        born = program.born
+        self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), program.descriptors())
 
     def _begin_task(self, request: BeginTask, descriptors: tuple[int, ...]) -> None:
         self._reap()  # it may have ended just now
-        ward = self._guarded()
-        ward.begin_task(request, descriptors)
-        born = ward.born
-        self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+        program = self._guarded()
+        program.begin_task(request, descriptors)
+        born = program.born
+        self._reply(Started(born.pid, born.inner_pid, born.isolated, self._all_notes()), program.descriptors())
 
     def _make_vessel(self, request: MakeVessel, descriptors: tuple[int, ...]) -> None:
         self._check_free()
-        self._ward = ward = Ward.make_vessel(request)
+        self._program = program = GuardedProgram.make_vessel(request)
         self._keeper = descriptors[0] if descriptors else None
-        born = ward.born
-        self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+        born = program.born
+        self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), program.descriptors())
 
     def _watch(self, request: Watch, descriptors: tuple[int, ...]) -> None:
         self._check_free()
         if len(descriptors) != 1:
-            raise WardError(f"cannot look after pid {request.pid}: its pidfd must come along")
-        self._ward = Ward.watch(request, descriptors[0])
+            raise ProgramError(f"cannot look after pid {request.pid}: its pidfd must come along")
+        self._program = GuardedProgram.watch(request, descriptors[0])
         self._reply(Watching(self._all_notes()))
 
     def _commit(self, request: Commit, _: tuple[int, ...]) -> None:
-        ward = self._guarded()
+        program = self._guarded()
         if request.totals is None:
-            ward.commit()
+            program.commit()
             self._drop_keeper()
             self._reply(Done())
             return
-        ward.commit_copy(request.totals, request.task)
+        program.commit_copy(request.totals, request.task)
         self._drop_keeper()
-        born = ward.born
-        self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), ward.descriptors())
+        born = program.born
+        self._reply(VesselReady(born.pid, born.inner_pid, born.isolated, self._all_notes()), program.descriptors())
 
     def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
-        if self._ward is not None and self._ward.task is not None and self._ward.exited is None:
-            self._ward.task.tell_safe(request.commit)
+        if self._program is not None and self._program.task is not None and self._program.exited is None:
+            self._program.task.tell_safe(request.commit)
 
     def _limit_output(self, request: LimitOutput, _: tuple[int, ...]) -> None:
-        if self._ward is not None and self._ward.pump is not None:
-            self._ward.pump.limit(request.hold_limit)
+        if self._program is not None and self._program.pump is not None:
+            self._program.pump.limit(request.hold_limit)
 
     def _lease(self, request: Lease, _: tuple[int, ...]) -> None:
         self._guarded().set_lease(request.until_ns)
         self._reply(Done())
 
     def _let_go(self, _: LetGo, __: tuple[int, ...]) -> None:
-        ward = self._guarded()
-        ward.set_lease(0)
-        if ward.frozen_by:
-            ward.thaw()
-        ward.let_go = self._ends_with_ward = True
+        program = self._guarded()
+        program.set_lease(0)
+        if program.frozen_by:
+            program.thaw()
+        program.let_go = self._ends_with_program = True
         self._stop_listening()  # no later agent may find it, and take it for a component
-        self._over = ward.pidfd is not None or ward.exited is not None
+        self._over = program.pidfd is not None or program.exited is not None
         self._reply(Done())
 
     def _stop_listening(self) -> None:
@@ -294,30 +296,30 @@ class Guard:
         self._listener.close()
 
     def _forget(self, _: Forget, __: tuple[int, ...]) -> None:
-        if self._ward is not None and self._ward.exited is None:
-            raise WardError("the program still runs; stop or release it first")
+        if self._program is not None and self._program.exited is None:
+            raise ProgramError("the program still runs; stop or release it first")
         self._reply(Done())
         self._over = True
 
-    def _act(self, act: Callable[[Ward], None]) -> None:
+    def _act(self, act: Callable[[GuardedProgram], None]) -> None:
         act(self._guarded())
         self._reply(Done())
 
-    def _guarded(self) -> Ward:
-        if self._ward is None:
-            raise WardError("nothing was started yet")
-        return self._ward
+    def _guarded(self) -> GuardedProgram:
+        if self._program is None:
+            raise ProgramError("nothing was started yet")
+        return self._program
 
     def _check_free(self) -> None:
-        if self._ward is not None:
-            raise WardError(f"this guard already looks after pid {self._ward.born.pid}; a guard serves one program only")
+        if self._program is not None:
+            raise ProgramError(f"this guard already looks after pid {self._program.born.pid}; a guard serves one program only")
 
     def _all_notes(self) -> tuple[str, ...]:
-        return (*(self._ward.notes if self._ward else ()), *self._notes)
+        return (*(self._program.notes if self._program else ()), *self._notes)
 
     def _description(self) -> Described:
-        if self._ward is not None:
-            return self._ward.describe(self._notes)
+        if self._program is not None:
+            return self._program.describe(self._notes)
         return Described("", "none", 0, 0, False, False, "", None, (0, 0), 0, "", "", "", self._notes)
 
     # --- ends ---
@@ -328,26 +330,26 @@ class Guard:
         self._reap()
 
     def _reap(self) -> None:
-        if self._ward is not None and self._ward.reap():
+        if self._program is not None and self._program.reap():
             self._announce_end()
 
     def _watched_end(self) -> None:
-        assert self._ward is not None
-        self._ward.watched_end()
+        assert self._program is not None
+        self._program.watched_end()
         self._announce_end()
 
     def _heed_task(self, task: TaskEnd) -> None:
         """The program says something about the state that it keeps."""
-        if self._ward is None or self._ward.exited is not None:  # it has ended in this same turn
+        if self._program is None or self._program.exited is not None:  # it has ended in this same turn
             return
         for event in task.heed():
             self._tell(event)
 
     def _announce_end(self) -> None:
-        assert self._ward is not None and self._ward.exited is not None
+        assert self._program is not None and self._program.exited is not None
         self._drop_keeper()
-        self._tell(self._ward.exited)
-        self._over |= self._ends_with_ward
+        self._tell(self._program.exited)
+        self._over |= self._ends_with_program
 
 
 def main(arguments: list[str]) -> int:
@@ -370,7 +372,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _listen(path: str) -> socket.socket:
-    """Listen at a path that nobody else listens at; 0600 from its first instant."""
+    """Listen at a path at which no other process listens; 0600 from its first instant."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     before = os.umask(0o177)
     try:
@@ -387,7 +389,7 @@ def _settle() -> tuple[str, ...]:
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)  # it ends when its program has ended, however the system shuts down
     syscalls.become_subreaper()
-    with contextlib.suppress(PermissionError):  # it leads a session already: whoever started it saw to that
+    with contextlib.suppress(PermissionError):  # it leads a session already: its parent saw to that
         os.setsid()
     notes = []
     syscalls.small_stacks()

@@ -11,7 +11,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from agent.event_log import StoryFile
+from agent.event_log import EventLogFile
 from agent.system import clock
 from failover.core.event_log.decisions import Decision, Line
 
@@ -31,16 +31,16 @@ SENTENCE_MAX: Final = 2_000
 """Characters of one sentence; a program's own error message may be in it."""
 
 
-class Scribe:
-    """One life's lines. `note` and `unwritten` belong to the heart, and no lock of the thread's can make them wait.
+class EventLogWriter:
+    """One life's lines. `note` and `unwritten` belong to the main loop, and no lock of the thread's can make them wait.
 
     Attributes:
-        trouble: why the story cannot be written now, or what is missing in it; "" if all is well.
+        trouble: why the event log cannot be written now, or what is missing in it; "" if all is well.
     """
 
     def __init__(self, state_directory: Path, robot: str, life: int) -> None:
         self.trouble = ""
-        self._file = StoryFile(state_directory)
+        self._file = EventLogFile(state_directory)
         self._robot, self._life, self._kernel = robot, life, clock.kernel_boot()
         self._number = 0
         self._last: dict[str, tuple[str, int, int]] = {}
@@ -49,7 +49,7 @@ class Scribe:
         self._given_up = 0
         self._queue: SimpleQueue[Line | None] = SimpleQueue()
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="scribe", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="event log writer", daemon=True)
         self._thread.start()
 
     def note(self, decisions: Iterable[Decision]) -> None:

@@ -25,7 +25,7 @@ from agent.errors import AgentError
 from agent.main_loop import messages, starvation, vote_record
 from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
 from agent.main_loop.duplicate_beats import Copies
-from agent.main_loop.event_log_writer import Scribe
+from agent.main_loop.event_log_writer import EventLogWriter
 from agent.main_loop.messages import (
     Alive,
     BeatCounts,
@@ -35,14 +35,14 @@ from agent.main_loop.messages import (
     Inventory,
     Life,
     SpeakKey,
-    ToHeart,
-    ToLanes,
     Told,
+    ToMainLoop,
+    ToWorker,
 )
 from agent.main_loop.outbox import Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
-from agent.main_loop.vote_record_writer import Persister
-from agent.main_loop.worker_process import LanesProcess
+from agent.main_loop.vote_record_writer import VoteRecordWriter
+from agent.main_loop.worker_process import WorkerProcess
 from agent.system import clock, syscalls, timers
 from agent.system.sd_notify import Notifier, watchdog_period_ns
 from checkpoint.keeper.messages import ChannelClosedError, ChannelError
@@ -53,7 +53,6 @@ from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
 from failover.core.frames.roster import roster
 from failover.core.node import URGENT_GAP_NS, Node
-from failover.core.types import Ballot
 from failover.core.wire.messages import Beat
 from failover.errors import FailoverError
 
@@ -71,19 +70,19 @@ GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
 
 REST_SHARE: Final = 3
-"""While the heart rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
+"""While the main loop rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
 
-LANES_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
-"""How long the lanes may say nothing; then another process takes their place. Meanwhile nobody renews the guards' leases."""
+WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
+"""How long the worker may say nothing; then another one takes its place. Meanwhile the guards' leases are not renewed."""
 
-LANES_LOOK_NS: Final = NANOSECONDS_A_SECOND
-"""Between two looks at lanes that say nothing: longer than between their signs of life, so that others are not looked at."""
+WORKER_LOOK_NS: Final = NANOSECONDS_A_SECOND
+"""Between two looks at a worker that says nothing: longer than between two signs of life, which one that works gives."""
 
-LANES_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
-"""The same before their first word: an interpreter starts."""
+WORKER_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
+"""The same before its first word: an interpreter starts."""
 
-LANES_TRIES: Final = 5
-"""Lanes processes that may die before their first word; then something is wrong that no restart cures."""
+WORKER_TRIES: Final = 5
+"""Workers that may die before their first word; then something is wrong that no restart cures."""
 
 STARTED: Final = "protecting this robot and its neighbours"
 
@@ -100,10 +99,10 @@ OUTLIVED: Final = (
 log = logging.getLogger("failover.heart")
 
 
-class Heart:
+class MainLoop:
     """One life of one robot's agent."""
 
-    def __init__(self, settings: Settings, ballot: vote_record.Ballot, notifier: Notifier) -> None:
+    def __init__(self, settings: Settings, record_file: vote_record.VoteRecordFile, notifier: Notifier) -> None:
         """Bind the beat sockets; nothing runs yet.
 
         Raises:
@@ -111,23 +110,24 @@ class Heart:
         """
         self._settings = settings
         self._me = settings.config.robot
-        self._ballot = ballot
+        self._record_file = record_file
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
         terms = settings.team.items().terms if settings.team.board.items else b""
         everybody = roster(settings.team.robots, terms)
-        self._frames = FrameLane(self._me, settings.team.team, everybody, ballot.record.boot, settings.config.beat_ms * 1_000)
+        round_us = settings.config.beat_ms * 1_000
+        self._frames = FrameLane(self._me, settings.team.team, everybody, record_file.record.boot, round_us)
         self._has_board = bool(terms) and settings.me.role == "robot"
         self._board: BoardLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
         self._urgent_ns: int | None = None
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
-        self._lanes = LanesProcess(settings)
+        self._worker = WorkerProcess(settings)
         self._node: Node | None = None
-        durable = core_vote_record.decode(ballot.record.core)
+        durable = core_vote_record.decode(record_file.record.core)
         self._outbox = Outbox(durable, settings.config.beat_ms * NANOSECONDS_A_SECOND // 1_000)
-        self._persister = Persister(lambda wanted: ballot.keep(core_vote_record.encode(wanted)))
-        self._scribe = Scribe(Path(settings.config.state_directory), self._me, ballot.record.boot)
+        self._persister = VoteRecordWriter(lambda wanted: record_file.keep(core_vote_record.encode(wanted)))
+        self._event_log = EventLogWriter(Path(settings.config.state_directory), self._me, record_file.record.boot)
         self._poll = select.epoll()
         self._alarm = timers.Alarm()
         self._wake, self._signalled = socket.socketpair(
@@ -137,11 +137,11 @@ class Heart:
         self._listens = True
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
-        self._lanes_deaths = 0
+        self._worker_deaths = 0
         self._turned_ns = clock.now_ns()
-        self._lanes_silent_ns = self._lanes_unseen_ns = 0
-        self._lanes_allowed_ns = LANES_BIRTH_NS
-        self._lanes_turns: starvation.Turns | None = None
+        self._worker_silent_ns = self._worker_unseen_ns = 0
+        self._worker_allowed_ns = WORKER_BIRTH_NS
+        self._worker_turns: starvation.Turns | None = None
         self._refused: Counter[str] = Counter()
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
@@ -156,10 +156,10 @@ class Heart:
         """Beat until SIGTERM or SIGINT. Components live on.
 
         Returns:
-            0; or the life of this robot that the team remembers and its ballot does not: another one above it must begin.
+            0; or the life of this robot that the team remembers and its vote record does not: another one above it must begin.
 
         Raises:
-            AgentError: the lanes cannot be started at all.
+            AgentError: the worker cannot be started at all.
         """
         self._begin()
         watchdog_ns = watchdog_period_ns()
@@ -185,12 +185,12 @@ class Heart:
         syscalls.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
             self._notes = clock.become_realtime()
-        self._start_lanes()  # told what was refused
+        self._start_worker()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
 
     def _open_board(self) -> None:
-        """Map the board that the worker process has made; a robot without its board still protects its programs."""
+        """Map the board that the worker has made; a robot without its board still protects its programs."""
         self._close_board()
         if not self._has_board:
             return
@@ -200,7 +200,7 @@ class Heart:
         try:
             self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._outbox.beat_ns)
         except (FailoverError, OSError) as error:
-            log.warning("frames carry no items: %s", error)  # the worker process says in status why there is no board
+            log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
         self._poll.register(self._board.wakes.fileno(), select.EPOLLIN)
 
@@ -210,19 +210,19 @@ class Heart:
             self._board.close()
         self._board = None
 
-    def _start_lanes(self) -> None:
+    def _start_worker(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
-        self._lanes.start()
-        self._expect_lanes()
+        self._worker.start()
+        self._expect_worker()
 
-    def _expect_lanes(self) -> None:
-        self._lanes_spoke(LANES_BIRTH_NS << self._lanes_deaths)  # a machine so busy gets no busier
-        self._poll.register(self._lanes.fileno(), select.EPOLLIN | select.EPOLLHUP)
-        self._lanes.send(Life(self._ballot.record.boot, os.getpid(), self._notes))
+    def _expect_worker(self) -> None:
+        self._worker_spoke(WORKER_BIRTH_NS << self._worker_deaths)  # a machine so busy gets no busier
+        self._poll.register(self._worker.fileno(), select.EPOLLIN | select.EPOLLHUP)
+        self._worker.send(Life(self._record_file.record.boot, os.getpid(), self._notes))
 
     def _turn(self) -> None:
         """Sleep, then one round of everything that came, then the core's deadline."""
-        self._lanes.flush()
+        self._worker.flush()
         self._rest()
         self._alarm.set(self._wakes_ns())
         came = self._poll.poll(SLEEP_LIMIT_S)
@@ -231,8 +231,8 @@ class Heart:
         for descriptor, _ in came:
             if descriptor == self._beats.fileno():
                 self._hear()
-            elif descriptor == self._lanes.fileno():
-                self._listen_to_lanes()
+            elif descriptor == self._worker.fileno():
+                self._listen_to_worker()
             elif descriptor == self._persister.fileno():
                 self._note_persisted()
             elif descriptor == self._wake.fileno():
@@ -242,7 +242,7 @@ class Heart:
                 self._urgent_ns = self._sent_ns + URGENT_GAP_NS
         if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
             self._send_urgent()
-        self._watch_lanes()
+        self._watch_worker()
         if self._node is not None:
             late_ns = clock.now_ns() - self._node.next_deadline_ns()
             if late_ns >= 0:
@@ -252,7 +252,7 @@ class Heart:
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
 
-        In a flood of what is refused the heart leaves half of the time to others: it runs before all ordinary processes.
+        In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
         self._rests = self._node is not None and self._board is None and self._node.rests(now_ns)
@@ -261,27 +261,27 @@ class Heart:
             self._listens = listens
             self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
 
-    def _watch_lanes(self) -> None:
-        """Count how long the lanes say nothing.
+    def _watch_worker(self) -> None:
+        """Count how long the worker says nothing.
 
-        A turn of our own that took long proves nothing about them, and neither does a time in which the kernel kept them from
-        running: the ones in their place would say as little.
+        A turn of our own that took long proves nothing about it, and neither does a time in which the kernel kept it from
+        running: another one in its place would say as little.
         """
         now_ns = clock.now_ns()
-        self._lanes_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
+        self._worker_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
         self._turned_ns = now_ns
-        if self._lanes_unseen_ns < LANES_LOOK_NS:
+        if self._worker_unseen_ns < WORKER_LOOK_NS:
             return
-        before, self._lanes_turns = self._lanes_turns, starvation.look(self._lanes.pid)
-        self._lanes_silent_ns += starvation.had_ns(before, self._lanes_turns, self._lanes_unseen_ns)
-        self._lanes_unseen_ns = 0
-        if self._lanes_silent_ns > self._lanes_allowed_ns:
-            self._replace_lanes(f"it was silent for {self._lanes_silent_ns / NANOSECONDS_A_SECOND:.0f} s of processor time")
+        before, self._worker_turns = self._worker_turns, starvation.look(self._worker.pid)
+        self._worker_silent_ns += starvation.had_ns(before, self._worker_turns, self._worker_unseen_ns)
+        self._worker_unseen_ns = 0
+        if self._worker_silent_ns > self._worker_allowed_ns:
+            self._replace_worker(f"it was silent for {self._worker_silent_ns / NANOSECONDS_A_SECOND:.0f} s of processor time")
 
-    def _lanes_spoke(self, allowed_ns: int) -> None:
-        """Their silence counts from now on, and may last so long."""
-        self._lanes_silent_ns = self._lanes_unseen_ns = 0
-        self._lanes_turns, self._lanes_allowed_ns = None, allowed_ns
+    def _worker_spoke(self, allowed_ns: int) -> None:
+        """The worker's silence counts from now on, and may last so long."""
+        self._worker_silent_ns = self._worker_unseen_ns = 0
+        self._worker_turns, self._worker_allowed_ns = None, allowed_ns
 
     def _wakes_ns(self) -> int | None:
         """When the next turn is due, whatever comes; None while the node is not born yet."""
@@ -300,7 +300,7 @@ class Heart:
             ready = self._node.step(event, now_ns)
             self._obey(self._outbox.take(ready, now_ns))
             if ready.told:
-                self._scribe.note(ready.told)
+                self._event_log.note(ready.told)
 
     def _hear(self) -> None:
         self._read_ns = clock.now_ns()
@@ -331,7 +331,7 @@ class Heart:
             self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 
     def _came_ns(self, wall_ns: int) -> int:
-        """When a beat came that waited because this heart rests: its sender was not late. 0: now, or a stall of ours."""
+        """When a beat came that waited because this main loop rests: its sender was not late. 0: now, or a stall of ours."""
         if not self._rests or not wall_ns:
             return 0
         came_ns, now_ns = clock.of_wall_ns(wall_ns), clock.now_ns()
@@ -341,7 +341,7 @@ class Heart:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
         life = self._node.outlived_by(beat) if self._node is not None else 0
         if life:
-            told = (beat.sender, life, self._me, vote_record.FILE_NAME, self._ballot.record.boot, life + 1)
+            told = (beat.sender, life, self._me, vote_record.FILE_NAME, self._record_file.record.boot, life + 1)
             log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
@@ -368,22 +368,22 @@ class Heart:
         self._gaps += gap_us > GAP_BEATS * self._settings.config.beat_ms * 1_000
 
     def _note_persisted(self) -> None:
-        for number, ballot in self._persister.finished():
-            self._obey(self._outbox.kept(number, ballot, clock.now_ns()))
+        for number, durable in self._persister.finished():
+            self._obey(self._outbox.kept(number, durable, clock.now_ns()))
 
-    def _listen_to_lanes(self) -> None:
+    def _listen_to_worker(self) -> None:
         try:
-            for message in self._lanes.receive():
-                self._lanes_spoke(LANES_SILENCE_NS)
+            for message in self._worker.receive():
+                self._worker_spoke(WORKER_SILENCE_NS)
                 self._heed(message)
         except (ChannelClosedError, ChannelError) as error:
-            self._replace_lanes(str(error))
+            self._replace_worker(str(error))
 
-    def _heed(self, message: ToHeart) -> None:
+    def _heed(self, message: ToMainLoop) -> None:
         match message:
             case Happened():
                 event = messages.event_of(message)
-                self._lanes.answered(event)
+                self._worker.answered(event)
                 self._step(event)
             case Inventory():
                 self._take_inventory(message)
@@ -394,37 +394,37 @@ class Heart:
             case Alive():
                 pass
             case _:
-                self._lanes.send(self._told(message))
+                self._worker.send(self._told(message))
 
     def _take_inventory(self, inventory: Inventory) -> None:
-        """The node is born with what was found; a node that lives already is told what the old lanes took with them."""
-        self._lanes_deaths = 0
+        """The node is born with what was found; a node that lives already is told what the old worker took with it."""
+        self._worker_deaths = 0
         self._open_board()
         if self._node is not None:
-            for event in self._lanes.lost(inventory):
+            for event in self._worker.lost(inventory):
                 self._step(event)
             return
-        self._lanes.ready()
-        boot = self._ballot.record.boot
+        self._worker.ready()
+        boot = self._record_file.record.boot
         config = node_config(self._settings)
         durable = self._outbox.durable
         self._node = Node(config, boot, durable, clock.now_ns(), inventory.held, inventory.found)
         self._notifier.ready(STARTED)
         log.info("robot %s sends heartbeats, life %d", self._me, boot)
 
-    def _replace_lanes(self, why: str) -> None:
-        """Start another lanes process; one that never gets as far as an inventory is not tried for ever.
+    def _replace_worker(self, why: str) -> None:
+        """Start another worker; one that never gets as far as an inventory is not tried for ever.
 
         Raises:
-            AgentError: `LANES_TRIES` of them died at once.
+            AgentError: `WORKER_TRIES` of them died at once.
         """
-        self._lanes_deaths += 1
-        if self._lanes_deaths > LANES_TRIES:
-            raise AgentError(f"the worker process ended {LANES_TRIES} times at once ({why}); its last words stand above")
+        self._worker_deaths += 1
+        if self._worker_deaths > WORKER_TRIES:
+            raise AgentError(f"the worker process ended {WORKER_TRIES} times at once ({why}); its last words stand above")
         log.error("the worker process is gone (%s); guards and programs run on, and another worker starts", why)
-        self._poll.unregister(self._lanes.fileno())
-        self._lanes.replace()
-        self._expect_lanes()
+        self._poll.unregister(self._worker.fileno())
+        self._worker.replace()
+        self._expect_worker()
 
     # --- obligations out ---
 
@@ -468,9 +468,9 @@ class Heart:
         return placed
 
     def _act(self, act: Act) -> None:
-        self._lanes.order(act)
+        self._worker.order(act)
 
-    def _told(self, question: messages.Ask) -> ToLanes:
+    def _told(self, question: messages.Ask) -> ToWorker:
         now_ns = clock.now_ns()
         refused = Counter(self._refused)
         refused[str(Reason.NOT_OURS)] += self._beats.dropped()
@@ -488,11 +488,11 @@ class Heart:
         troubles = tuple(
             filter(
                 None,
-                (self._persister.trouble, self._scribe.trouble, *map(UNLIKE.format, sorted(self._unlike))),
+                (self._persister.trouble, self._event_log.trouble, *map(UNLIKE.format, sorted(self._unlike))),
             )
         )
         if question.what == "why":
-            return Told(question.number, now_ns, story=self._scribe.unwritten(), beats=counts, troubles=troubles)
+            return Told(question.number, now_ns, unwritten=self._event_log.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
 
@@ -502,11 +502,11 @@ class Heart:
         return dict(self._frames.assembly.dropped + left_out)
 
     def _end(self) -> None:
-        self._lanes.send(Farewell())
-        self._lanes.flush()
+        self._worker.send(Farewell())
+        self._worker.flush()
         self._persister.close(PERSIST_PATIENCE_S)
-        self._scribe.close(PERSIST_PATIENCE_S)
-        self._lanes.wait()
+        self._event_log.close(PERSIST_PATIENCE_S)
+        self._worker.wait()
         self._beats.close()
         self._close_board()
         self._alarm.close()
@@ -523,7 +523,7 @@ def arrived_ns(wall_ns: int) -> int:
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:
-    """Live one life, from the ballot to the farewell; and another, if the team remembers a later one than the ballot.
+    """Live one life, from the vote record to the farewell; and another, if the team remembers a later one than it does.
 
     Raises:
         AgentError: what is needed to begin cannot be had.
@@ -535,11 +535,8 @@ def beat(settings: Settings, notifier: Notifier) -> None:
         raise AgentError(
             f"cannot use the state directory {directory}: {error.strerror}; name another in state_directory"
         ) from error
-    ballot = vote_record.Ballot(directory, settings.config.robot)
-    ballot.open()
-    while remembered := Heart(settings, ballot, notifier).run():
-        ballot.outlive(remembered)
-        ballot.open()
-
-
-__all__ = ["Ballot", "Heart", "beat"]
+    record_file = vote_record.VoteRecordFile(directory, settings.config.robot)
+    record_file.open()
+    while remembered := MainLoop(settings, record_file, notifier).run():
+        record_file.outlive(remembered)
+        record_file.open()

@@ -56,61 +56,61 @@ _event_decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in EVENTS.
 
 
 class Order(msgspec.Struct, frozen=True, tag=True):
-    """Heart to lanes: an act of the core, to be carried out."""
+    """Main loop to worker: an act of the core, to be carried out."""
 
     kind: str
     body: bytes
 
 
 class Happened(msgspec.Struct, frozen=True, tag=True):
-    """Lanes to heart: an event for the core."""
+    """Worker to main loop: an event for the core."""
 
     kind: str
     body: bytes
 
 
 class Life(msgspec.Struct, frozen=True, tag=True):
-    """Heart to lanes, first of all: which life of the agent this is, and what the heart was refused."""
+    """Main loop to worker, first of all: which life of the agent this is, and what the main loop was refused."""
 
     boot: int
-    heart: int
+    main_loop: int
     notes: tuple[str, ...]
 
 
 class Inventory(msgspec.Struct, frozen=True, tag=True):
-    """Lanes to heart, first of all: what this robot's store holds and whose guards were found alive."""
+    """Worker to main loop, first of all: what this robot's store holds and whose guards were found alive."""
 
     held: tuple[Held, ...]
     found: tuple[Found, ...]
 
 
 class SpeakKey(msgspec.Struct, frozen=True, tag=True):
-    """Lanes to heart: the peer has been told this key; seal beats to it with it."""
+    """Worker to main loop: the peer has been told this key; seal beats to it with it."""
 
     peer: str
     key: bytes
 
 
 class Alive(msgspec.Struct, frozen=True, tag=True):
-    """Lanes to heart, from time to time: this process turns."""
+    """Worker to main loop, from time to time: this process turns."""
 
 
 class HearKey(msgspec.Struct, frozen=True, tag=True):
-    """Lanes to heart: the peer says that it seals its beats to us with this key."""
+    """Worker to main loop: the peer says that it seals its beats to us with this key."""
 
     peer: str
     key: bytes
 
 
 class Ask(msgspec.Struct, frozen=True, tag=True):
-    """Lanes to heart: show me the team, or tell me the story. Answer: `Told`."""
+    """Worker to main loop: show me the team, or the decisions that are not on the disk yet. Answer: `Told`."""
 
     number: int
     what: Literal["status", "why"]
 
 
 class BeatCounts(msgspec.Struct, frozen=True):
-    """What the beat lane has seen.
+    """What the heartbeats' sockets have seen.
 
     Attributes:
         refused: frames not believed, by reason.
@@ -133,27 +133,27 @@ class BeatCounts(msgspec.Struct, frozen=True):
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):
-    """Heart to lanes: the answer to `Ask`.
+    """Main loop to worker: the answer to `Ask`.
 
     Attributes:
-        story: lines that are not on the disk yet; what is kept there the lanes read themselves.
-        troubles: sentences: why a ballot, or the story, cannot be written.
+        unwritten: lines of the event log that are not on the disk yet; the worker reads the others itself.
+        troubles: sentences: why a vote record, or the event log, cannot be written.
     """
 
     number: int
     now_ns: int
     status: StatusView | None = None
-    story: tuple[Line, ...] = ()
+    unwritten: tuple[Line, ...] = ()
     beats: BeatCounts = BeatCounts()
     troubles: tuple[str, ...] = ()
 
 
 class Farewell(msgspec.Struct, frozen=True, tag=True):
-    """Heart to lanes: the agent ends; components live on."""
+    """Main loop to worker: the agent ends; components live on."""
 
 
-ToLanes = Order | Life | Told | Farewell
-ToHeart = Happened | Inventory | SpeakKey | HearKey | Alive | Ask
+ToWorker = Order | Life | Told | Farewell
+ToMainLoop = Happened | Inventory | SpeakKey | HearKey | Alive | Ask
 
 
 def order(act: Act) -> Order:
@@ -170,7 +170,7 @@ def act_of(message: Order) -> Act:
     """The act inside.
 
     Raises:
-        AgentError: there is none; heart and lanes are of different versions.
+        AgentError: there is none; main loop and worker are of different versions.
     """
     return _unpacked(_act_decoders, message)  # type: ignore[no-any-return]
 

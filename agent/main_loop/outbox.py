@@ -15,18 +15,18 @@ import msgspec
 from msgspec import Struct, field
 
 from failover.core.acts import Act, Ready, SetLease
-from failover.core.types import Ballot
+from failover.core.types import VoteRecord
 from failover.core.wire.messages import Beat
 
 
 class Due(Struct, frozen=True):
-    """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the lanes.
+    """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the worker.
 
     Attributes:
-        persist: (number, ballot); `Outbox.kept` is told the number once it is durable.
+        persist: (number, vote record); `Outbox.kept` is told the number once it is durable.
     """
 
-    persist: tuple[int, Ballot] | None = None
+    persist: tuple[int, VoteRecord] | None = None
     beats: tuple[Beat, ...] = ()
     acts: tuple[Act, ...] = ()
 
@@ -35,15 +35,15 @@ class Outbox(Struct):
     """The obligations of one node.
 
     Attributes:
-        durable: the ballot that is on the disk.
+        durable: the vote record that is on the disk.
         beat_ns: period after which a beat is due whatever happens.
 
-    Invariant: acts leave in the order in which they were ordered, each after every ballot ordered before it.
+    Invariant: acts leave in the order in which they were ordered, each after every vote record ordered before it.
     """
 
-    durable: Ballot
+    durable: VoteRecord
     beat_ns: int
-    _newest: Ballot | None = None
+    _newest: VoteRecord | None = None
     _ordered: int = 0
     _kept: int = 0
     _acts: deque[tuple[int, Act]] = field(default_factory=deque)
@@ -53,7 +53,7 @@ class Outbox(Struct):
 
     @property
     def waiting(self) -> bool:
-        """Whether a ballot is on its way to the disk."""
+        """Whether a vote record is on its way to the disk."""
         return self._kept < self._ordered
 
     def take(self, ready: Ready, now_ns: int) -> Due:
@@ -67,9 +67,9 @@ class Outbox(Struct):
             self._queue(act)
         return Due(persist, self._beats(ready.send, now_ns), self._free_acts())
 
-    def kept(self, number: int, ballot: Ballot, now_ns: int) -> Due:
-        """The ballot of that number, and so every earlier one, is durable."""
-        self._kept, self.durable = max(self._kept, number), ballot
+    def kept(self, number: int, vote_record: VoteRecord, now_ns: int) -> Due:
+        """The vote record of that number, and so every earlier one, is durable."""
+        self._kept, self.durable = max(self._kept, number), vote_record
         beat = self._withheld
         if self.waiting or beat is None:
             return Due(acts=self._free_acts())
@@ -109,8 +109,8 @@ class Outbox(Struct):
         return tuple(free)
 
 
-def abandoned(durable: Ballot, newest: Ballot) -> frozenset[str]:
-    """Robots whose primacy of some component is accepted by the one ballot and not, or not in the same epoch, by the other."""
+def abandoned(durable: VoteRecord, newest: VoteRecord) -> frozenset[str]:
+    """Robots whose primacy of some component one vote record accepts and the other does not, or not in the same epoch."""
     now = {record.name: record for record in newest.records}
     return frozenset(
         record.primary

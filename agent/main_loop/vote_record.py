@@ -21,7 +21,7 @@ from agent.errors import BallotError
 FILE_NAME: Final = "ballot"
 RESERVE_NAME: Final = "ballot.reserve"
 RESERVE_SIZE: Final = 64 << 10
-"""Bytes kept for the ballot of a full disk: a vote needs a few hundred, and a takeover cannot wait for an administrator."""
+"""Bytes kept for the vote record of a full disk: a vote needs a few hundred, and a takeover cannot wait for an administrator."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 VERSION: Final = 1
 SIZE_LIMIT: Final = 4 << 20
@@ -42,7 +42,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     core: bytes = b""
 
 
-class Ballot:
+class VoteRecordFile:
     """The file of one robot. One thread at a time."""
 
     def __init__(self, directory: Path, robot: str) -> None:

@@ -17,17 +17,17 @@ from typing import Final
 from agent.config import Settings
 from agent.errors import AgentError
 from agent.main_loop import messages
-from agent.main_loop.messages import Inventory, ToHeart, ToLanes
+from agent.main_loop.messages import Inventory, ToMainLoop, ToWorker
 from checkpoint.keeper.messages import Channel, ChannelError, pair
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.events import Event
 
 WAITING_LIMIT: Final = 4_096
-"""Messages that wait for a lanes process which does not read; beyond it, it is hung and is replaced."""
+"""Messages that wait for a worker which does not read; beyond it, it is hung and is replaced."""
 
 MESSAGES_A_TURN: Final = 64
-"""Taken from the lanes in one turn of the heart."""
+"""Taken from the worker in one turn of the main loop."""
 
 END_PATIENCE_S: Final = 5.0
 
@@ -36,13 +36,13 @@ LOST: Final = "the agent's worker process restarted in the middle of it"
 log = logging.getLogger("failover.heart")
 
 vars(subprocess)["_USE_VFORK"] = False
-"""Of the whole heart, which would stand still until the child, at ordinary priority, has had a processor.
+"""Of the whole main loop, which would stand still until the child, at ordinary priority, has had a processor.
 
 Source: the documentation of subprocess.
 """
 
 
-class LanesProcess:
+class WorkerProcess:
     """One child process after another, and what the core still expects of it."""
 
     def __init__(self, settings: Settings) -> None:
@@ -52,9 +52,9 @@ class LanesProcess:
         self._wanted = self._begun = 0
         self._is_doomed = False
         self._successor = threading.Thread(target=self._succeed, name="successor", daemon=True)
-        self._successor.start()  # now, while nobody minds: a heart would wait for the birth of a thread at ordinary priority
-        self._channel: Channel[ToHeart] | None = None
-        self._waiting: deque[ToLanes] = deque()
+        self._successor.start()  # now: later the main loop would wait for the birth of a thread at ordinary priority
+        self._channel: Channel[ToMainLoop] | None = None
+        self._waiting: deque[ToWorker] = deque()
         self._expected: dict[tuple[str, str], Act] = {}
         self._admitted: dict[str, acts.Admit] = {}
         self._warm: dict[str, acts.Warm] = {}
@@ -89,7 +89,7 @@ class LanesProcess:
             self._channel.close()
         ours, theirs = pair()
         ours.setblocking(False)
-        self._channel = Channel(ours, ToHeart)
+        self._channel = Channel(ours, ToMainLoop)
         self._waiting.clear()
         self._ready = False
         return theirs
@@ -122,7 +122,7 @@ class LanesProcess:
                 command,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
-                process_group=0,  # a Ctrl-C at the terminal is the heart's to act on
+                process_group=0,  # a Ctrl-C at the terminal is the main loop's to act on
             )
         except OSError as error:
             raise AgentError(
@@ -136,7 +136,7 @@ class LanesProcess:
         assert self._channel is not None, "start comes first"
         return self._channel.fileno()
 
-    def send(self, message: ToLanes) -> None:
+    def send(self, message: ToWorker) -> None:
         """Queue a message; it leaves in `flush`, as soon as the process reads."""
         if len(self._waiting) >= WAITING_LIMIT:
             log.error("the worker process does not read; the main loop ends it")
@@ -186,7 +186,7 @@ class LanesProcess:
                 return  # full: the next turn; closed: `receive` says so
             self._waiting.popleft()
 
-    def receive(self) -> Iterator[ToHeart]:
+    def receive(self) -> Iterator[ToMainLoop]:
         """What has come, without waiting.
 
         Raises:

@@ -17,12 +17,12 @@ from agent.system import syscalls
 
 BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
-HEART_PRIORITY: Final = 60
-"""SCHED_FIFO priority of the heart: just above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
+MAIN_LOOP_PRIORITY: Final = 60
+"""SCHED_FIFO priority of the main loop: above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
 
 
 class Laps(Struct):
-    """How long each stage of something took: for the log, and for whoever wants to shorten it."""
+    """How long each stage of something took: for the log, and for an engineer who wants to shorten it."""
 
     last_ns: int = field(default_factory=time.monotonic_ns)
     stages: list[tuple[str, int]] = field(default_factory=list)
@@ -48,7 +48,7 @@ def wall_ns(instant_ns: int) -> int:
 
 
 def of_wall_ns(wall_ns: int) -> int:
-    """An instant of this machine's calendar by our clock; only for one so young that nobody can have set the calendar since.
+    """An instant of this machine's calendar by our clock; only for one so young that the calendar cannot have been set since.
 
     It is never told too early, and by at most as much too late as passes between two readings of a clock.
     """
@@ -71,10 +71,10 @@ def become_realtime() -> tuple[str, ...]:
     """
     notes: list[str] = []
     try:
-        if (priority := syscalls.become_realtime(HEART_PRIORITY)) < HEART_PRIORITY:
+        if (priority := syscalls.become_realtime(MAIN_LOOP_PRIORITY)) < MAIN_LOOP_PRIORITY:
             notes.append(
                 f"beats run at real-time priority {priority}: what has a higher one may delay them; "
-                f"allow {HEART_PRIORITY} (LimitRTPRIO, ulimit -r)"
+                f"allow {MAIN_LOOP_PRIORITY} (LimitRTPRIO, ulimit -r)"
             )
     except OSError as error:
         notes.append(

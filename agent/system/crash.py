@@ -8,12 +8,12 @@ import os
 from typing import Any, Final
 
 STATUS: Final = 70
-"""Exit status of the lanes after a mistake: EX_SOFTWARE of sysexits.h."""
+"""Exit status of the worker after a mistake: EX_SOFTWARE of sysexits.h."""
 
 log = logging.getLogger("failover.lanes")
 
 
-def end_lanes_on_mistake(task: asyncio.Task[Any]) -> None:
+def end_worker_on_mistake(task: asyncio.Task[Any]) -> None:
     """For a task that has ended: if it was by a mistake of ours, end the process. Components live on."""
     if task.cancelled() or task.exception() is None:
         return

@@ -26,7 +26,7 @@ from checkpoint.linux.spawn.inherited_limits import Inheritance
 
 SO_PEERGROUPS: Final = 59
 GROUPS_SIZE_MAX: Final = 1_024
-"""Bytes: what `socket.getsockopt` takes; somebody in more than 256 groups gets those that the system's lists name."""
+"""Bytes: what `socket.getsockopt` takes; a user in more than 256 groups gets those that the system's lists name."""
 
 SCHED_DEADLINE: Final = 6
 """Needs more than a priority to be set, and no child inherits it."""
@@ -36,7 +36,7 @@ NOBODY: Final = -1
 """For what a robot asks another one by itself: it may be told how things stand, and no more."""
 
 SAID: Final = "; it said: "
-"""Begins, at the end of a sentence of status or story, what a program wrote last."""
+"""Begins, at the end of a sentence of the status or the event log, what a program wrote last."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 
@@ -57,10 +57,10 @@ class Caller(Struct, frozen=True):
 
 
 def may(uid: int, owner: int | None) -> bool:
-    """The rule: root and the agent's own user may do everything, everybody else what concerns his own components.
+    """The rule: root and the agent's own user may do everything, another user what concerns his own components.
 
     Args:
-        owner: whose the component is; None: nobody knows.
+        owner: whose the component is; None: it is not known.
     """
     return uid in (ROOT, os.geteuid()) or uid == owner
 
@@ -74,7 +74,7 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
     """Let a user act on a component.
 
     Raises:
-        RefusedError: it is somebody else's.
+        RefusedError: it is another user's.
     """
     if not may(uid, owner):
         whose = f"belongs to uid {owner}" if owner is not None else "has no owner on record at this robot"
@@ -82,7 +82,7 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
 
 
 def without_output(told: Any) -> Any:
-    """The same without what programs said, in all of its sentences: for somebody who may not read their output."""
+    """The same without what programs said, in all of its sentences: for a user who may not read their output."""
     if isinstance(told, str):
         sentence, said, _ = told.partition(SAID)
         return f"{sentence}; only its owner and root may read what it said" if said else told
@@ -125,7 +125,7 @@ def inheritance_for(caller: Caller, user: str) -> Inheritance:
 
 
 def guest_of(pid: int, caller: Caller) -> Guest:
-    """A running process that somebody wants protected, held by a pidfd: what is asked of it later is asked of the same one.
+    """A running process that a user wants protected, held by a pidfd: what is asked of it later is asked of the same one.
 
     A process that the system keeps from its own user (a set-user-id program, one that is not dumpable) is root's.
     Its rights are those that it has now; they bound each capture (`agent.worker.components.restore_limits`), for it may execute
@@ -166,7 +166,7 @@ def _check_own(pid: int, caller: Caller, uids: set[int], gids: set[int]) -> None
 
 
 def _as_user(caller: Caller, name: str) -> Inheritance:
-    """What a program inherits that is to run as somebody else."""
+    """What a program inherits that is to run as another user."""
     if caller.uid != ROOT:
         raise RefusedError(f"only root may choose a user; uid {caller.uid} runs programs as itself", "PermissionError")
     try:
@@ -177,7 +177,7 @@ def _as_user(caller: Caller, name: str) -> Inheritance:
 
 
 def _seen(pid: int, uid: int) -> Inheritance | None:
-    """What the client's children would inherit; None where it cannot be seen, or is somebody else by now."""
+    """What the client's children would inherit; None where it cannot be seen, or has another user by now."""
     try:
         pidfd = os.pidfd_open(pid)
     except (OSError, ValueError):

@@ -39,8 +39,8 @@ limit, for what comes after it begins then: asked to end first, it could go on f
 def starter() -> str:
     """The command that asks systemd for a transient service; "" where systemd did not start our parent, or does not obey us.
 
-    Called by the lanes, whose parent is the service's main process. An agent that is merely a descendant of some service (of a CI
-    runner, of a desktop's terminal) may live in namespaces where systemd's services are strangers.
+    Called by the worker, whose parent is the service's main process. An agent that is merely a descendant of some service (of a
+    CI runner, of a desktop's terminal) may live in namespaces where systemd's services are strangers.
     """
     if os.geteuid() != 0 or os.environ.get(STARTED) != str(os.getppid()) or not os.path.isdir("/run/systemd/system"):
         return ""
@@ -63,7 +63,7 @@ def in_a_unit(program: str, kind: Kind, name: str) -> list[str]:
 
 def own_service(cgroups: str) -> str:
     """The systemd service that a process belongs to, by its /proc/PID/cgroup; "" if none."""
-    for line in filter(None, cgroups.split("\n")):  # whoever names a group may have others in it
+    for line in filter(None, cgroups.split("\n")):  # a group that a user named may hold other processes
         controllers, path = line.split(":", 2)[1:]
         if controllers in ("", "name=systemd"):
             units = [part for part in path.split("/") if part.endswith(".service")]

@@ -23,12 +23,12 @@ from agent import config as configuration
 from agent.config import Settings
 from agent.errors import AgentError, LaneError
 from agent.main_loop import messages
-from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, ToLanes, Told
+from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, Told, ToWorker
 from agent.system import syscalls
 from agent.system.log_setup import set_up_log
 from agent.worker.control.queries import QUESTIONS, Questions
 from agent.worker.control.server import ControlServer
-from agent.worker.network.connections import BULK, Ways
+from agent.worker.network.connections import BULK, AllConnections
 from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Links
 from agent.worker.network.remote_orders import Errands
@@ -43,7 +43,7 @@ from failover.core.frames.frame import KEY_SIZE_MIN
 from failover.core.wire.messages import VERSION, Bulk, Errand, ErrandDone, Goodbye, Hello
 
 ALIVE_S: Final = 0.5
-"""Between two signs of life to the heart."""
+"""Between two signs of life to the main loop."""
 
 ANSWER_PATIENCE_S: Final = 60.0
 """How long an operator's command may take; a handover's own limit in the core is shorter."""
@@ -73,12 +73,12 @@ class Switchboard:
 
     verbs: Questions
 
-    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
+    def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         self.settings = settings
         config = settings.config
         self._runtime = Path(config.runtime_directory)
-        self._heart = heart
-        self._outgoing: asyncio.Queue[messages.ToHeart] = asyncio.Queue()
+        self._main_loop = main_loop
+        self._outgoing: asyncio.Queue[messages.ToMainLoop] = asyncio.Queue()
         self._numbers = itertools.count(1)
         self._questions: dict[int, asyncio.Future[Told]] = {}
         self._commands: dict[int, asyncio.Future[acts.Answer]] = {}
@@ -97,19 +97,19 @@ class Switchboard:
         facts = Facts(frozenset(config.wireless))
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
         self._wires = Wires(self._links, self._links_changed)
-        self._ways = Ways(settings, keys, self._hear, self._way_changed, self._links, self._unread)
-        self._lane = self._ways.bulk
+        self._connections = AllConnections(settings, keys, self._hear, self._way_changed, self._links, self._unread)
+        self._replication_link = self._connections.bulk
 
     def connect(self, verbs: Questions) -> None:
         """Have the orders of people and robots carried out by these."""
         self.verbs = verbs
-        self.errands = Errands(self._ways.say, self.hindrance, verbs.errands())
+        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands())
 
     # --- what builds on it ---
 
     @abstractmethod
     async def prepare(self) -> messages.Inventory:
-        """Have ready whatever is needed before anything can be asked; what the heart must know of it."""
+        """Have ready whatever is needed before anything can be asked; what the main loop must know of it."""
 
     @abstractmethod
     def obeys(self, act: acts.Act) -> None:
@@ -120,59 +120,59 @@ class Switchboard:
         """What ``status`` shows."""
 
     async def stop_work(self) -> None:
-        """Give up what is under way, while the lanes still stand."""
+        """Give up what is under way, while the connections still stand."""
 
     async def close(self) -> None:
-        """Give back what is left, when nobody can ask for anything any more."""
+        """Give back what is left, when no client can ask for anything any more."""
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """A word about a snapshot on the bulk lane."""
+        """A word about a snapshot on the replication link."""
 
-    def lane_lost(self, peer: str) -> None:
+    def link_lost(self, peer: str) -> None:
         """The bulk lane to a peer is gone, and every transfer on it."""
 
-    def lane_is_new(self, peer: str) -> None:
-        """A peer greets on a new bulk lane."""
+    def link_is_new(self, peer: str) -> None:
+        """A peer greets on a new replication link."""
 
     async def run(self) -> None:
-        """From the heart's first word to its last.
+        """From the main loop's first word to its last.
 
         Raises:
             AgentError, CheckpointError: something needed to begin cannot be had.
         """
         loop = asyncio.get_running_loop()
         make_directory(self._runtime)
-        loop.add_reader(self._heart.fileno(), self._listen_to_heart)
-        speaking = asyncio.create_task(self._speak_to_heart())
+        loop.add_reader(self._main_loop.fileno(), self._listen_to_main_loop)
+        speaking = asyncio.create_task(self._speak_to_main_loop())
         living = asyncio.create_task(self._show_life())
         self._life = await self._begun
         self._say(await self.prepare())
         self._wires.watch()
-        self._ways.open()
+        self._connections.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.table())
         await server.open()
         syscalls.give_back()  # what the start has left
         try:
             await self._end.wait()
         finally:
-            loop.remove_reader(self._heart.fileno())
+            loop.remove_reader(self._main_loop.fileno())
             await server.close()
             self._wires.close()
             await self.errands.close()
             await self.stop_work()
-            await self._ways.close()
+            await self._connections.close()
             await self.close()
             speaking.cancel()
             living.cancel()
 
-    # --- the heart ---
+    # --- the main loop ---
 
     def tell(self, event: Event) -> None:
         """Pass an event to the core."""
         self._say(messages.happened(event))
 
     async def ask(self, what: Literal["status", "why"]) -> Told:
-        """Ask the heart for the core's view, or for what it has not written down yet."""
+        """Ask the main loop for the core's view, or for what it has not written down yet."""
         number = next(self._numbers)
         answer: asyncio.Future[Told] = asyncio.get_running_loop().create_future()
         self._questions[number] = answer
@@ -197,7 +197,7 @@ class Switchboard:
         finally:
             self._commands.pop(number, None)
 
-    def _say(self, message: messages.ToHeart) -> None:
+    def _say(self, message: messages.ToMainLoop) -> None:
         self._outgoing.put_nowait(message)
 
     async def _show_life(self) -> None:
@@ -205,35 +205,35 @@ class Switchboard:
             self._say(Alive())
             await asyncio.sleep(ALIVE_S)
 
-    async def _speak_to_heart(self) -> None:
+    async def _speak_to_main_loop(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
             message = await self._outgoing.get()
             while True:
                 try:
-                    self._heart.send(message)
+                    self._main_loop.send(message)
                     break
                 except ChannelClosedError:
                     self._end.set()
                     return
                 except ChannelError:
                     writable = asyncio.Event()
-                    loop.add_writer(self._heart.fileno(), writable.set)
+                    loop.add_writer(self._main_loop.fileno(), writable.set)
                     await writable.wait()
-                    loop.remove_writer(self._heart.fileno())
+                    loop.remove_writer(self._main_loop.fileno())
 
-    def _listen_to_heart(self) -> None:
+    def _listen_to_main_loop(self) -> None:
         try:
             for _ in range(MESSAGES_A_TURN):
-                message, _descriptors = self._heart.receive()
+                message, _descriptors = self._main_loop.receive()
                 self._heed(message)
         except BlockingIOError:
             return
         except ChannelError:
-            asyncio.get_running_loop().remove_reader(self._heart.fileno())
+            asyncio.get_running_loop().remove_reader(self._main_loop.fileno())
             self._end.set()
 
-    def _heed(self, message: ToLanes) -> None:
+    def _heed(self, message: ToWorker) -> None:
         match message:
             case Order():
                 self.obeys(messages.act_of(message))
@@ -253,21 +253,21 @@ class Switchboard:
 
     def _way_changed(self, way: int, peer: str, state: LinkState, reason: str) -> None:
         """A connection stands: introduce ourselves. It is gone: so is every transfer on it, and every word that took it."""
-        lane = "replication link" if way == BULK else f"link {way}"
-        log.info("%s to %s: %s%s", lane, peer, state, f": {reason}" if reason else "")
-        had_words = self._ways.carried_words(way, peer, state)
+        link = "replication link" if way == BULK else f"link {way}"
+        log.info("%s to %s: %s%s", link, peer, state, f": {reason}" if reason else "")
+        had_words = self._connections.carried_words(way, peer, state)
         if state is LinkState.CONNECTED:
-            key = self._ways.beat_key(peer)
+            key = self._connections.beat_key(peer)
             self._greet(way, peer, key)
             self._say(SpeakKey(peer, key))
             return
         if way == BULK:
-            self.lane_lost(peer)
+            self.link_lost(peer)
         if had_words:
             self.errands.lost(peer)
 
     def _unread(self, peer: str, why: str) -> None:
-        """Something came from a peer, or from nobody known (""), that does not prove whose it is."""
+        """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""
         now_s = asyncio.get_running_loop().time()
         sign = (peer, why if peer else "")
         if len(self._signs) > SIGNS_MAX:
@@ -281,25 +281,27 @@ class Switchboard:
             log.info("%s", sentence)
             self.tell(events.Noticed("", sentence))
         try:
-            await self._lane.hold_to_devices()
+            await self._replication_link.hold_to_devices()
         except LaneError as error:
             log.critical("%s; the worker process starts anew", error)
             self._end.set()
 
     def hindrance(self, peer: str) -> str:
         """Why nothing can be said to a peer now; "" when it can."""
-        return self._ways.hindrance(peer)
+        return self._connections.hindrance(peer)
 
     def _hear(self, way: int, peer: str, message: Bulk) -> None:
         match message:
             case Hello():
                 self._greeted(way, peer, message)
             case Goodbye(reason):
-                self._ways.refuse(way, peer, reason)
+                self._connections.refuse(way, peer, reason)
             case _ if peer in self._incompatible:
                 return
             case Errand(verb=verb) if verb not in QUESTIONS and self.votes_only(peer):
-                self._ways.say(peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders"))
+                self._connections.say(
+                    peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders")
+                )
             case Errand():
                 self.errands.received(peer, message)
             case ErrandDone():
@@ -316,22 +318,22 @@ class Switchboard:
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
         if way == BULK and not hello.again:
-            self.lane_is_new(peer)  # a new connection: what was half here stays half
+            self.link_is_new(peer)  # a new connection: what was half here stays half
         if reason:
             self._incompatible[peer] = reason
             self._unread(peer, reason)
-            self._ways.answer(way, peer, Goodbye(reason))
+            self._connections.answer(way, peer, Goodbye(reason))
             log.warning("%s", reason)
             return
         self._incompatible.pop(peer, None)
         self._say(HearKey(peer, hello.beat_key))
-        if self._ways.is_new_key(way, peer, hello.beat_key) and self._ways.present_key(peer):
-            # Whoever lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
-            self._greet(way, peer, self._ways.present_key(peer), again=True)
+        if self._connections.is_new_key(way, peer, hello.beat_key) and self._connections.present_key(peer):
+            # A robot that lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
+            self._greet(way, peer, self._connections.present_key(peer), again=True)
 
     def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
         config = self.settings.config
-        self._ways.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
+        self._connections.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
 
     def votes_only(self, peer: str) -> bool:
         """Whether nothing that this peer says may start, end or overwrite anything."""
@@ -342,8 +344,8 @@ class Switchboard:
         return [
             *self._own_troubles,
             *self._incompatible.values(),
-            *self._lane.troubles(),
-            *self._ways.troubles,
+            *self._replication_link.troubles(),
+            *self._connections.troubles,
             *self._links.notes(),
         ]
 
@@ -369,8 +371,8 @@ def _resolve(waiting: dict[int, asyncio.Future[Any]], number: int, answer: Any) 
         future.set_result(answer)
 
 
-def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
-    """Be the other process of the heart that started us with CONFIG and DESCRIPTOR; its signals are its own."""
+def live(kind: Callable[[Settings, Channel[ToWorker]], Switchboard]) -> int:
+    """Be the other process of the main loop that started us with CONFIG and DESCRIPTOR; its signals are its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     allocator.be_frugal()
@@ -386,7 +388,7 @@ def live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard]) -> int:
     return 0
 
 
-async def _live(kind: Callable[[Settings, Channel[ToLanes]], Switchboard], settings: Settings, descriptor: int) -> None:
+async def _live(kind: Callable[[Settings, Channel[ToWorker]], Switchboard], settings: Settings, descriptor: int) -> None:
     end = socket.socket(fileno=descriptor)
     end.setblocking(False)
-    await kind(settings, Channel(end, ToLanes)).run()
+    await kind(settings, Channel(end, ToWorker)).run()

@@ -18,21 +18,20 @@ from typing import Any, Final
 from agent.config import Settings
 from agent.core_config import retention
 from agent.errors import TROUBLE, AgentError, GuardLostError, LaneError
-from agent.main_loop.messages import Inventory, ToLanes, Told
-from agent.system.crash import end_lanes_on_mistake
+from agent.main_loop.messages import Inventory, Told, ToWorker
+from agent.system.crash import end_worker_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
-from agent.worker import board_directory
 from agent.worker.components import launch, prerequisites
 from agent.worker.components.context import Surroundings
 from agent.worker.components.hooks import Hooks
 from agent.worker.components.paths import Places, guard_sockets
-from agent.worker.components.process_pool import Nursery
+from agent.worker.components.process_pool import ProcessPool
 from agent.worker.components.run_records import Records
 from agent.worker.components.snapshots import newest_of
 from agent.worker.components.statistics import Memory
-from agent.worker.components.supervisor import Charge
-from agent.worker.control.status_view import team_view
+from agent.worker.components.supervisor import Supervisor
+from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.control.verbs import Verbs
 from agent.worker.hub import Switchboard, live, make_directory
 from agent.worker.replication.receive_files import Limits, Stock
@@ -51,6 +50,7 @@ from checkpoint.snapshot.required_files import Need, names_of_contents, needs
 from checkpoint.store.content_store import FOLDER as CONTENTS_FOLDER
 from checkpoint.store.store import Store, open_store
 from checkpoint.store.xor_cache_budget import PageBudget
+from failover.boards import LINK_NAME
 from failover.config.quantities import size_bytes
 from failover.core import acts, events
 from failover.core.types import HISTORY_MAX, Found, Held
@@ -59,7 +59,7 @@ from failover.errors import FailoverError
 
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
-"""Between two looks for brought files that nobody needs any more."""
+"""Between two looks for brought files that no snapshot needs any more."""
 
 GIVE_BACK_S: Final = 20.0
 """Between two times that free memory goes back to the kernel: a few milliseconds in a thread of its own."""
@@ -77,25 +77,25 @@ STORE_PAUSE_S: Final = 0.1
 log = logging.getLogger("failover.lanes")
 
 
-class Lanes(Switchboard):
+class Worker(Switchboard):
     """One life of the process."""
 
-    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
-        super().__init__(settings, heart)
-        self.charges: dict[str, Charge] = {}
+    def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
+        super().__init__(settings, main_loop)
+        self.supervisors: dict[str, Supervisor] = {}
         self._inquiries: set[str] = set()
         config = settings.config
         state, runtime = Path(config.state_directory), Path(config.runtime_directory)
         self._store_path = state / "store"
         sockets = runtime / "guards"
         self._starter = starter()
-        self._nursery = Nursery(sockets, self._starter)
+        self._process_pool = ProcessPool(sockets, self._starter)
         contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
         self._alive = LastAlive.found(state / "last_alive")
         self.places = Places(
-            sockets, state / "logs", self._nursery, "", config.robot, contents, PageBudget(config.xor_cache_size)
+            sockets, state / "logs", self._process_pool, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
-        self._shipper = Shipper(self._lane, config.link_mbit_s * BYTES_A_MEGABIT)
+        self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self))
 
     async def prepare(self) -> Inventory:
@@ -110,13 +110,13 @@ class Lanes(Switchboard):
         settled = self._deposit.settled
         self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks, self._alive)
         self._sources = Sources(store, self._from_program)
-        self._bringing = Bringing(self._shipper, self._lane.say, self._sources.open, self._note_bringing)
+        self._bringing = Bringing(self._shipper, self._replication_link.say, self._sources.open, self._note_bringing)
         self._dispatch = Dispatch(
             store, self._shipper, self.tell, self._links.hindrance, self._bringing, lambda name: here(name).bring_data
         )
-        self._receiver = Receiver(self._lane, self._store_path, self._deposit)
+        self._receiver = Receiver(self._replication_link, self._store_path, self._deposit)
         self._stock = Stock(store, self._limits(), self.settings.config.robot, self._deposit.hindrance)
-        self._contents = Receiver(self._lane, self._store_path, self._stock)
+        self._contents = Receiver(self._replication_link, self._store_path, self._stock)
         self._tasks: set[asyncio.Task[None]] = set()
         self._new_here = asyncio.Event()
         self._task(self._tidy_contents())
@@ -129,10 +129,14 @@ class Lanes(Switchboard):
         found = await self._find_guards(records)
         await self._mend_logs(found)
         if found:
-            self._nursery.begin()
+            self._process_pool.begin()
         return Inventory(_held(store), found)
 
     async def _provide_board(self) -> None:
+        if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):
+            return
+        from agent.worker import board_directory  # here: a team without a board does not load it
+
         try:
             place = await asyncio.to_thread(board_directory.provide, self.settings)
         except (AgentError, FailoverError, OSError) as error:
@@ -145,7 +149,7 @@ class Lanes(Switchboard):
     async def _give_signs(self) -> None:
         """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""
         while True:
-            if any(one.component is not None or one.figures.spec is not None for one in self.charges.values()):
+            if any(one.component is not None or one.figures.spec is not None for one in self.supervisors.values()):
                 await asyncio.to_thread(self._alive.sign)
             await asyncio.sleep(SIGN_S)
 
@@ -156,11 +160,11 @@ class Lanes(Switchboard):
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._dispatch.close()
         await self._bringing.close()
-        await asyncio.gather(*(charge.close() for charge in self.charges.values()))
+        await asyncio.gather(*(supervisor.close() for supervisor in self.supervisors.values()))
 
     async def close(self) -> None:
         """Let another life have the store."""
-        await self._nursery.close()
+        await self._process_pool.close()
         self._store.close()
 
     async def _open_store(self) -> Store:
@@ -194,17 +198,17 @@ class Lanes(Switchboard):
             case acts.Inquire():
                 self._task(self._inquire(act))
             case _:
-                self.charge(act.component).order(act)
+                self.supervisor(act.component).order(act)
 
-    def charge(self, name: str) -> Charge:
+    def supervisor(self, name: str) -> Supervisor:
         """The component of that name, known or new."""
-        if name not in self.charges:
-            self.charges[name] = Charge(name, self._around)
-            self.charges[name].begin()
-        return self.charges[name]
+        if name not in self.supervisors:
+            self.supervisors[name] = Supervisor(name, self._around)
+            self.supervisors[name].begin()
+        return self.supervisors[name]
 
     async def _find_guards(self, records: Records) -> tuple[Found, ...]:
-        """Take the guards that outlived the last agent into charge."""
+        """Find the guards that outlived the last agent, and supervise their components."""
         found = []
         for path in guard_sockets(self.places):
             try:
@@ -215,7 +219,7 @@ class Lanes(Switchboard):
                 continue
             epoch = records.epoch(component.name)
             component.keeper.names = self._names_of_brought(component.name)
-            self.charge(component.name).adopt(component, epoch)
+            self.supervisor(component.name).adopt(component, epoch)
             running = standing.state in ("running", "frozen")
             found.append(Found(component.name, epoch, running, standing.exit_status or 0))
             log.info("%s: found again, pid %d, %s", component.name, component.pid, standing.state)
@@ -233,12 +237,16 @@ class Lanes(Switchboard):
             log.warning("the output of earlier checkpoints is not complete here: %s", error)
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """A word about a snapshot on the bulk lane."""
+        """A word about a snapshot on the replication link."""
         match message:
             case Offer() if self.votes_only(peer):
-                self._lane.say(peer, Refuse(message.transfer, f"{peer} is a witness: it votes, and keeps no snapshots"))
+                self._replication_link.say(
+                    peer, Refuse(message.transfer, f"{peer} is a witness: it votes, and keeps no snapshots")
+                )
             case Offer() if hindrance := self._links.hindrance():
-                self._lane.say(peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}"))
+                self._replication_link.say(
+                    peer, Refuse(message.transfer, f"snapshots wait: at {self.settings.config.robot} {hindrance}")
+                )
             case Offer():
                 self._receiver.offered(peer, message)
             case Belongings() | Content() if self.votes_only(peer):
@@ -258,13 +266,13 @@ class Lanes(Switchboard):
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
 
-    def lane_lost(self, peer: str) -> None:
+    def link_lost(self, peer: str) -> None:
         """The bulk lane to a peer is gone, and every transfer on it."""
         self._shipper.lost(peer)
         self._bringing.lost(peer)
 
-    def lane_is_new(self, peer: str) -> None:
-        """A peer greets on a new bulk lane: what was half here stays half."""
+    def link_is_new(self, peer: str) -> None:
+        """A peer greets on a new replication link: what was half here stays half."""
         self._receiver.lost(peer)
         self._contents.lost(peer)
         self._stock.lost(peer)
@@ -276,18 +284,18 @@ class Lanes(Switchboard):
         return Limits(config.bring, size_bytes(config.bring_size), runs=self.settings.me.role != "server")
 
     async def _compare(self, peer: str, asked: Belongings) -> None:
-        self._lane.say(peer, await self._stock.compare(peer, asked))
+        self._replication_link.say(peer, await self._stock.compare(peer, asked))
 
     async def _from_program(self, component: str, need: Need) -> int:
         """A file that only the running program leads to, through its keeper."""
-        running = self.charge(component).component
+        running = self.supervisor(component).component
         if running is None:
             raise LaneError(f"{need.path} is not here any more, and the program does not run here")
         _, (descriptor,) = await running.keeper.ask(messages.OpenFile(need.path, need.digest))
         return int(descriptor)
 
     def _note_bringing(self, component: str, peer: str, sentence: str) -> None:
-        on_its_way = self.charge(component).figures.bringing
+        on_its_way = self.supervisor(component).figures.bringing
         on_its_way.pop(peer, None)
         if sentence:
             on_its_way[peer] = sentence
@@ -297,8 +305,8 @@ class Lanes(Switchboard):
         said: dict[str, str] = {}
         while True:
             await asyncio.sleep(LOOK_S)
-            for name, charge in list(self.charges.items()):
-                if charge.component is None or charge.component.engine == COOPERATIVE:
+            for name, supervisor in list(self.supervisors.items()):
+                if supervisor.component is None or supervisor.component.engine == COOPERATIVE:
                     continue
                 outline = await asyncio.to_thread(newest_of, self._around.store, name)
                 try:
@@ -330,20 +338,20 @@ class Lanes(Switchboard):
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
 
     def tell(self, event: events.Event) -> None:
         """See `agent.worker.hub.Switchboard.tell`."""
-        if isinstance(event, events.Captured) and self.charge(event.component).figures.snapshots == 1:
+        if isinstance(event, events.Captured) and self.supervisor(event.component).figures.snapshots == 1:
             self._new_here.set()  # the first one of it: look at once who else writes to its files
         super().tell(event)
 
     def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
-        figures = self.charge(offer.component).figures
+        figures = self.supervisor(offer.component).figures
         if figures.spec is None:
             self._new_here.set()  # the first one of it: look at once whether it could go on here
         figures.stored(snapshot, offer.size, offer.spec)
-        self.charge(offer.component).copy.accepted(snapshot.position)
+        self.supervisor(offer.component).copy.accepted(snapshot.position)
 
     async def _look_what_is_lacking(self) -> None:
         """Now and then, and when a component is new here: what this robot lacks of what it stands by for, and which files of what
@@ -352,25 +360,25 @@ class Lanes(Switchboard):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._new_here.wait(), LACKS_S)
             self._new_here.clear()
-            waiting = [charge for charge in self.charges.values() if charge.component is None and charge.figures.spec is not None]
+            waiting = [one for one in self.supervisors.values() if one.component is None and one.figures.spec is not None]
             found = await prerequisites.look(self._around, waiting)
-            for charge in waiting:
-                charge.figures.lacks = found.get(charge.name)
-            contested = await prerequisites.contested(self._around, tuple(self.charges.values()))
-            for charge in self.charges.values():
-                charge.figures.contested = contested.get(charge.name, ())
+            for supervisor in waiting:
+                supervisor.figures.lacks = found.get(supervisor.name)
+            contested = await prerequisites.contested(self._around, tuple(self.supervisors.values()))
+            for supervisor in self.supervisors.values():
+                supervisor.figures.contested = contested.get(supervisor.name, ())
 
     async def lacking(self, name: str) -> tuple[str, ...]:
         """What this robot lacks, now, of what a component needs to go on here; nothing where it holds no checkpoint of it.
 
         Nor where a hook gets it ready first, which may bring what is lacking: then the restore itself tells.
         """
-        charge = self.charge(name)
-        if charge.is_prepared_first:
+        supervisor = self.supervisor(name)
+        if supervisor.is_prepared_first:
             return ()
-        found = (await prerequisites.look(self._around, (charge,))).get(name)
-        if charge.figures.spec is not None:
-            charge.figures.lacks = found
+        found = (await prerequisites.look(self._around, (supervisor,))).get(name)
+        if supervisor.figures.spec is not None:
+            supervisor.figures.lacks = found
         return found or ()
 
     async def _inquire(self, act: acts.Inquire) -> None:
@@ -396,22 +404,14 @@ class Lanes(Switchboard):
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
         notices = [*self.notices(), *self._around.store.notices[-NOTICES_SHOWN:]]
-        return team_view(
-            self.settings,
-            self._life,
-            told,
-            self.charges,
-            self._lane.links,
-            notices,
-            self._links.shown(),
-            self._around.store,
-            self._memory(),
-        )
+        links, interfaces = self._replication_link.links, self._links.shown()
+        ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory())
+        return team_view(self.settings, self._life, told, ours)
 
     def _memory(self) -> Memory:
-        keepers = {charge.component.keeper.pid for charge in self.charges.values() if charge.component is not None}
+        keepers = {one.component.keeper.pid for one in self.supervisors.values() if one.component is not None}
         budget = self.places.budget
-        ours = (self._life.heart, os.getpid())
+        ours = (self._life.main_loop, os.getpid())
         return Memory(
             sum(map(memory_limits.held, ours)), sum(memory_limits.held(pid) for pid in keepers if pid), budget.held, budget.limit
         )
@@ -432,5 +432,5 @@ def _keeps_state(store: Store, name: str) -> bool:
 
 
 def main() -> int:
-    """Be the lanes of the heart that started us."""
-    return live(Lanes)
+    """Be the worker of the main loop that started us."""
+    return live(Worker)

@@ -11,9 +11,9 @@ import logging
 from typing import Any
 
 from agent.config import Settings
-from agent.main_loop.messages import Inventory, ToLanes, Told
+from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.worker.control.queries import Questions
-from agent.worker.control.status_view import team_view
+from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.hub import Switchboard, live
 from checkpoint.keeper.messages import Channel
 from failover.core import acts
@@ -25,8 +25,8 @@ log = logging.getLogger("failover.lanes")
 class Witness(Switchboard):
     """One life of the process."""
 
-    def __init__(self, settings: Settings, heart: Channel[ToLanes]) -> None:
-        super().__init__(settings, heart)
+    def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
+        super().__init__(settings, main_loop)
         self.connect(Questions(self))
 
     async def prepare(self) -> Inventory:
@@ -41,15 +41,18 @@ class Witness(Switchboard):
             log.debug("a witness does not do %s", type(act).__name__)
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """Nobody should offer one."""
+        """A witness is offered none."""
         if isinstance(message, Offer):
-            self._lane.say(peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots"))
+            self._replication_link.say(
+                peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots")
+            )
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        return team_view(self.settings, self._life, told, {}, self._lane.links, self.notices(), self._links.shown(), None)
+        ours = WorkerView(self._replication_link.links, self.notices(), self._links.shown())
+        return team_view(self.settings, self._life, told, ours)
 
 
 def main() -> int:
-    """Be the other process of the witness's heart that started us."""
+    """Be the other process of the witness's main loop that started us."""
     return live(Witness)

@@ -14,7 +14,7 @@ from checkpoint.resources.carried import capture
 from checkpoint.resources.devices import by_rule, refused, stateless
 from checkpoint.resources.events import aio, epoll, eventfd, fd_signals, inotify, pidfd, signalfd, timerfd
 from checkpoint.resources.files import locks, memfd, namespaces, overmounted, proc_and_sys, regular
-from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
+from checkpoint.resources.ipc import boards, fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.process import (
     audit_login,
     control_groups,
@@ -57,6 +57,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
     parent_death_signals,
     seccomp,
     refused_threads,
+    boards,
     shared_memory,
     regular,
     overmounted,

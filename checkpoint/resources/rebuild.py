@@ -41,7 +41,7 @@ from checkpoint.resources.files import (
     regular,
     unlinked,
 )
-from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
+from checkpoint.resources.ipc import boards, fifos, pipes, pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.process import (
     audit_login,
     control_groups,
@@ -88,6 +88,7 @@ MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     memfd.KIND: memfd.rebuild,
     overmounted.KIND: overmounted.rebuild,
     by_rule.KIND: by_rule.rebuild,
+    boards.KIND: boards.rebuild,
 }
 """Kinds that are made anew: each adds its calls and answers with a descriptor."""
 NEEDED: Final[Mapping[str, Callable[[Resource], Iterable[str]]]] = {

@@ -15,7 +15,7 @@ from checkpoint.resources import refusals, shared_open_file
 from checkpoint.resources.devices import by_rule, refused, stateless
 from checkpoint.resources.events import epoll, eventfd, inotify, pidfd, signalfd, timerfd
 from checkpoint.resources.files import memfd, namespaces, overmounted, proc_and_sys, regular
-from checkpoint.resources.ipc import fifos, pipes, pseudo_terminals, standard_streams
+from checkpoint.resources.ipc import boards, fifos, pipes, pseudo_terminals, standard_streams
 from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.sockets import inet, netlink, packet, sockets, tcp, unix
 
@@ -40,6 +40,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     pseudo_terminals,
     standard_streams,
     shared_open_file,
+    boards,
     proc_and_sys,
     memfd,
     overmounted,

@@ -23,7 +23,7 @@ from checkpoint.resources.descriptor_groups import Grouping
 from checkpoint.resources.devices import by_rule
 from checkpoint.resources.events import epoll, fd_signals
 from checkpoint.resources.files import locks, regular
-from checkpoint.resources.ipc import pipes, shared_memory, standard_streams
+from checkpoint.resources.ipc import boards, pipes, shared_memory, standard_streams
 from checkpoint.resources.open_file import ALONE, Held, Kin, Opened, OpenFile, Owners, Surroundings
 from checkpoint.resources.socket_cache import Recollection
 from checkpoint.resources.sockets import scm_rights, sockets
@@ -102,7 +102,7 @@ def with_contents(
     for held in _with_travelling(opened, noted, recollection):
         if empty and held.first.number in empty and held.lent is None:
             held = empty[held.first.number]
-        elif held.is_echo or held.observed:
+        elif held.is_echo or held.observed or boards.is_open_one(held):
             pass
         elif rules and by_rule.is_ruled(held.first, rules):
             held = replace(held, observed=by_rule.observe(held, opened))
@@ -214,8 +214,9 @@ def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
     """
     resources, findings = [], []
     for held in opened:
-        of_any = locks.refuse(held) or (None if held.is_echo else fd_signals.refuse(held))
-        if surroundings.detached:
+        is_board = not held.is_echo and boards.is_open_one(held)
+        of_any = None if is_board else locks.refuse(held) or (None if held.is_echo else fd_signals.refuse(held))
+        if surroundings.detached and not is_board:
             of_any = of_any or shared_memory.refuse_partial(held.first, surroundings.detached)
             held = _detached(held, surroundings.detached)
         for kind in registry.ASKED:
@@ -241,6 +242,8 @@ def _detached(held: OpenFile, objects: Mapping[tuple[int, int], int]) -> OpenFil
 
 def _of_every_kind(held: OpenFile, resource: Resource) -> dict[str, Fact]:
     """Facts that any kind may have."""
+    if resource.kind == boards.KIND:  # its locks are of this robot's board
+        return {"description": held.description} if held.description else {}
     if resource.kind == shared_open_file.KIND:
         return locks.describe(held, kinds=locks.OF_PROCESSES)
     facts = {**fd_signals.describe(held), **locks.describe(held)}

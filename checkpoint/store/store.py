@@ -19,7 +19,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import accumulate
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,7 +26,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.errors import ChainError, FormatError, StoreError
-from checkpoint.model import OutputPiece, Position, Snapshot
+from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
 from checkpoint.snapshot.canonical_state import header_of
 from checkpoint.snapshot.required_files import needs
@@ -37,6 +36,7 @@ from checkpoint.store.atomic_files import TEMPORARY_PREFIX, WholeFiles, disk_tro
 from checkpoint.store.base_on_disk import stored_chain
 from checkpoint.store.content_store import Contents
 from checkpoint.store.disk import Disk, DiskFile, lock_exclusively
+from checkpoint.store.fold_rules import fold_is_due, held_at_once, newest_output
 from checkpoint.store.folding import Folding
 from checkpoint.store.index import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.store.retention import HISTORY_FOLDER, History, Retention
@@ -56,28 +56,10 @@ ASIDE_LIMIT = 4
 
 LOCK_NAME = "lock"
 
-FOLD_DELTA_COUNT = 64
-"""A chain to the oldest wanted position with more deltas than this is folded: a restore reads them all, about 3 ms each."""
-
-CHEAP_BASE_SIZE = 16 << 20
-CHEAP_DELTA_COUNT = 12
-"""…and where the base is no larger than this, with more deltas than that: writing it again is cheaper than a slow takeover."""
-
-FOLD_DELTA_PART = 0.5
-"""…and one whose deltas together take more than this part of its base: otherwise the store would grow without end."""
-
 NOTICES_KEPT = 100
 """Of what was found damaged or left over."""
 
-FOLDED_AT_ONCE_SIZE = 64 << 20
-"""Bytes of the pages of deltas that a fold holds in memory; a chain with more is folded in several steps. Of a large base, which
-takes long to write again, half as much as its own."""
-
 NOTHING_OLD = Retention()
-
-FOLDED_OUTPUT_SIZE = 1 << 20
-"""Bytes of output of each stream that a folded base keeps; the whole is in the component's logs."""
-
 
 A = TypeVar("A")
 
@@ -278,7 +260,7 @@ class Store:
 
     @contextmanager
     def _change_of(self, component: str) -> Iterator[None]:
-        """Nobody else changes what is held of a component during the body; everybody may read it."""
+        """No other thread changes what is held of a component during the body; all may read it."""
         with self._lock:
             changing = self._changing.setdefault(component, threading.RLock())
         with changing:
@@ -313,7 +295,9 @@ class Store:
 
         Whole checkpoints among it are kept for people as the retention says. An ``oldest`` that is not held forgets nothing.
         """
-        if self._fold_is_due(component, oldest):
+        with self._lock:
+            entries = self._shelf(component).chain_to(oldest)
+        if fold_is_due(entries):
             self.fold(component, oldest)
         with self._change_of(component):
             shelf = self._shelf(component)
@@ -355,7 +339,7 @@ class Store:
         """
         is_there = False
         while not is_there:
-            entries = _held_at_once(self.chain_of(component, position))
+            entries = held_at_once(self.chain_of(component, position))
             reached = entries[-1].position
             is_there = reached == position
             written = self._write_fold(component, entries)
@@ -382,7 +366,7 @@ class Store:
         whole = self._read(component, entries, lambda: chain.fold([format.decode(entries[0].path), *deltas]))
         if whole is None:
             return None
-        folded = replace(whole, output=_newest_output(whole.output))
+        folded = replace(whole, output=newest_output(whole.output))
         return self._write_base(folded, lambda file: format.encode(folded, file))
 
     def _write_straight(self, component: str, entries: tuple[Entry, ...], deltas: list[Snapshot]) -> Entry | None:
@@ -391,7 +375,7 @@ class Store:
             stored = self._read(component, entries, lambda: open_files.enter_context(stored_chain(entries[0].path, deltas)))
             if stored is None:
                 return None
-            folded = replace(stored.outline, output=_newest_output(stored.outline.output))
+            folded = replace(stored.outline, output=newest_output(stored.outline.output))
             folding = Folding(stored, folded)
             return self._read(component, entries, lambda: self._write_base(folded, folding.write))
 
@@ -408,15 +392,6 @@ class Store:
     def _write_base(self, folded: Snapshot, write: Callable[[DiskFile], int]) -> Entry:
         final = self._root / folder_name(folded.component) / file_name(header_of(folded))
         return _entry_of(final, folded, self._files.write(final, write))
-
-    def _fold_is_due(self, component: str, oldest: Position) -> bool:
-        with self._lock:
-            entries = self._shelf(component).chain_to(oldest)
-        if not entries:
-            return False
-        base, deltas = entries[0], entries[1:]
-        most = CHEAP_DELTA_COUNT if base.size <= CHEAP_BASE_SIZE else FOLD_DELTA_COUNT
-        return len(deltas) > most or sum(entry.size for entry in deltas) > FOLD_DELTA_PART * base.size
 
     def set_aside(self, component: str, generations: Iterable[int]) -> Path | None:
         """Take generations out of the chain; their newest state is kept as one file for inspection.
@@ -489,7 +464,7 @@ class Store:
         """Remove files, the youngest first: what is left at any instant is whole chains.
 
         Args:
-            taken: whether somebody else has taken a whole checkpoint's file to keep it.
+            taken: whether a whole checkpoint's file has been taken, to be kept elsewhere.
         """
         with disk_trouble(f"remove snapshots of {component}"):
             for entry in sorted(entries, key=lambda entry: entry.order, reverse=True):
@@ -504,7 +479,7 @@ class Store:
             self._files.remove_damaged(self._root / folder_name(component), is_old)
 
     def _set_out_of_use(self, component: str, entry: Entry, why: str) -> None:
-        """Never offer this file again; it stays where it is, for whoever wants to look, until it is pruned."""
+        """Never offer this file again; it stays where it is for inspection, until it is pruned."""
         with self._lock:
             shelf = self._shelf(component)
             if entry in shelf.entries:
@@ -609,35 +584,3 @@ def why_not_ours(about: os.stat_result) -> str:
 
 def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
     return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())
-
-
-def _held_at_once(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    """The beginning of a chain, with one delta at least, whose deltas' pages may be held together; files hold them compressed."""
-    sizes = [_pages_size(entry) for entry in entries]
-    limit = max(FOLDED_AT_ONCE_SIZE, int(FOLD_DELTA_PART * sizes[0]))
-    count = sum(total <= limit for total in accumulate(sizes[1:]))
-    return entries[: 1 + max(count, 1)]
-
-
-def _pages_size(entry: Entry) -> int:
-    """Bytes of the pages that a file tells; 0 where it is damaged, as whoever reads it will find."""
-    try:
-        return format.read_header(entry.path).contents_size
-    except FormatError:
-        return 0
-
-
-def _newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:
-    """The end of each stream, so that a base that was folded a thousand times does not carry all that was ever written."""
-    ends = {piece.stream: piece.offset + len(piece.content) for piece in output}
-    return tuple(
-        _cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE)
-        for piece in output
-        if piece.offset + len(piece.content) >= ends[piece.stream] - FOLDED_OUTPUT_SIZE
-    )
-
-
-def _cut(piece: OutputPiece, first: int) -> OutputPiece:
-    """The part of a piece from an offset of its stream on."""
-    skipped = max(0, first - piece.offset)
-    return replace(piece, offset=piece.offset + skipped, content=piece.content[skipped:])

@@ -346,10 +346,10 @@ def team(room: argparse.ArgumentParser) -> None:
         "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
     )
     _json(shared)
-    create = _act(acts, "create", shared, "begin a team", CREATE_STORY)
+    create = _act(acts, "create", shared, "begin a team", CREATE_DESCRIPTION)
     create.add_argument("name", metavar="TEAM", help="the team's name")
     create.set_defaults(function="failover.cli.verbs.team:create")
-    enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_STORY)
+    enrol = _act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_DESCRIPTION)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
         "address",
@@ -372,13 +372,13 @@ def team(room: argparse.ArgumentParser) -> None:
     show.set_defaults(function="failover.cli.verbs.team:show")
 
 
-CREATE_STORY: Final = """
+CREATE_DESCRIPTION: Final = """
     Make the team directory with an empty team file. Do this once, anywhere; failover team enrol adds the robots.
 
       failover team create lab
     """
 
-ENROL_STORY: Final = """
+ENROL_DESCRIPTION: Final = """
     Add a robot to the team file and make its key pair. The team file then goes to every robot. The secret key (keys/ROBOT.secret)
     belongs to that robot alone: enrolled on another machine, copy it to the robot and remove it here. Or make the pair on the
     robot (failover-agent keypair), so that the secret never travels, and enrol its public half. Agents read the team file when
@@ -404,29 +404,29 @@ def board(room: argparse.ArgumentParser) -> None:
     acts = room.add_subparsers(dest="act", metavar="ACT", title="acts")
     of_board = argparse.ArgumentParser(add_help=False, parents=[shared])
     _place_of_board(of_board)
-    get = _act(acts, "get", of_board, "one item's value, how old it is, and how old it can be at most", GET_STORY)
+    get = _act(acts, "get", of_board, "one item's value, how old it is, and how old it can be at most", GET_DESCRIPTION)
     get.add_argument("path", metavar="ROBOT/ITEM", help="an item of a robot; ITEM alone: of this robot")
     get.add_argument("--watch", action="store_true", help="print each new value until Ctrl-C")
     get.set_defaults(function="failover.cli.verbs.board:get")
-    put = _act(acts, "put", of_board, "put a value of this robot", PUT_STORY)
+    put = _act(acts, "put", of_board, "put a value of this robot", PUT_DESCRIPTION)
     put.add_argument("path", metavar="ITEM", help="an item of this robot")
     put.add_argument("value", metavar="JSON", help="the value; bytes in hexadecimal; - reads it from standard input")
     put.set_defaults(function="failover.cli.verbs.board:put")
-    top = _act(acts, "top", of_board, "rates, sizes, ages and losses of every item", TOP_STORY)
+    top = _act(acts, "top", of_board, "rates, sizes, ages and losses of every item", TOP_DESCRIPTION)
     _repeated(top, 1000)
     top.set_defaults(function="failover.cli.verbs.board:top")
-    users = _act(acts, "users", of_board, "the programs that have the board open", USERS_STORY)
+    users = _act(acts, "users", of_board, "the programs that have the board open", USERS_DESCRIPTION)
     users.set_defaults(function="failover.cli.verbs.board:users")
     of_team = argparse.ArgumentParser(add_help=False, parents=[shared])
     of_team.add_argument(
         "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
     )
-    header = _act(acts, "header", of_team, "the items as a C header", HEADER_STORY)
+    header = _act(acts, "header", of_team, "the items as a C header", HEADER_DESCRIPTION)
     header.add_argument(
         "--rtdb", action="store_true", help="also numbers of items and agents under their own names, for failover_rtdb.h"
     )
     header.set_defaults(function="failover.cli.verbs.board_files:header")
-    imported = _act(acts, "import", shared, "an rtdb.conf as a table of team.toml", IMPORT_STORY)
+    imported = _act(acts, "import", shared, "an rtdb.conf as a table of team.toml", IMPORT_DESCRIPTION)
     imported.add_argument("file", metavar="FILE", help="CAMBADA's rtdb.conf, or RTDB2's rtdb2_configuration.xml")
     imported.add_argument(
         "-I", dest="include", metavar="DIR", action="append", default=[], help="a folder with headers; may be given again"
@@ -471,7 +471,7 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-GET_STORY: Final = """
+GET_DESCRIPTION: Final = """
     Print the newest value of an item as JSON, its age, and the age that it can have at most. Exit status 1: the value may be
     older than its bound.
 
@@ -480,7 +480,7 @@ GET_STORY: Final = """
       failover board get robot2/ball --watch
     """
 
-PUT_STORY: Final = """
+PUT_DESCRIPTION: Final = """
     Put a value by hand, for a test or from a shell script. One process at a time writes an item: while a program writes it, this
     command is refused and names the program.
 
@@ -488,7 +488,7 @@ PUT_STORY: Final = """
       failover board put goal '"00ff"'
     """
 
-TOP_STORY: Final = """
+TOP_DESCRIPTION: Final = """
     Show, over a span, how often each item is put, how old its newest value was at half and at 99 of 100 looks, and how many
     frames carried it or were lost.
 
@@ -496,13 +496,13 @@ TOP_STORY: Final = """
       failover board top --every-ms 5000 --json
     """
 
-USERS_STORY: Final = """
+USERS_DESCRIPTION: Final = """
     List the programs that have this robot's board open. The kernel tells: a program that was killed is not in the list.
 
       failover board users
     """
 
-HEADER_STORY: Final = """
+HEADER_DESCRIPTION: Final = """
     Print the items of team.toml as a C header: a struct for each, its number, size and digest, and assertions that the compiler
     lays the structs out as the board does. It compiles as C11 and as C++11.
 
@@ -510,7 +510,7 @@ HEADER_STORY: Final = """
       failover board header --directory ~/team --rtdb > items.h
     """
 
-IMPORT_STORY: Final = """
+IMPORT_DESCRIPTION: Final = """
     Read CAMBADA's rtdb.conf and print its items as the table [board] of team.toml, with the sizes of their C types. This command
     compiles a file that only names the types, and reads the sizes from the object file: it runs nothing of yours, and works with
     a compiler for the robots' processor. An agent needs no compiler. A mistake in the file is told with line and column.
@@ -523,13 +523,13 @@ IMPORT_STORY: Final = """
     """
 
 
-def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, story: str) -> argparse.ArgumentParser:
+def _act(acts: Any, name: str, shared: argparse.ArgumentParser, summary: str, description: str) -> argparse.ArgumentParser:
     """One act of ``failover team``."""
     room: argparse.ArgumentParser = acts.add_parser(
         name,
         parents=[shared],
         help=summary,
-        description=dedent(story).strip(),
+        description=dedent(description).strip(),
         epilog=EXIT_STATUSES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

@@ -42,14 +42,14 @@ class Verb(Struct, frozen=True):
 
     Attributes:
         summary: one line, for the list of verbs.
-        story: what it does, and examples; dedented before it is shown.
+        description: what it does, and examples; dedented before it is shown.
         arguments: adds the verb's own arguments to its parser.
         function: ``module:function``; takes the parsed arguments, returns the exit status.
     """
 
     name: str
     summary: str
-    story: str
+    description: str
     arguments: Callable[[argparse.ArgumentParser], None]
     function: str
 
@@ -69,7 +69,7 @@ def build(verb: str = "") -> argparse.ArgumentParser:
         room = rooms.add_parser(
             one.name,
             help=one.summary,
-            description=dedent(one.story).strip(),
+            description=dedent(one.description).strip(),
             epilog=arguments.EXIT_STATUSES,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from checkpoint.model import Position
 from failover.core.event_log.decisions import Decision
-from failover.core.types import Ballot, ComponentSpec, Resumption
+from failover.core.types import ComponentSpec, Resumption, VoteRecord
 from failover.core.wire.messages import Beat
 
 
@@ -66,7 +66,7 @@ class Capture(Struct, frozen=True):
 
 
 class Ship(Struct, frozen=True):
-    """Send the snapshot at ``position`` over the bulk lane. → ShipEnded.
+    """Send the snapshot at ``position`` over the replication link. → ShipEnded.
 
     Attributes:
         parent: the standby's present position; None for a base.
@@ -310,12 +310,12 @@ class Ready(Struct, frozen=True):
     """The obligations after one step, in the order in which they are met.
 
     Attributes:
-        persist: the whole ballot, to be made durable before anything else; None when it has not changed.
+        persist: the whole vote record, to be made durable before anything else; None when it has not changed.
         send: beats, each for every peer over every link.
         told: what was decided, for ``failover why``; nothing waits for it.
     """
 
-    persist: Ballot | None = None
+    persist: VoteRecord | None = None
     send: tuple[Beat, ...] = ()
     act: tuple[Act, ...] = ()
     told: tuple[Decision, ...] = ()

@@ -132,7 +132,8 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
 def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
     home = component.rules.prefer or (component.spec.home if component.spec else "")
     if home == turn.me and component.state in _RUNNING:
-        turn.order(acts.Answer(command.request, True, f"{component.name} runs at {home} already, its preferred robot"))
+        why = "its preferred robot" if component.rules.prefer else "where it was started"
+        turn.order(acts.Answer(command.request, True, f"{component.name} runs at {home} already, {why}"))
     elif not home:
         refusal = (
             f"{component.name} prefers no robot, and {turn.me} does not know where it was started; "

@@ -16,7 +16,6 @@ from failover.core.types import (
     EPOCH_MAX,
     HISTORY_MAX,
     HOLDING,
-    Ballot,
     ComponentSpec,
     Config,
     OnLoss,
@@ -24,6 +23,7 @@ from failover.core.types import (
     Resumption,
     Rules,
     State,
+    VoteRecord,
     Waiting,
     WhenAlone,
 )
@@ -330,7 +330,7 @@ class Component(Struct):
 
     @classmethod
     def remembered(cls, record: Record) -> Component:
-        """The component as the ballot remembers it, before anything is known of its process."""
+        """The component as the vote record remembers it, before anything is known of its process."""
         return cls(
             record.name,
             record.epoch,
@@ -353,7 +353,7 @@ class Turn(Struct):
     """One step: its instant, what the rules may look at, what they order, and what they say about it.
 
     Attributes:
-        before: the ballot as the last step left it.
+        before: the vote record as the last step left it.
         late_ns: see `failover.core.event_log.decisions.Facts`.
     """
 
@@ -361,7 +361,7 @@ class Turn(Struct):
     config: Config
     team: Membership
     next_counter: int
-    before: Ballot
+    before: VoteRecord
     late_ns: int
     load: int = 0
     acts: list[Act] = field(default_factory=list)

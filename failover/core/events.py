@@ -231,7 +231,7 @@ class Exited(Struct, frozen=True):
 
 
 class Noticed(Struct, frozen=True):
-    """Something that belongs in the story and changes nothing: about a component, or ("") about this robot.
+    """Something that belongs in the event log and changes nothing: about a component, or ("") about this robot.
 
     Attributes:
         output_pending: see `failover.core.event_log.decisions.Facts`.

@@ -32,7 +32,7 @@ UNSTEADY_FACTOR = 2
 """The margin is so many times the lateness that was seen: the next one may be longer."""
 
 UNREAD_NS = 10_000 * MS
-"""A sign of a member that cannot be authenticated proves for so long that its robot lives: its lanes knock every two seconds."""
+"""A sign of a member that cannot be authenticated proves for so long that its robot lives: its agent connects every 2 s."""
 
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
@@ -264,7 +264,7 @@ class Membership:
         return robot not in self.peers or not self.peers[robot].boot
 
     def unreadable(self, robot: str, why: str, now_ns: int) -> str:
-        """Note what could not be authenticated; a sentence for the story where it is the first, or says more than before.
+        """Note what could not be authenticated; a sentence for the event log where it is the first, or says more than before.
 
         Of a peer that lives it says nothing: anybody may send from its address.
         """

@@ -48,7 +48,7 @@ from failover.core.replication import servers, standby, warm_standby
 from failover.core.status import guarantee, view
 from failover.core.status.observations import Watch
 from failover.core.transitions import exits, failback, handover, promotion
-from failover.core.types import COMPONENTS_MAX, ENDED, MS, Ballot, Config, Found, Held, Resumption, State, StatusView
+from failover.core.types import COMPONENTS_MAX, ENDED, MS, Config, Found, Held, Resumption, State, StatusView, VoteRecord
 from failover.core.wire.messages import Beat, Entry
 
 NS_PER_S = 1_000 * MS
@@ -71,7 +71,7 @@ class Node:
 
     Args:
         boot: count of this agent's starts, durable already; grows with every start.
-        ballot: what the last ``Ready.persist`` made durable.
+        vote_record: what the last ``Ready.persist`` made durable.
         held: what this robot's snapshot store can restore.
         found: components whose guards outlived the last agent.
     """
@@ -80,7 +80,7 @@ class Node:
         self,
         config: Config,
         boot: int,
-        ballot: Ballot,
+        vote_record: VoteRecord,
         now_ns: int,
         held: tuple[Held, ...] = (),
         found: tuple[Found, ...] = (),
@@ -90,13 +90,13 @@ class Node:
         self._now_ns = now_ns
         self._asked_ns = self._next_beat_ns = now_ns
         self._last_beat_ns = now_ns - URGENT_GAP_NS
-        self._durable = ballot
+        self._durable = vote_record
         self._team = Membership(config, boot, now_ns)
         self._speaker = Speaker(config.robot, boot, config.rule, len(config.peers) + 1)
         self._watch = Watch()
         self._testimony = Testimony()
         self._outlivers: set[str] = set()
-        self._components = {record.name: Component.remembered(record) for record in ballot.records}
+        self._components = {record.name: Component.remembered(record) for record in vote_record.records}
         self._found = {one.component: one for one in found}
         self._begun = False
         self._load = 0
@@ -130,8 +130,8 @@ class Node:
     def outlived_by(self, beat: Beat) -> int:
         """A life of this robot that the sender has heard and that is not an earlier one of ours; 0 for none.
 
-        Our ballot was lost, or is an old copy: whoever remembers that life believes none of our beats before a later one. It is
-        a lie where at least as many others have heard this life of ours.
+        Our vote record was lost, or is an old copy: a peer that remembers that life believes no beat of ours before a later one.
+        It is a lie where at least as many others have heard this life of ours.
         """
         life = self._life_told(beat)
         self._outlivers.discard(beat.sender)
@@ -294,12 +294,12 @@ class Node:
         known = (component for component in self._components.values() if component.epoch or (starts and component.autostart))
         return {component.name: entry_of(component) for component in known}
 
-    def _persist(self) -> Ballot | None:
-        ballot = Ballot(tuple(component.record() for component in self._components.values() if component.epoch))
-        if ballot == self._durable:
+    def _persist(self) -> VoteRecord | None:
+        vote_record = VoteRecord(tuple(component.record() for component in self._components.values() if component.epoch))
+        if vote_record == self._durable:
             return None
-        self._durable = ballot
-        return ballot
+        self._durable = vote_record
+        return vote_record
 
     def _deadline_ns(self) -> int:
         instants = [self._next_beat_ns]

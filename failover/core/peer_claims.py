@@ -28,7 +28,7 @@ EPOCHS_AWAY_MAX = 1 << 20
 """Epochs that may have passed while this robot was away: one each second for twelve days, one each minute for two years."""
 
 MANY = 10
-"""The story tells of the first entry that was refused, and of each that makes so many times as many."""
+"""The event log tells of the first entry that was refused, and of each that makes so many times as many."""
 
 RECENT_NS = 60_000 * MS
 """For so long after the last such entry the status counts this robot's sight of the team as not healthy."""

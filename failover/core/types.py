@@ -392,7 +392,7 @@ class Record(Struct, frozen=True):
     bare: bool = False
 
 
-class Ballot(Struct, frozen=True):
+class VoteRecord(Struct, frozen=True):
     """All that a robot's rules must not forget: durable before any message that depends on it leaves."""
 
     records: tuple[Record, ...] = ()

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import msgspec
 
-from failover.core.types import Ballot
+from failover.core.types import VoteRecord
 from failover.errors import RulesError
 
 _encoder = msgspec.json.Encoder()
-_decoder: msgspec.json.Decoder[Ballot] = msgspec.json.Decoder(Ballot)
+_decoder: msgspec.json.Decoder[VoteRecord] = msgspec.json.Decoder(VoteRecord)
 
 
-def encode(ballot: Ballot) -> bytes:
+def encode(vote_record: VoteRecord) -> bytes:
     """JSON, so that a person in trouble can read it."""
-    return _encoder.encode(ballot)
+    return _encoder.encode(vote_record)
 
 
-def decode(body: bytes) -> Ballot:
-    """What ``encode`` gave; b"" is the ballot of a robot that never voted.
+def decode(body: bytes) -> VoteRecord:
+    """What ``encode`` gave; b"" is the vote record of a robot that never voted.
 
     Raises:
         RulesError: anything else.
     """
     if not body:
-        return Ballot()
+        return VoteRecord()
     try:
         return _decoder.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agent.main import main
-from agent.main_loop.vote_record import Ballot
+from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.store.store import open_store
 from failover.config import team
 from failover.config.team import Robot, Team
@@ -31,7 +31,7 @@ OTHER = Record("/lab/robot1/other", 3, "robot1", State.PRIMARY)
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """Of a robot whose agent is stopped and whose ballot has two records."""
+    """Of a robot whose agent is stopped and whose vote record has two records."""
     directory = tmp_path / "team"
     directory.mkdir()
     members = Team("lab", {"robot1": Robot(("127.0.0.1:7420",), "127.0.0.1:7421")})
@@ -43,15 +43,15 @@ def config(tmp_path: Path) -> Path:
         f'robot = "robot1"\nteam_directory = "{directory}"\nstate_directory = "{tmp_path}/state"\n'
         f'runtime_directory = "{tmp_path}/run"\ninsecure = true\n'
     )
-    ballot = Ballot(tmp_path / "state", "robot1")
-    ballot.open()
-    ballot.keep(core_vote_record.encode(types.Ballot((POISONED, OTHER))))
+    record_file = VoteRecordFile(tmp_path / "state", "robot1")
+    record_file.open()
+    record_file.keep(core_vote_record.encode(types.VoteRecord((POISONED, OTHER))))
     open_store(tmp_path / "state" / "store").close()
     return path
 
 
 def records(config: Path) -> tuple[Record, ...]:
-    return core_vote_record.decode(Ballot(config.parent / "state", "robot1").read().core).records
+    return core_vote_record.decode(VoteRecordFile(config.parent / "state", "robot1").read().core).records
 
 
 def test_it_tells_the_cost_and_changes_nothing_until_it_is_agreed_to(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -66,7 +66,7 @@ def test_it_lowers_the_one_record_and_leaves_no_vote_in_it(config: Path) -> None
     mended, other = records(config)
     assert (mended.epoch, mended.primary, mended.entrusted, mended.trusted, mended.spec) == (12, "", (), False, POISONED.spec)
     assert other == OTHER
-    assert Ballot(config.parent / "state", "robot1").open().boot == 2, "it was no life of the agent"
+    assert VoteRecordFile(config.parent / "state", "robot1").open().boot == 2, "it was no life of the agent"
 
 
 @pytest.mark.parametrize(

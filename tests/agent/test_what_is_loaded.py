@@ -30,7 +30,7 @@ def seldom_used() -> set[str]:
     return set(slim_imports.SELDOM_USED) - ({"inspect"} if sys.version_info >= (3, 12) else set())
 
 
-def test_the_heart_loads_neither_asyncio_nor_what_reads_pages() -> None:
+def test_the_main_loop_loads_neither_asyncio_nor_what_reads_pages() -> None:
     loaded = loaded_by("agent.main", "agent.main_loop.loop")
     assert "agent.main_loop.loop" in loaded
     assert not loaded & {
@@ -47,11 +47,12 @@ def test_the_heart_loads_neither_asyncio_nor_what_reads_pages() -> None:
     }
 
 
-@pytest.mark.parametrize("lanes", ["agent.worker.process", "agent.worker.witness"])
-def test_the_lanes_load_no_numpy_before_a_snapshot_comes(lanes: str) -> None:
-    loaded = loaded_by(lanes)
-    assert lanes in loaded
+@pytest.mark.parametrize("worker", ["agent.worker.process", "agent.worker.witness"])
+def test_the_worker_loads_no_numpy_before_a_snapshot_comes(worker: str) -> None:
+    loaded = loaded_by(worker)
+    assert worker in loaded
     assert not loaded & {"numpy", "importlib.metadata", "ssl", "_ssl", "_hashlib", "unicodedata", *seldom_used()}
+    assert not any(name.startswith(("failover.boards.", "failover.core.board.")) for name in loaded), "the team may have no board"
 
 
 USED: Final = """

@@ -262,7 +262,7 @@ class Campaign:
         )
 
     def evidence(self) -> None:
-        """Leave the merged story of all robots, and each one's own picture, beside their journals."""
+        """Leave the merged event log of all robots, and each one's own picture, beside their journals."""
         for member in self.house.powered:
             member.go_on()
         with contextlib.suppress(OSError):

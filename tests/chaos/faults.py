@@ -20,12 +20,12 @@ from tests.chaos.network import Way
 
 LEASE_S: Final = LEASE_MS / 1_000
 PARTS: Final[tuple[tuple[str, ...], ...]] = (
-    ("heart",),
-    ("lanes",),
+    ("main_loop",),
+    ("worker",),
     ("keeper",),
     ("guard",),
-    ("heart", "lanes"),
-    ("heart", "lanes", "keeper"),
+    ("main_loop", "worker"),
+    ("main_loop", "worker", "keeper"),
 )
 """What is killed, or stands still, at one instant."""
 
@@ -103,7 +103,7 @@ class Draw:
             send(pids, signal.SIGKILL)
 
         def end() -> None:
-            if "heart" in parts:
+            if "main_loop" in parts:
                 self.house.start_agent(member)
 
         sentence = f"kill -9 {' and '.join(parts)} of {member.name}"

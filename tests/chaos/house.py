@@ -62,8 +62,8 @@ STEP_MS: Final = 50
 
 PROGRAMS: Final = Path(__file__).parent / "programs"
 MODULES: Final = {
-    "heart": b"agent.main",
-    "lanes": b"agent.worker.process",
+    "main_loop": b"agent.main",
+    "worker": b"agent.worker.process",
     "keeper": b"checkpoint",
     "guard": b"agent.guard.server",
 }
@@ -350,7 +350,7 @@ class House:
         return found
 
     def is_connected(self) -> bool:
-        """Whether every member hears every other and has a lane to it."""
+        """Whether every member hears every other and has a replication link to it."""
         pictures = self.pictures()
         peers = [peer for picture in pictures.values() for peer in picture["peers"]]
         heard = all(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected" for peer in peers)

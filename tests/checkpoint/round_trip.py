@@ -280,6 +280,7 @@ def restored(
     devices: tuple[DeviceRule, ...] = (),
     isolate: bool = False,
     shared: tuple[str, ...] = (),
+    epoch: int = 0,
 ) -> Program:
     """Bring a base, or a base with its deltas, back as a child of ours and let it run."""
     base = state if isinstance(state, Snapshot | StoredBase) else chain.fold(state) if len(state) > 1 else state[0]
@@ -292,7 +293,7 @@ def restored(
         born = spawn_vessel(Birth(inner_pid=inner_pid, isolate=isolate, clocks=clocks, elapsed_ns=elapsed_ns, stdio=stdio))
     try:
         terms = Terms(devices=devices, shared=shared)
-        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, contents=str(contents), terms=terms)
+        options = RestoreOptions(elapsed_ns, accept_changed, own_eyes, epoch, contents=str(contents), terms=terms)
         program = ENGINE.restore(born.pid, base, options)
         program.resume()
     except BaseException:

@@ -13,7 +13,7 @@ from typing import Final
 
 from checkpoint.arch import TRY_UNPROVED
 from failover.cli.demo import robots as demo
-from failover.cli.demo.robots import ADDRESS, NAMES, RobotMachine, Stage
+from failover.cli.demo.robots import ADDRESS, NAMES, Pace, RobotMachine, Stage
 from tests.e2e import robots
 from tests.machines.emulated import Machine
 
@@ -83,7 +83,7 @@ class MixedStage(Stage):
 
     def __init__(self, directory: Path, guests: Mapping[str, Machine]) -> None:
         # one end of a wire is a tunnel here, of which an agent cannot know what carries it
-        super().__init__(directory, robots.means(), 'snapshots_over = "any"\n', beat_ms=BEAT_MS, lease_ms=LEASE_MS)
+        super().__init__(directory, robots.means(), 'snapshots_over = "any"\n', pace=Pace(BEAT_MS, LEASE_MS))
         self._guests = guests
 
     def start_robot(self, name: str) -> RobotMachine:

@@ -141,7 +141,7 @@ def numbers(robot: RobotMachine, name: str = "count") -> list[int]:
 
 
 def connected(robot: RobotMachine) -> bool:
-    """Whether it hears its peer's beats and has a bulk lane to it."""
+    """Whether it hears its peer's beats and has a replication link to it."""
     (peer,) = robot.status()["peers"]
     return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 PRIORITY: Final = 70
-"""Above a heart's."""
+"""Above a main loop's."""
 
 WATCHMAN: Final = """
 import os, signal, sys, time

@@ -59,7 +59,7 @@ if 0 not in children:
 
 KNOCK = """
 import asyncio, sys
-from agent.worker.network.replication_link import BulkLane, Keys, LinkState, new_keys
+from agent.worker.network.replication_link import Callbacks, Keys, LinkState, ReplicationLink, new_keys
 from failover.core.wire.messages import Cancel
 
 async def knock(name, address, server_key):
@@ -70,11 +70,12 @@ async def knock(name, address, server_key):
         said.append((state, reason))
         if state in (LinkState.REFUSED, LinkState.CONNECTED):
             refused.set()
-    lane = BulkLane(name, "127.0.0.1:7999", {"door": address}, Keys(public, secret, {"door": server_key}), print, changed)
-    lane.open()
+    keys = Keys(public, secret, {"door": server_key})
+    link = ReplicationLink(name, "127.0.0.1:7999", {"door": address}, keys, Callbacks(print, changed))
+    link.open()
     await asyncio.wait_for(refused.wait(), 30)
-    lane.say("door", Cancel(1))
-    await lane.close()
+    link.say("door", Cancel(1))
+    await link.close()
     print(*said[-1])
 
 asyncio.run(knock(*sys.argv[1:]))

@@ -155,16 +155,16 @@ def test_a_client_that_hangs_up_midway_leaves_nothing(pair: Pair, sent: bytes) -
 
 
 def test_half_requests_on_many_connections_take_a_bounded_memory_and_no_place(pair: Pair) -> None:
-    (lanes,) = parts(pair[0], "lanes")
+    (worker,) = parts(pair[0], "worker")
     half = LENGTH.pack(REQUEST_LIMIT) + bytes(REQUEST_LIMIT - 1)
-    before = procfs.status(lanes).resident_size
+    before = procfs.status(worker).resident_size
     with ExitStack() as held:
         for _ in range(CONNECTIONS):
             link = held.enter_context(connect(pair[0].socket))
             with suppress(ConnectionError):  # told that it is too much, and hung up on
                 link.sendall(half)
         assert pair[0].status()["robot"] == "robot1"
-        assert procfs.status(lanes).resident_size - before < GROWTH_MAX
+        assert procfs.status(worker).resident_size - before < GROWTH_MAX
 
 
 def test_a_client_that_reads_nothing_holds_nobody_up(pair: Pair) -> None:

@@ -168,7 +168,7 @@ def test_beats_recorded_in_an_earlier_life_are_not_believed_in_the_next(pair: Pa
     assert standing(pair) == stood
 
 
-def test_a_stranger_at_the_bulk_lane_is_refused_and_disturbs_nobody(pair: Pair) -> None:
+def test_a_stranger_at_the_replication_link_is_refused_and_disturbs_nobody(pair: Pair) -> None:
     assert "REFUSED" in stranger.knock(pair[0], "robot2").upper()
     until_said(pair[0], "this robot refused a key that is not in its team.toml on the replication link", "1 of 1 connected")
 

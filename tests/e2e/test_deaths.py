@@ -32,15 +32,15 @@ SPREAD_S = 0.15
 RESTORE_S = 0.25
 """A handover, its restore included, takes about so long."""
 
-NAMES = {"heart": b"agent.main", "lanes": b"agent.worker.process", "keeper": b"checkpoint", "guard": b"agent.guard.server"}
+NAMES = {"main_loop": b"agent.main", "worker": b"agent.worker.process", "keeper": b"checkpoint", "guard": b"agent.guard.server"}
 """Module of each part of an agent: the third word of its command line."""
 
 WAYS = {
     "keeper": ("keeper",),
-    "lanes": ("lanes",),
-    "heart": ("heart",),
-    "agent": ("heart", "lanes"),
-    "agent_and_keeper": ("heart", "lanes", "keeper"),
+    "worker": ("worker",),
+    "main_loop": ("main_loop",),
+    "agent": ("main_loop", "worker"),
+    "agent_and_keeper": ("main_loop", "worker", "keeper"),
 }
 
 Pair = tuple[RobotMachine, RobotMachine]
@@ -78,8 +78,8 @@ def kill(robot: RobotMachine, names: tuple[str, ...]) -> None:
 
 def revived(robot: RobotMachine, names: tuple[str, ...]) -> None:
     """Bring the agent back, if it was killed, and wait until it answers."""
-    if "heart" in names:
-        robots.until(lambda: not parts(robot, "heart") and not parts(robot, "lanes"), "the agent to be gone")
+    if "main_loop" in names:
+        robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
         robots.start_agent(robot)
     robots.until(lambda: robots.answers(robot), "the agent to answer")
 

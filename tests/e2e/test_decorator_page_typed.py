@@ -71,4 +71,4 @@ def test_two_robots_on_one_machine_as_the_page_tells_it(tmp_path: Path) -> None:
         robots.until(lambda: len(typed.type(logs).split()) > before + MORE, f"the counter to go on after: {said}")
         numbers = typed.type(logs).split()
         assert numbers == [str(number) for number in range(1, len(numbers) + 1)]
-        robots.until(lambda: "it resumes from checkpoint" in typed.type(why), "the story to be told")
+        robots.until(lambda: "it resumes from checkpoint" in typed.type(why), "the event log to tell of it")

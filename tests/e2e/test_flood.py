@@ -19,7 +19,7 @@ BUSY = 24
 """Programs beside it: the kernel leaves a part of the processors to ordinary programs, and they share that part."""
 
 FLOOD_S = 10.0
-"""Longer than the lanes may be silent, and than any lease."""
+"""Longer than the worker may be silent, and than any lease."""
 
 
 @pytest.fixture(scope="module")

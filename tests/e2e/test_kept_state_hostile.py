@@ -66,7 +66,7 @@ class Left:
 
 def stop(robot: RobotMachine) -> None:
     robots.stop_agent(robot)
-    robots.until(lambda: not parts(robot, "heart") and not parts(robot, "lanes"), "the agent to be gone")
+    robots.until(lambda: not parts(robot, "main_loop") and not parts(robot, "worker"), "the agent to be gone")
 
 
 @pytest.fixture(scope="module")

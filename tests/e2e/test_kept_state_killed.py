@@ -43,10 +43,10 @@ CYCLE: Final = ("program", "program", "robot", "other", "robot")
 
 OTHERS: Final = {
     "keeper": ("keeper",),
-    "lanes": ("lanes",),
+    "worker": ("worker",),
     "guard": ("guard",),
-    "agent": ("heart", "lanes"),
-    "agent_and_keeper": ("heart", "lanes", "keeper"),
+    "agent": ("main_loop", "worker"),
+    "agent_and_keeper": ("main_loop", "worker", "keeper"),
 }
 
 
@@ -154,7 +154,7 @@ def kill_other(going: Voyage, robot: RobotMachine, way: str) -> None:
     """A part of what stands around the program."""
     before, lives = going.now(), going.lives()
     kill(robot, OTHERS[way])
-    if "heart" in OTHERS[way]:
+    if "main_loop" in OTHERS[way]:
         robots.until(lambda: going.lives() > lives, "the other robot to take over")
         assert (going.now().why, going.now().epoch) == ("taken-over", max(before.epoch, 1) + 1)
     revived(robot, OTHERS[way])

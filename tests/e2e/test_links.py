@@ -113,7 +113,7 @@ def test_a_cable_that_is_out_while_the_radio_lives_degrades_and_moves_nothing(tm
                 brief = ("why", "--brief", "--robot", robot.name)
                 robots.until(
                     lambda at=robot, asked=brief: "wire has no carrier any more" in robots.failover(at, *asked).stdout,  # type: ignore[misc]
-                    "the story to tell of it",
+                    "the event log to tell of it",
                 )
 
         robots.cable(first, "up")
@@ -187,12 +187,12 @@ def test_an_agent_that_restarts_while_the_cable_is_out_is_heard_again_over_the_r
         counts_on(first)
         assert robots.component(first, "count")["epoch"] == epoch
         with only_beats_over_the_air(first):
-            robots.until(lambda: all_answer(second), "everybody's part of the story: questions travel over the radio")
+            robots.until(lambda: all_answer(second), "everybody's event log: questions travel over the radio")
             assert "has ended" in robots.failover(second, "stop", "count").stdout, "and orders"
 
 
 def all_answer(robot: RobotMachine) -> bool:
-    """Whether each robot told its part of the story in time when it was asked there."""
+    """Whether each robot told its event log in time when it was asked there."""
     return all(one["answered"] for one in json.loads(robots.failover(robot, "why", "--json").stdout)["robots"])
 
 

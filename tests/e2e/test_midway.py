@@ -46,14 +46,14 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
         yield both
 
 
-def lanes_of(robot: RobotMachine) -> int:
+def worker_of(robot: RobotMachine) -> int:
     return robots.host_pid(robot, robot.status()["lanes_pid"])
 
 
 def arriving(robot: RobotMachine) -> list[int]:
     """Sizes of the unnamed files in the robot's store: what is coming in."""
     found = []
-    for descriptor in Path(f"/proc/{lanes_of(robot)}/fd").iterdir():
+    for descriptor in Path(f"/proc/{worker_of(robot)}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):
             path = os.readlink(descriptor)
             if path.startswith(str(robot.directory / "state" / "store")) and path.endswith(" (deleted)"):
@@ -81,7 +81,7 @@ def test_a_primary_that_goes_in_the_middle_is_taken_over_from_the_last_whole_sna
 
 def test_a_standby_that_goes_in_the_middle_is_named_and_gets_all_when_it_is_back(pair: Pair) -> None:
     first, second = pair
-    os.kill(lanes_of(second), signal.SIGKILL)  # its heart beats on, and starts another
+    os.kill(worker_of(second), signal.SIGKILL)  # its main loop beats on, and starts another
     before = len(robots.numbers(first))
     robots.until(lambda: "the connection was lost" in robots.failover(first, "why", "count").stdout, "the loss to be told")
     robots.until(lambda: len(robots.numbers(first)) > before, "the program to run on")

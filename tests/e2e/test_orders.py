@@ -135,9 +135,9 @@ def test_a_released_program_outlives_an_agent_restart_and_a_namesake(pair: Pair)
     assert list(first.directory.rglob("*.running"))
     order(first, "release", name="count")
     assert not list(first.directory.rglob("*.running")), "its guard was told, too, when the order was answered"
-    lanes = first.status()["lanes_pid"]
-    os.kill(robots.host_pid(first, lanes), signal.SIGKILL)
-    robots.until(lambda: robots.answers(first) and first.status()["lanes_pid"] != lanes, "the agent's other half to be back")
+    worker = first.status()["lanes_pid"]
+    os.kill(robots.host_pid(first, worker), signal.SIGKILL)
+    robots.until(lambda: robots.answers(first) and first.status()["lanes_pid"] != worker, "the agent's other half to be back")
     namesake = "import time\nfor i in range(50):\n    print('namesake', i, flush=True)\n    time.sleep(0.01)\n"
     ran = robots.failover(first, "run", "--name", "count", "--", "/usr/bin/python3", "-S", "-c", namesake)
     assert ran.stdout.splitlines() == [f"namesake {number}" for number in range(50)]  # while the released one writes on

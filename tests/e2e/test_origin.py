@@ -55,14 +55,14 @@ def test_a_takeover_that_goes_on_from_this_robots_own_checkpoint_is_called_one(t
     """The other robot ran it for a while, and none of its checkpoints came back."""
     with robots.two_robots(tmp_path, cables=TWO) as (first, second):
         protected(first, second, tmp_path)
-        heart = parts(first, "heart")
+        main_loop = parts(first, "main_loop")
         for robot in (first, second):
             robots.cable(robot, "down")  # snapshots travel over this one alone
-        for pid in heart:
+        for pid in main_loop:
             os.kill(pid, signal.SIGSTOP)
         robots.until_taken_over(second)
         told(second, "taken-over")
-        for pid in heart:
+        for pid in main_loop:
             os.kill(pid, signal.SIGCONT)
         robots.until(lambda: robots.component(first, "count").get("role") == "standby", "robot1 to know who runs it")
         second.cut_power()

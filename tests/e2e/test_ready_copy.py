@@ -47,7 +47,9 @@ def test_a_takeover_lets_the_ready_copy_go(tmp_path: Path) -> None:
         assert "ready copy at robot2" in robots.failover(second, "status").stdout
         first.cut_power()
         count_goes_on(second)
-        robots.until(lambda: "taking the ready copy" in robots.failover(second, "why", "count").stdout, "the story to tell of it")
+        robots.until(
+            lambda: "taking the ready copy" in robots.failover(second, "why", "count").stdout, "the event log to tell of it"
+        )
 
 
 @pytest.mark.root

@@ -74,9 +74,9 @@ def waiting(robot: RobotMachine, directory: Path) -> Iterator[Waiting]:
 
 def test_run_goes_on_waiting_when_its_agent_is_killed_and_started_again(tmp_path: Path) -> None:
     with robots.two_robots(tmp_path, HOLD) as (first, _), waiting(first, tmp_path) as run:
-        for names in (("lanes",), ("heart",), ("heart", "lanes")):
+        for names in (("worker",), ("main_loop",), ("main_loop", "worker")):
             kill(first, names)
-            if "heart" in names:
+            if "main_loop" in names:
                 revived(first, names)
             run.expect_more()
         assert robots.component(first, "told")["restores"] == 0
@@ -94,13 +94,13 @@ def test_an_agent_that_comes_back_after_a_takeover_ends_the_copy_that_outlived_i
     with robots.two_robots(tmp_path) as (first, second), waiting(first, tmp_path) as run:
         program = robots.host_pid(first, robots.component(first, "told")["pid"])
         run.expect_more()
-        kill(first, ("heart", "lanes"))
+        kill(first, ("main_loop", "worker"))
         robots.until(lambda: robots.component(second, "told").get("restores") == 1, "robot2 to take over")
         standing, begun = written(first), len(written(second))
         robots.until(lambda: len(written(second)) > begun + MORE, "robot2 to count on")
         assert written(first) == standing, "the old copy stood still before the new one ran"
         assert Path(f"/proc/{program}").exists()
-        revived(first, ("heart", "lanes"))
+        revived(first, ("main_loop", "worker"))
         robots.until(lambda: not Path(f"/proc/{program}").exists(), "the old copy to be ended")
         robots.until(lambda: list((first.directory / "state" / "lost").glob("*.snapshot")), "what became of it, for inspection")
         run.expect_more()

@@ -77,7 +77,7 @@ def test_both_robots_answer_the_same_after_an_end(pair: Pair) -> None:
     until_both_say(pair, 0, "ended (signal 15)")
 
 
-@pytest.mark.parametrize("part", ["keeper", "lanes"])
+@pytest.mark.parametrize("part", ["keeper", "worker"])
 def test_both_robots_answer_the_same_after_a_part_was_killed(pair: Pair, part: str) -> None:
     (killed,) = parts_of_it(pair[0], part)
     os.kill(killed, signal.SIGKILL)
@@ -87,8 +87,8 @@ def test_both_robots_answer_the_same_after_a_part_was_killed(pair: Pair, part: s
 
 def test_a_program_whose_agent_is_killed_is_healthy_at_no_robot(pair: Pair) -> None:
     first, second = pair
-    kill(first, ("heart",))
-    robots.until(lambda: not parts(first, "heart") and not parts(first, "lanes"), "the agent to be gone")
+    kill(first, ("main_loop",))
+    robots.until(lambda: not parts(first, "main_loop") and not parts(first, "worker"), "the agent to be gone")
     robots.until(lambda: answer(second)[0] == 1, "robot2 to say that not all is well")
     robots.until_taken_over(second)
     assert answer(second)[0] == 1, "it has no standby"

@@ -10,7 +10,7 @@ from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 
 
-def test_a_heart_and_its_lanes_do_without_openssl_and_the_tables_of_names(tmp_path: Path) -> None:
+def test_a_main_loop_and_its_worker_do_without_openssl_and_the_tables_of_names(tmp_path: Path) -> None:
     with robots.two_robots(tmp_path) as (first, _):
         parts = {name: mapped_by(first, name) for name in ("agent.main", "agent.worker.process")}
         for mapped in parts.values():

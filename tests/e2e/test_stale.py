@@ -22,10 +22,10 @@ from tests.e2e.test_deaths import COUNT, numbers, parts
 pytestmark = pytest.mark.root
 
 STOPPED = {
-    "heart": ("heart",),
-    "agent": ("heart", "lanes"),
-    "heart_and_keeper": ("heart", "keeper"),
-    "agent_and_keeper": ("heart", "lanes", "keeper"),
+    "main_loop": ("main_loop",),
+    "agent": ("main_loop", "worker"),
+    "main_loop_and_keeper": ("main_loop", "keeper"),
+    "agent_and_keeper": ("main_loop", "worker", "keeper"),
 }
 """Parts whose rest makes a robot silent; the guard, which stands by itself, freezes the program before its lease ends."""
 
@@ -92,7 +92,7 @@ def kept_aside(robot: RobotMachine) -> int:
 
 def parts_of_it(robot: RobotMachine, name: str) -> list[int]:
     """The processes of that kind which the program has to do with: spare guards and keepers wait besides."""
-    if name == "lanes":
+    if name == "worker":
         return parts(robot, name)
     program = robots.host_pid(robot, robots.component(robot, "count")["pid"])
     if name == "guard":
@@ -132,7 +132,7 @@ def test_who_stops_and_wakes_up_stale_has_not_run_on(pair: Pair, way: str) -> No
     assert kept_aside(first) == len(standing), "and it did not run on before it was told"
 
 
-ALONE = [("lanes", signal.SIGSTOP), ("keeper", signal.SIGSTOP), ("guard", signal.SIGSTOP), ("guard", signal.SIGKILL)]
+ALONE = [("worker", signal.SIGSTOP), ("keeper", signal.SIGSTOP), ("guard", signal.SIGSTOP), ("guard", signal.SIGKILL)]
 
 
 @pytest.mark.parametrize(("part", "number"), ALONE)

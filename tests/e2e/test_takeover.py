@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.main_loop.loop import LANES_SILENCE_NS, NANOSECONDS_A_SECOND
+from agent.main_loop.loop import NANOSECONDS_A_SECOND, WORKER_SILENCE_NS
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.trace.tracee import Tracee
 from failover.cli.demo.robots import LEASE_MS
@@ -81,9 +81,9 @@ def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, Ro
     first, second = pair
     start_counting(first, 1_000_000)
     robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
-    lanes = robots.host_pid(first, first.status()["lanes_pid"])
+    worker = robots.host_pid(first, first.status()["lanes_pid"])
     pid = robots.component(first, "count")["pid"]
-    os.kill(lanes, signal.SIGKILL)
+    os.kill(worker, signal.SIGKILL)
     robots.until(
         lambda: robots.answers(first) and robots.component(first, "count").get("pid") == pid, "the guard to be found again"
     )
@@ -95,30 +95,30 @@ def test_components_outlive_an_agent_that_is_killed(pair: tuple[RobotMachine, Ro
 
 
 @pytest.mark.root
-def test_a_lanes_process_that_takes_long_to_end_holds_up_no_beat(pair: tuple[RobotMachine, RobotMachine]) -> None:
-    """On a busy machine it may wait for a processor before it can end. Here we hold its end up: the heart hears nothing of it,
-    ends it at last, and beats on for a dozen leases while it still is there.
+def test_a_worker_that_takes_long_to_end_holds_up_no_beat(pair: tuple[RobotMachine, RobotMachine]) -> None:
+    """On a busy machine it may wait for a processor before it can end. Here we hold its end up: the main loop hears nothing of
+    it, ends it at last, and beats on for a dozen leases while it still is there.
     """
     first, second = pair
     start_counting(first, 1_000_000)
     robots.until(lambda: robots.checkpoints(second, "count") >= SNAPSHOTS, "checkpoints at robot2")
     pid = robots.component(first, "count")["pid"]
-    lanes = Tracee(robots.host_pid(first, first.status()["lanes_pid"]))
-    lanes.seize(PTRACE_O_TRACEEXIT)
-    os.kill(lanes.pid, signal.SIGKILL)
+    worker = Tracee(robots.host_pid(first, first.status()["lanes_pid"]))
+    worker.seize(PTRACE_O_TRACEEXIT)
+    os.kill(worker.pid, signal.SIGKILL)
     try:
-        robots.until(lambda: procfs.status(lanes.pid).state == "t", "its end to be held up")
+        robots.until(lambda: procfs.status(worker.pid).state == "t", "its end to be held up")
         life = second.status()["life"]
-        until = time.monotonic() + (LANES_SILENCE_NS + 12 * LEASE_MS * MS) / NANOSECONDS_A_SECOND
+        until = time.monotonic() + (WORKER_SILENCE_NS + 12 * LEASE_MS * MS) / NANOSECONDS_A_SECOND
         while time.monotonic() < until:
             (peer,) = second.status()["peers"]
             assert peer["state"] != "dead"
             assert robots.component(second, "count")["role"] == "standby"
     finally:
-        os.waitpid(lanes.pid, WALL)
-        lanes.cont()
-        os.waitpid(lanes.pid, WALL)  # its parent hears of it after its tracer
-    robots.until(lambda: robots.answers(first), "another lanes process to answer")
+        os.waitpid(worker.pid, WALL)
+        worker.cont()
+        os.waitpid(worker.pid, WALL)  # its parent hears of it after its tracer
+    robots.until(lambda: robots.answers(first), "another worker to answer")
     robots.until(lambda: robots.component(first, "count").get("pid") == pid, "the guard to be found again")
     assert second.status()["life"] == life
     assert robots.component(first, "count")["restores"] == 0
@@ -136,13 +136,13 @@ def test_a_cable_that_is_cut_is_noticed_and_one_that_is_back_too(pair: tuple[Rob
     robots.until(lambda: robots.connected(first) and robots.connected(second), "both to hear each other again")
 
 
-def test_no_thread_of_a_heart_is_at_ordinary_priority(pair: tuple[RobotMachine, RobotMachine]) -> None:
+def test_no_thread_of_the_main_loop_is_at_ordinary_priority(pair: tuple[RobotMachine, RobotMachine]) -> None:
     """One that writes to the disk could be kept from a processor with the interpreter's lock in its hand, and beats with it."""
     first, _ = pair
     if not first.status()["realtime"]:
         pytest.skip("needs real-time priority")
-    heart = robots.host_pid(first, first.status()["pid"])
-    policies = [os.sched_getscheduler(int(thread)) for thread in os.listdir(f"/proc/{heart}/task")]
+    main_loop = robots.host_pid(first, first.status()["pid"])
+    policies = [os.sched_getscheduler(int(thread)) for thread in os.listdir(f"/proc/{main_loop}/task")]
     assert len(policies) > 1
     assert {policy & ~os.SCHED_RESET_ON_FORK for policy in policies} == {os.SCHED_FIFO}
 

@@ -66,7 +66,7 @@ def forgotten(pair: Pair) -> Iterator[None]:
         (("handover", "sleeper", "--to", "mars"), FAILED, "the team knows robot1, robot2"),
         (("prefer", "sleeper", "mars"), FAILED, "the team knows robot1, robot2"),
         (("prefer", "sleeper"), USAGE, "the following arguments are required: ROBOT"),
-        (("failback", "sleeper"), HEALTHY, "runs at robot1 already, its preferred robot"),
+        (("failback", "sleeper"), HEALTHY, "runs at robot1 already, where it was started"),
         (("protect", "1073741823"), FAILED, "No such process"),
         (("protect", "me"), USAGE, "is not a whole number above zero"),
         (("logs", "nobody"), FAILED, "no component is called 'nobody'"),

@@ -109,18 +109,18 @@ def test_protection_that_was_given_up_is_said_and_nothing_is_taken_over(pair: Pa
     robots.until(says_of_its_output_alone, "no note but of its output: neither that captures are slow")
 
 
-def lanes_of(robot: RobotMachine) -> int:
+def worker_of(robot: RobotMachine) -> int:
     return robots.host_pid(robot, robot.status()["lanes_pid"])
 
 
 @contextlib.contextmanager
 def full_disk(robot: RobotMachine) -> Iterator[None]:
     """Nothing that the robot's agent writes gets beyond a file's first byte: what a full disk is to it, without root."""
-    lanes = robots.host_pid(robot, robot.status()["lanes_pid"])
-    before = resource.prlimit(lanes, resource.RLIMIT_FSIZE)
-    resource.prlimit(lanes, resource.RLIMIT_FSIZE, (1, before[1]))
+    worker = robots.host_pid(robot, robot.status()["lanes_pid"])
+    before = resource.prlimit(worker, resource.RLIMIT_FSIZE)
+    resource.prlimit(worker, resource.RLIMIT_FSIZE, (1, before[1]))
     yield
-    resource.prlimit(lanes, resource.RLIMIT_FSIZE, before)
+    resource.prlimit(worker, resource.RLIMIT_FSIZE, before)
 
 
 def test_a_standby_that_cannot_write_is_named_at_both_robots(pair: Pair, flag: Path) -> None:

@@ -113,13 +113,13 @@ def test_what_waits_is_used_by_a_handover_and_ends_with_the_component(tmp_path: 
         robots.until(lambda: not programs(first) and not programs(second), "all of it to end")
 
 
-def test_what_waits_ends_with_the_lanes_and_another_takes_its_place(tmp_path: Path) -> None:
+def test_what_waits_ends_with_the_worker_and_another_takes_its_place(tmp_path: Path) -> None:
     with robots.two_robots(tmp_path) as (first, second):
         counting(first, tmp_path)
         until_warm(first, second)
         (lost,) = programs(second)
-        kill(second, ("lanes",))
-        revived(second, ("lanes",))
+        kill(second, ("worker",))
+        revived(second, ("worker",))
         robots.until(lambda: starts(tmp_path) == 3, "another one to be started")
         until_warm(first, second)
         assert lost not in programs(second)

@@ -44,7 +44,7 @@ def test_a_takeover_is_told_with_what_was_seen_and_what_it_cost_and_outlives_the
     first, second = pair
     first.cut_power()
     robots.until_taken_over(second)
-    robots.until(lambda: bool(lines(second, "resumes from checkpoint")), "the story to be told")
+    robots.until(lambda: bool(lines(second, "resumes from checkpoint")), "the event log to tell of it")
     (claim,) = lines(second, "claims epoch", "--robot", "robot2")
     (seen,) = claim["seen"]
     assert (seen["robot"], seen["state"]) == ("robot1", "dead")
@@ -115,7 +115,7 @@ def test_both_robots_tell_one_story_in_order_though_a_clock_is_wrong_by_five_sec
     robots.until_taken_over(second)
     os.kill(agent, signal.SIGCONT)
     robots.until(lambda: robots.component(first, "count").get("role") == "standby", "robot1 to follow")
-    robots.until(lambda: bool(lines(first, "hears that its copy is stale")), "the story to be told")
+    robots.until(lambda: bool(lines(first, "hears that its copy is stale")), "the event log to tell of it")
     for robot, other, ahead_ms in ((first, "robot2", SKEW_S * 1_000), (second, "robot1", -SKEW_S * 1_000)):
         told = robots.until(lambda at=robot: told_by_both(at), "both robots to tell their part")  # type: ignore[misc]
         clocks = {one["robot"]: one["clock_offset_ms"] for one in told["robots"]}
@@ -128,7 +128,7 @@ def test_both_robots_tell_one_story_in_order_though_a_clock_is_wrong_by_five_sec
 
 
 def told_by_both(robot: RobotMachine) -> dict[str, Any]:
-    """The story of the component as it is told there, once both robots have answered in time."""
+    """The event log of the component as it is told there, once both robots have answered in time."""
     told = why(robot, "count")
     return told if all(one["answered"] for one in told["robots"]) else {}
 

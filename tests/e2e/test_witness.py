@@ -74,7 +74,7 @@ def test_a_witness_decides_between_two_robots_and_does_nothing_else(tmp_path: Pa
             refused = robots.failover(gate, *order)
             assert refused.returncode == 1 and "gate is a witness: it votes, and neither runs nor keeps" in refused.stderr
         robots.until(lambda: "robot2 claims epoch" in robots.failover(gate, "why", "count").stdout, "robot2 to tell its part")
-        assert len(agents(gate)) == 2, "the heart and its lines"
+        assert len(agents(gate)) == 2, "the main loop and its worker"
         for pid in agents(gate):
             status = Path(f"/proc/{pid}/status").read_text()
             assert re.search(r"^CapEff:\s+0+$", status, re.MULTILINE) and re.search(r"^CapBnd", status, re.MULTILINE)

@@ -167,13 +167,13 @@ def _let_one_lie(world: World, invariants: Invariants, random: Random, until_ns:
 
 def _lose_a_disk(world: World, random: Random) -> None:
     """One robot of the team, once: it comes back empty."""
-    name, ballot = random.choice(list(world.robots)), random.random() < 0.3
+    name, vote_record = random.choice(list(world.robots)), random.random() < 0.3
     at_ns = random.randrange(TROUBLE_NS)
 
     def lose() -> None:
         world.faults += 1
         world.power_off(name)
-        world.new_disk(name, ballot)
+        world.new_disk(name, vote_record)
 
     world.at(at_ns, lose)
     world.at(at_ns + random.randrange(10, 500) * MS, lambda: world.power_on(name))

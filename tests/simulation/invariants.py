@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.types import ENDED, MS, Ballot, ComponentView, OnLoss, Resumption, State, WhenAlone
+from failover.core.types import ENDED, MS, ComponentView, OnLoss, Resumption, State, VoteRecord, WhenAlone
 from failover.core.wire.messages import ORDERED, Beat
 from tests.simulation.deeds import epoch_of
 from tests.simulation.liars import INVENTED_NAME
-from tests.simulation.robots import NewDisk, ballot_of
+from tests.simulation.robots import NewDisk, vote_record_of
 from tests.simulation.world import World
 
 SURELY_UNREAD_NS = 5_000 * MS
@@ -66,7 +66,7 @@ class Invariants:
         match what:
             case None:
                 self._one_acts(world)
-            case Ballot():
+            case VoteRecord():
                 self._epochs_grow(world, robot, what)
                 self._one_vote_an_epoch(world, robot, what)
             case NewDisk():
@@ -129,15 +129,15 @@ class Invariants:
             if other not in here.read and world.now_ns - at_ns < SURELY_UNREAD_NS:
                 raise _broken(world, f"{robot} takes {act.component} over, and receives from {other} what it cannot authenticate")
 
-    def _epochs_grow(self, world: World, robot: str, ballot: Ballot) -> None:
-        kept = {record.name: record.epoch for record in ballot.records}
+    def _epochs_grow(self, world: World, robot: str, vote_record: VoteRecord) -> None:
+        kept = {record.name: record.epoch for record in vote_record.records}
         for (name, component), epoch in self.epochs.items():
             if name == robot and kept.get(component, 0) < epoch:
                 raise _broken(world, f"{robot}: the epoch of {component} fell from {epoch} to {kept.get(component, 0)}")
         self.epochs.update({(robot, component): epoch for component, epoch in kept.items()})
 
-    def _one_vote_an_epoch(self, world: World, robot: str, ballot: Ballot) -> None:
-        for record in ballot.records:
+    def _one_vote_an_epoch(self, world: World, robot: str, vote_record: VoteRecord) -> None:
+        for record in vote_record.records:
             if not self.votes or not record.primary or record.state in ENDED:
                 continue
             key = (robot, record.name, record.epoch)
@@ -152,12 +152,12 @@ class Invariants:
 
     def _forget(self, robot: str, loss: NewDisk) -> None:
         self.gone.update(loss.lost)
-        if loss.ballot:
+        if loss.vote_record:
             self.epochs = {key: epoch for key, epoch in self.epochs.items() if key[0] != robot}
             self.given = {key: primary for key, primary in self.given.items() if key[0] != robot}
 
     def _durable_before_said(self, world: World, robot: str, beat: Beat) -> None:
-        durable = {record.name: record.epoch for record in ballot_of(world.robots[robot]).records}
+        durable = {record.name: record.epoch for record in vote_record_of(world.robots[robot]).records}
         for entry in beat.entries:
             if entry.flags & ORDERED:
                 self.ordered.add((entry.name, entry.epoch))
@@ -225,7 +225,7 @@ class Invariants:
         in_place = (
             any(
                 record.name == act.component and record.state is State.PRIMARY and record.primary == robot
-                for record in ballot_of(world.robots[robot]).records
+                for record in vote_record_of(world.robots[robot]).records
             )
             and (robot, act.component) in self.crashing
         )
@@ -237,7 +237,7 @@ class Invariants:
         """After healing: each component that goes on acts at one robot, and the other protects it."""
         if self.liar:
             return
-        for component in sorted({record.name for robot in world.robots.values() for record in ballot_of(robot).records}):
+        for component in sorted({record.name for robot in world.robots.values() for record in vote_record_of(robot).records}):
             if component.startswith(INVENTED_NAME):
                 continue  # there is none such
             states = {name: state_at(world, name, component) for name in world.robots}
@@ -274,7 +274,7 @@ def seen_at(world: World, robot: str, component: str) -> ComponentView:
 
 
 def _waits_at_a_standby(world: World, component: str) -> bool:
-    specs = (record.spec for robot in world.robots.values() for record in ballot_of(robot).records if record.name == component)
+    specs = (one.spec for robot in world.robots.values() for one in vote_record_of(robot).records if one.name == component)
     return any(spec is not None and spec.rules.on_loss is OnLoss.TAKEOVER for spec in specs)
 
 

@@ -41,7 +41,7 @@ def lease_from_the_answer() -> Any:
     return patch.object(Membership, "lease_ns", counted)
 
 
-def forgetful_ballot() -> Any:
+def forgetful_vote_record() -> Any:
     """Epochs are not made durable."""
     return patch.object(node.Node, "_persist", lambda self: None)
 
@@ -490,7 +490,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
 MUTANTS: tuple[Mutant, ...] = (
     impatient_standby,
     lease_from_the_answer,
-    forgetful_ballot,
+    forgetful_vote_record,
     deaf_to_stale,
     everybody_yields,
     no_consent,
@@ -515,7 +515,7 @@ ELECTIVE_MUTANTS: tuple[Mutant, ...] = (
     no_margin,
     impatient_standby,
     lease_from_the_answer,
-    forgetful_ballot,
+    forgetful_vote_record,
     forgotten_votes,
     disloyal_voter,
     minority_rules,

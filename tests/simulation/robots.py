@@ -9,7 +9,7 @@ from failover.core.event_log.decisions import Decision
 from failover.core.events import Event
 from failover.core.frames.lane import FrameLane
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, Config, Launch
+from failover.core.types import MS, Config, Launch, VoteRecord
 from failover.core.vote_record import decode
 from tests.simulation.liars import Lie
 
@@ -22,9 +22,9 @@ KEEPS_STATE = "cooperative"
 
 @dataclass(frozen=True, slots=True)
 class NewDisk:
-    """A robot has lost its checkpoints; ``ballot``: and its votes."""
+    """A robot has lost its checkpoints; ``vote_record``: and its votes."""
 
-    ballot: bool
+    vote_record: bool
     lost: tuple[Position, ...]
 
 
@@ -80,7 +80,7 @@ class Robot:
     config: Config
     clock: Clock
     boot: int = 0
-    ballot: bytes = b""
+    vote_record: bytes = b""
     store: dict[str, list[Position]] = field(default_factory=dict)
     node: Node | None = None
     programs: dict[str, Program] = field(default_factory=dict)
@@ -102,7 +102,7 @@ class Robot:
     broken_store: bool = False
     refuses: bool = False
     lacks: tuple[str, ...] | None = ()
-    pending: Ballot | None = None
+    pending: VoteRecord | None = None
     lie: Lie | None = None
     told: list[Decision] = field(default_factory=list)
     writing: list[tuple[str, Position]] = field(default_factory=list)
@@ -139,6 +139,6 @@ class Network:
         self.healed = True
 
 
-def ballot_of(robot: Robot) -> Ballot:
+def vote_record_of(robot: Robot) -> VoteRecord:
     """What the robot will remember after a power cut at this instant."""
-    return decode(robot.ballot)
+    return decode(robot.vote_record)

@@ -134,7 +134,7 @@ class Story:
                 others = {*config.peers} - {arguments[1]} if verb == "old-team" else {*config.peers, arguments[1]}
                 world.robots[robot].config = replace(config, peers=tuple(sorted(others)))
             case "new-disk" | "new-robot":
-                world.new_disk(robot, ballot=verb == "new-robot")
+                world.new_disk(robot, vote_record=verb == "new-robot")
             case "epoch":
                 self._expect(f"the epoch at {robot} is", str(seen_at(world, robot, COMPONENT).epoch), arguments[1])
             case "gives-up":

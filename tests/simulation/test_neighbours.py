@@ -100,7 +100,7 @@ def test_both_are_dead_one_is_back_with_a_new_disk_and_the_server_returns_both_c
     kept = {name: world.values[world.robots["server1"].store[name][-1]] for name in (A, B)}
     world.power_off("robot2")
     world.power_off("robot1")
-    world.new_disk("robot2", ballot=True)
+    world.new_disk("robot2", vote_record=True)
     after(world, 500 * MS)
     world.power_on("robot2")
     after(world, RETURN_NS)
@@ -117,7 +117,7 @@ def test_a_robot_that_lost_its_store_waits_for_the_standby_before_it_goes_on_fro
     assert newest(world, "server1", A) < kept
     world.power_off("robot2")
     world.power_off("robot1")
-    world.new_disk("robot1", ballot=False)
+    world.new_disk("robot1", vote_record=False)
     world.network.cuts.clear()
     world.power_on("robot1")
     after(world, 700 * MS)

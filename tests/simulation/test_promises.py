@@ -225,7 +225,7 @@ def test_where_a_server_stands_by_it_gives_the_checkpoint_to_the_first_robot_tha
     assert three.says_of_it("robot1") == sentence and three.story_of_it("robot1") == [sentence]
     value = three.world.values[three.world.robots["server1"].store[PART][-1]]
     three.world.power_off("robot1")
-    three.world.new_disk("robot2", ballot=True)
+    three.world.new_disk("robot2", vote_record=True)
     three.world.power_on("robot2")
     assert three.after(3_000) == ["robot2"]
     assert three.world.robots["robot2"].programs[PART].value >= value

@@ -98,7 +98,7 @@ def test_a_robot_with_a_new_disk_begins_nothing_afresh_of_which_another_member_k
     world.run(4_000 * MS)
     assert world.acting(SPEC.name) == ["robot2"]
     world.power_off("robot2")
-    world.new_disk("robot2", ballot=True)
+    world.new_disk("robot2", vote_record=True)
     world.power_on("robot2")
     world.run(10_000 * MS)
     assert world.acting(SPEC.name) == []

@@ -20,7 +20,7 @@ from failover.core.events import Event, Exited, Received, Tick, Unread
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.roster import roster
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, Config, Found, Held
+from failover.core.types import MS, Config, Found, Held, VoteRecord
 from failover.core.vote_record import decode, encode
 from failover.core.wire.messages import Beat
 from tests.simulation.deeds import Deeds
@@ -38,7 +38,7 @@ TORN = 0.5
 
 
 Watcher = Callable[["World", str, object], None]
-"""Called with (world, robot, what happened): an act that is carried out, a ballot that became durable, beats that leave."""
+"""Called with (world, robot, what happened): an act that is carried out, a vote record that became durable, beats that leave."""
 
 
 class World:
@@ -89,7 +89,7 @@ class World:
         self.now_ns = until_ns
 
     def note(self, sentence: str) -> None:
-        """Something for whoever reads the story afterwards."""
+        """Something for the log that a failed seed prints."""
         self.log.append(f"{self.now_ns / MS:10.3f}  {sentence}")
 
     def _tell(self, robot: str, what: object) -> None:
@@ -121,7 +121,9 @@ class World:
                 robot.lane.hear(other, KEY + other.encode())
                 robot.lane.speak(other, KEY + name.encode())
         keep = {
-            record.name for record in decode(robot.ballot).records if record.spec and record.spec.launch.engine == KEEPS_STATE
+            record.name
+            for record in decode(robot.vote_record).records
+            if record.spec and record.spec.launch.engine == KEEPS_STATE
         }
         held = tuple(
             Held(component, tuple(positions[-8:]), component in keep) for component, positions in robot.store.items() if positions
@@ -130,7 +132,7 @@ class World:
             Found(component, program.epoch, program.exit_status is None, program.exit_status or 0)
             for component, program in robot.programs.items()
         )
-        robot.node = Node(robot.config, robot.boot, decode(robot.ballot), self.local(robot), held, found)
+        robot.node = Node(robot.config, robot.boot, decode(robot.vote_record), self.local(robot), held, found)
         self.note(f"{name} starts, life {robot.boot}")
         self.feed(robot, Tick())
 
@@ -148,7 +150,7 @@ class World:
     def _tear(self, robot: Robot) -> None:
         """A rename, or a new file, that was on its way to the disk: it got there and nobody was told, or it did not."""
         if robot.pending is not None and self.random.random() < TORN:
-            robot.ballot = encode(robot.pending)
+            robot.vote_record = encode(robot.pending)
             self._tell(robot.name, robot.pending)
         for component, position in robot.writing:
             if self.random.random() < TORN:
@@ -156,21 +158,21 @@ class World:
         robot.pending = None
         robot.writing.clear()
 
-    def new_disk(self, name: str, ballot: bool) -> None:
+    def new_disk(self, name: str, vote_record: bool) -> None:
         """The checkpoints of a robot that is off are gone; perhaps what it has decided, too (not how often it started)."""
         robot = self.robots[name]
         lost = tuple(position for positions in robot.store.values() for position in positions)
         robot.store.clear()
-        robot.ballot = robot.ballot if not ballot else b""
-        self.note(f"{name} gets a new disk{', and forgets its votes' if ballot else ''}")
-        self._tell(name, NewDisk(ballot, lost))
+        robot.vote_record = robot.vote_record if not vote_record else b""
+        self.note(f"{name} gets a new disk{', and forgets its votes' if vote_record else ''}")
+        self._tell(name, NewDisk(vote_record, lost))
 
     def later(self, name: str, epochs: int) -> None:
         """Switch a robot off; so many epochs more have passed when it comes back, as its disk says."""
         self.power_off(name)
         robot = self.robots[name]
-        records = (replace(record, epoch=record.epoch + epochs) for record in decode(robot.ballot).records)
-        robot.ballot = encode(Ballot(tuple(records)))
+        records = (replace(record, epoch=record.epoch + epochs) for record in decode(robot.vote_record).records)
+        robot.vote_record = encode(VoteRecord(tuple(records)))
 
     def power_off(self, name: str) -> None:
         """Take everything that is not on the disk."""
@@ -266,7 +268,7 @@ class World:
             return
         robot.pending = None
         if ready.persist is not None:
-            robot.ballot = encode(ready.persist)
+            robot.vote_record = encode(ready.persist)
             self._tell(robot.name, ready.persist)
         wait_ns = self.soon(0, 0.2) if ready.persist is not None else 0
         self.after(wait_ns, lambda: self._obey(robot, life, ready))

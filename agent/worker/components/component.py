@@ -13,7 +13,7 @@ base.
 
 On the standby, when it takes over:
 
-    component = await launch.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted
+    component = await launch.restore(name, chain_descriptors, places, options)         # stopped, whole, uncommitted
     await component.resume()                                                            # it runs, protected already
 """
 
@@ -109,7 +109,7 @@ class Component:
     Attributes:
         name, pid, inner_pid, isolated: as the guard said.
         logs: its output; `OutputLogs.read` serves ``failover logs``.
-        guest: where it is somebody else's child.
+        guest: where it is not the guard's child.
         engine_wanted: as it was asked for: `AUTO`, `PTRACE` or `COOPERATIVE`.
         task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
         goes_on: it was started again, or had waited, with a state that it was to go on from.
@@ -118,8 +118,8 @@ class Component:
         keeper: what captures it.
         commit: what `resume` commits to it with.
         prepared: a program that is to be started with a state, by `resume`.
-        streams: what its guard gave of them: counters, two read ends, two logs; none of somebody else's child.
-        let_go_ns: when `resume` let it go on, by our clock; 0 where nobody told.
+        streams: what its guard gave of them: counters, two read ends, two logs; none of a program that is not the guard's child.
+        let_go_ns: when `resume` let it go on, by our clock; 0 where it is not known.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
     """
 
@@ -186,7 +186,7 @@ class Component:
             told: a signal, and its value, that it gets before its next instruction.
 
         Returns:
-            Why it was not told; "" if it was, or nobody wanted that.
+            Why it was not told; "" if it was, or was not wanted.
 
         Raises:
             RestoreError, GuardError, KeeperLostError: it did not get that far; nothing of it is left.
@@ -244,7 +244,7 @@ class Component:
 
         Raises:
             checkpoint.errors.UnsupportedError: with the reasons; the program was not touched.
-            ProcessGoneError: somebody else's child has ended, so that its number may be another process's.
+            ProcessGoneError: a program that is not the guard's child has ended, so that its number may be another process's.
             ProbeError, KeeperLostError.
         """
         followed = self.engine, (self.task_pid or self.pid) if self.engine == COOPERATIVE else self.pid
@@ -347,7 +347,7 @@ class Component:
     def limit_output(self, limited: bool) -> None:
         """Bound how much of held output may wait, or do not.
 
-        A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while nobody stands by,
+        A program that keeps its state makes no checkpoint while it waits in a write: it is bounded only while no robot stands by,
         for then its checkpoints would not help.
         """
         if self._guard.open and self.logs.is_held and limited != self._output_limited:
@@ -505,7 +505,7 @@ class Component:
             self.guest.end(self.name)
         if not self.ended.done():
             self.ended.set_exception(GuardLostError(f"the guard of {self.name} ended, and its program with it"))
-            self.ended.exception()  # noted: after a release nobody waits for the end
+            self.ended.exception()  # noted: after a release no task waits for the end
 
     def _forget_guest(self) -> None:
         if self.guest is not None:

@@ -22,7 +22,7 @@ from failover.core.types import COMMITTED, Launch
 
 
 class Surroundings(Struct):
-    """What every charge works with.
+    """What every supervisor works with.
 
     Attributes:
         tell: passes an event to the core.

@@ -48,7 +48,7 @@ class Following:
         Raises:
             KeeperLostError: none can be had.
         """
-        self._link, self.followed = await self._places.nursery.keeper(), None
+        self._link, self.followed = await self._places.process_pool.keeper(), None
         self._remembers_nothing()
         return self._link
 

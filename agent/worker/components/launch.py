@@ -1,7 +1,7 @@
 """Ways in which a component begins on this robot: started, taken in, restored from a checkpoint, or found again.
 
 component = await launch.start("/lab/robot1/mapper", program, places)           # it runs, and is not protected yet
-component = await launch.restore(name, chain_descriptors, places, outage_ns=…)  # stopped, whole, uncommitted: `resume` it
+component = await launch.restore(name, chain_descriptors, places, options)      # stopped, whole, uncommitted: `resume` it
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from checkpoint.linux.spawn.inherited_limits import Inheritance
 from checkpoint.model import Snapshot
 from checkpoint.program import epoch_variable
 from checkpoint.segment.task_messages import Origin
+from checkpoint.sentences import copy_outdated
 from checkpoint.snapshot import format
 from checkpoint.snapshot.carried_files import paths_of
 from checkpoint.snapshot.credentials import Owner
@@ -59,6 +60,37 @@ class Program(Struct, frozen=True):
     brought: tuple[tuple[str, str, int], ...] = ()
 
 
+class RestoreOptions(Struct, frozen=True):
+    """How a component comes back on this robot.
+
+    Attributes:
+        outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
+        owner: uid; None: the one it ran as. A program that is not root's opens its files with its owner's rights alone.
+        started: what it was started with; None: not known.
+        task: for a program that may still say that it keeps its state.
+        epoch: the fencing token.
+        terms: this robot's.
+        stood_still: nothing of it has run since the newest snapshot.
+    """
+
+    outage_ns: int = 0
+    owner: int | None = None
+    started: Inheritance | None = None
+    task: messages.Task | None = None
+    epoch: int = 0
+    terms: Terms = NO_TERMS
+    stood_still: bool = False
+
+    def owner_of(self, outline: Snapshot) -> int:
+        """Whose the component is, also where nothing but its snapshot tells."""
+        return outline.process.credentials.uids[0] if self.owner is None else self.owner
+
+    @property
+    def engine(self) -> str:
+        """The engine that the component's program wants."""
+        return self.task.engine if self.task is not None else PTRACE
+
+
 async def start(name: str, program: Program, places: Places, epoch: int = 0, owner: int | None = None) -> Component:
     """Start a guard and under it the program. It runs, and is not protected yet.
 
@@ -68,7 +100,7 @@ async def start(name: str, program: Program, places: Places, epoch: int = 0, own
     Raises:
         GuardError: it could not be started; nothing is left of it.
     """
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     try:
         component.begin_output(os.geteuid() if owner is None else owner)
     except OSError as error:
@@ -115,7 +147,7 @@ async def watch(name: str, guest: Guest, places: Places) -> Component:
         GuardError: it has ended.
     """
     try:
-        component = Component(name, await places.nursery.guard(), places)
+        component = Component(name, await places.process_pool.guard(), places)
     except (GuardError, OSError):
         guest.close()
         raise
@@ -128,61 +160,34 @@ async def restore(
     name: str,
     chain: Sequence[int],
     places: Places,
-    *,
-    outage_ns: int,
-    owner: int | None = None,
-    started: Inheritance | None = None,
+    options: RestoreOptions,
     laps: Laps | None = None,
-    task: messages.Task | None = None,
-    epoch: int = 0,
-    terms: Terms = NO_TERMS,
-    stood_still: bool = False,
 ) -> Component:
     """Rebuild a component from a chain (descriptors of encoded snapshots, oldest first), stopped, committed to nothing.
 
-    Whatever fails, and whoever dies before `resume`: nothing of it is left.
+    Where a step fails, or agent or keeper ends before `resume`, nothing of it is left.
 
     Args:
         laps: told how long each stage took.
-        outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
-        task: for a program that may still say that it keeps its state.
-        owner: uid; None: whoever it ran as. What is not root's opens its files with its owner's rights, and gets no others.
-        started: what it was started with; None: not known.
-        terms: this robot's.
-        stood_still: nothing of it has run since the newest snapshot.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
     """
     laps = laps or Laps()
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
-    theirs = outline.process.credentials
-    owner = theirs.uids[0] if owner is None else owner
-    check_rights(name, outline, owner, started)
+    owner = options.owner_of(outline)
+    check_rights(name, outline, owner, options.started)
     await asyncio.to_thread(complete_logs, log_directory(name, places), chain, owner=owner)
     laps.lap("reading the newest")
-    component = Component(name, await places.nursery.guard(), places)
-    request = _vessel_for(name, outline, places, outage_ns, total_of(outline.output), task)
-    component.engine_wanted = task.engine if task is not None else PTRACE
-    component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
-    component.keeper.names = names_of_contents(needs(outline), places.contents)
+    component = Component(name, await places.process_pool.guard(), places)
+    request = _vessel_for(name, outline, places, options.outage_ns, total_of(outline.output), options.task)
+    _prepare(component, outline, places, options)
     try:
         keeper = await component.keeper.give()
         laps.lap("guard and keeper")
         await _vessel(component, request, keeper)
         laps.lap("vessel")
-        order = keeper_messages.Restore(
-            component.pid,
-            name,
-            outage_ns,
-            streams=True,
-            robot=places.robot,
-            own_eyes=owner != ROOT,
-            epoch=epoch,
-            contents=places.contents,
-            terms=component.keeper.terms,
-            stood_still=stood_still,
-        )
+        order = _order(component, places, options, owner, streams=True)
         restored, _ = await component.keeper.ask(order, (*chain, *component.streams))
         laps.lap("restore")
     except (CheckpointError, GuardError, KeeperLostError):
@@ -190,6 +195,30 @@ async def restore(
         raise
     component.notes = (*component.notes, *restored.notes)
     return component
+
+
+def _prepare(component: Component, outline: Snapshot, places: Places, options: RestoreOptions) -> None:
+    """Tell the component on which terms its keeper follows it from now on."""
+    component.engine_wanted = options.engine
+    component.keeper.terms = terms_of(outline, options.terms, bound_of(options.owner_of(outline), options.started))
+    component.keeper.names = names_of_contents(needs(outline), places.contents)
+
+
+def _order(
+    component: Component, places: Places, options: RestoreOptions, owner: int, *, streams: bool
+) -> keeper_messages.Restore:
+    return keeper_messages.Restore(
+        component.pid,
+        component.name,
+        options.outage_ns,
+        streams=streams,
+        robot=places.robot,
+        own_eyes=owner != ROOT,
+        epoch=options.epoch,
+        contents=places.contents,
+        terms=component.keeper.terms,
+        stood_still=options.stood_still,
+    )
 
 
 def _vessel_for(
@@ -234,7 +263,7 @@ async def lay(
     counted_ns = now_ns()
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
     check_rights(name, outline, owner, started)
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
     request = _vessel_for(name, outline, places, age_ns + COPY_CLOCKS_AHEAD_NS, None, counted_ns=counted_ns)
     try:
@@ -252,23 +281,11 @@ async def lay(
 
 def stale(name: str) -> ChainError:
     """A ready copy does not lead to what the store holds now: a base has come."""
-    return ChainError(f"the ready copy of {name} must be built again: a new chain has begun")
+    return ChainError(copy_outdated("a new chain has begun", name))
 
 
-async def finish(
-    component: Component,
-    outline: Snapshot,
-    places: Places,
-    *,
-    outage_ns: int,
-    owner: int | None,
-    started: Inheritance | None,
-    task: messages.Task | None,
-    epoch: int,
-    terms: Terms,
-    stood_still: bool,
-) -> None:
-    """Make the program of its ready copy, stopped, committed to nothing; arguments as of `restore`.
+async def finish(component: Component, outline: Snapshot, places: Places, options: RestoreOptions) -> None:
+    """Make the program of its ready copy, stopped, committed to nothing.
 
     Args:
         outline: of the snapshot that it stands at.
@@ -276,29 +293,16 @@ async def finish(
     Raises:
         checkpoint.errors.MismatchError, RestoreError; GuardError, KeeperLostError: nothing of it is left.
     """
-    name, theirs = component.name, outline.process.credentials
-    owner = theirs.uids[0] if owner is None else owner
+    owner = options.owner_of(outline)
     try:
-        check_rights(name, outline, owner, started)
-        component.engine_wanted = task.engine if task is not None else PTRACE
-        component.keeper.terms = terms_of(outline, terms, bound_of(owner, started))
-        component.keeper.names = names_of_contents(needs(outline), places.contents)
-        order = keeper_messages.Restore(
-            component.pid,
-            name,
-            outage_ns,
-            robot=places.robot,
-            own_eyes=owner != ROOT,
-            epoch=epoch,
-            contents=places.contents,
-            terms=component.keeper.terms,
-            stood_still=stood_still,
-        )
+        check_rights(component.name, outline, owner, options.started)
+        _prepare(component, outline, places, options)
+        order = _order(component, places, options, owner, streams=False)
         restored, _ = await component.keeper.ask(keeper_messages.Finish(order, outline.position))
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
-    component.commit = messages.Commit(total_of(outline.output), task)
+    component.commit = messages.Commit(total_of(outline.output), options.task)
     component.notes = (*component.notes, *restored.notes)
 
 
@@ -318,27 +322,25 @@ async def begin_again(
     program: Program,
     chain: Sequence[int],
     places: Places,
-    *,
-    outage_ns: int,
-    owner: int,
-    epoch: int,
+    options: RestoreOptions,
     why: str,
     waiting: Component | None = None,
-    terms: Terms = NO_TERMS,
 ) -> Component:
     """Prepare a program that keeps its state to go on from a chain of the cooperative engine; `resume` lets it.
 
-    Whatever fails, and whoever dies before `resume`: nothing of it is left.
+    Where a step fails, or agent or keeper ends before `resume`, nothing of it is left.
 
     Args:
+        options: with its owner.
         why: one of `checkpoint.segment.task_messages.REASONS`.
         waiting: the program, started to wait (`start_to_wait`); None: `resume` starts it.
-        terms: this robot's.
 
     Raises:
         checkpoint.errors.MismatchError, RestoreError, ChainError, FormatError; GuardError, KeeperLostError.
     """
     outline = await asyncio.to_thread(format.read_outline, chain[-1])
+    owner = options.owner
+    assert owner is not None, "a robot that knows a program's command knows whose it is"
     _check_owner(name, program, owner)
     try:
         check_rights(name, outline, owner, program.inheritance)  # its carried files are laid down with them
@@ -352,25 +354,26 @@ async def begin_again(
         if waiting is not None:
             await waiting.undo()
         raise
-    component = waiting or Component(name, await places.nursery.guard(), places)
+    component = waiting or Component(name, await places.process_pool.guard(), places)
     component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
-    component.keeper.terms = terms_of(outline, terms, bound_of(owner, program.inheritance))
+    component.keeper.terms = terms_of(outline, options.terms, bound_of(owner, program.inheritance))
     try:
         await component.keeper.give()
         filled, (segment,) = await component.keeper.ask(
-            keeper_messages.Fill(name, owner != ROOT, terms.carry.places), tuple(chain)
+            keeper_messages.Fill(name, owner != ROOT, options.terms.carry.places), tuple(chain)
         )
     except (CheckpointError, GuardError, KeeperLostError):
         await component.undo()
         raise
     component.notes = (*component.notes, *filled.notes)
-    age_ns = outage_ns + commit_age_ns(outline)
+    age_ns = options.outage_ns + commit_age_ns(outline)
     origin = Origin(outline.machine.robot, filled.position.generation, why, age_ns)
     totals = total_of(outline.output)
     if waiting is not None:
-        component.prepared = Prepared(messages.BeginTask(epoch, origin, totals), segment, age_ns)
+        component.prepared = Prepared(messages.BeginTask(options.epoch, origin, totals), segment, age_ns)
     else:
-        start = _starting(name, under_epoch(program, epoch), places, messages.Task(epoch, origin), totals)
+        task = messages.Task(options.epoch, origin)
+        start = _starting(name, under_epoch(program, options.epoch), places, task, totals)
         component.prepared = Prepared(start, segment, age_ns)
     return component
 
@@ -379,17 +382,17 @@ async def start_to_wait(name: str, program: Program, places: Places, owner: int)
     """Start a program that keeps its state in advance: it waits for `begin_again`, and ends with this agent until then.
 
     Raises:
-        checkpoint.errors.MismatchError: it would run as somebody else than its owner.
+        checkpoint.errors.MismatchError: it would run as another user than its owner.
         GuardError: it could not be started; nothing is left of it.
     """
     _check_owner(name, program, owner)
-    component = Component(name, await places.nursery.guard(), places)
+    component = Component(name, await places.process_pool.guard(), places)
     component.engine_wanted = COOPERATIVE
     return await _born(component, _starting(name, under_epoch(program, 0), places, messages.Task(warm=True)))
 
 
 def _check_owner(name: str, program: Program, owner: int) -> None:
-    """Raises MismatchError: a program of this owner's would run as somebody else."""
+    """Raises MismatchError: a program of this owner's would run as another user."""
     inherited = program.inheritance.uid if program.inheritance is not None else os.geteuid()
     if owner not in (ROOT, inherited):
         reason = f"it is to run as uid {inherited}, which is not its owner, uid {owner}; start it as that user"
@@ -400,7 +403,7 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     """Find a component again after the agent was restarted.
 
     Raises:
-        GuardLostError: nobody listens there any more; the left-over socket has been removed.
+        GuardLostError: no guard listens there any more; the left-over socket has been removed.
     """
     try:
         guard = connect(socket_path)

@@ -8,7 +8,7 @@ from pathlib import Path
 from msgspec import Struct, field
 
 from agent.guard.output_logs import OutputLogs, logs_of, total_of
-from agent.worker.components.process_pool import Nursery
+from agent.worker.components.process_pool import ProcessPool
 from checkpoint.snapshot import format
 from checkpoint.store.index import folder_name
 from checkpoint.store.xor_cache_budget import PageBudget
@@ -20,7 +20,7 @@ class Places(Struct, frozen=True):
     Attributes:
         sockets: directory of the guards' sockets; gone after a reboot, as the guards are.
         logs: directory with one directory of output a component.
-        nursery: where guards and keepers come from.
+        process_pool: where guards and keepers come from.
         cgroup: a delegated cgroup v2 directory that each component gets a cgroup of its own in; "" for the guard's own.
         robot: this robot's name, for the snapshots.
         contents: directory of files that programs brought along; "": none are brought to this robot.
@@ -29,7 +29,7 @@ class Places(Struct, frozen=True):
 
     sockets: Path
     logs: Path
-    nursery: Nursery
+    process_pool: ProcessPool
     cgroup: str = ""
     robot: str = ""
     contents: str = ""

@@ -19,7 +19,7 @@ from agent.system.permissions import ROOT
 from agent.worker.components.context import Surroundings, program_of
 from agent.worker.components.process_pool import KeeperLink
 from agent.worker.components.restore_limits import check_rights
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.network.remote_orders import Errands
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CheckpointError, MismatchError, StoreError
@@ -47,27 +47,27 @@ async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
     return tuple(map(str, reasons)) if isinstance(reasons, list) else ()
 
 
-async def look(around: Surroundings, charges: Iterable[Charge]) -> Mapping[str, tuple[str, ...]]:
+async def look(around: Surroundings, supervisors: Iterable[Supervisor]) -> Mapping[str, tuple[str, ...]]:
     """What is lacking here for each of these, as sentences, by name; what cannot be looked at, or is not stored, is left out."""
-    return await _told_by_one_keeper(around, charges, _compared)
+    return await _told_by_one_keeper(around, supervisors, _compared)
 
 
-async def contested(around: Surroundings, charges: Collection[Charge]) -> Mapping[str, tuple[str, ...]]:
+async def contested(around: Surroundings, supervisors: Collection[Supervisor]) -> Mapping[str, tuple[str, ...]]:
     """Which files of those that run here, and have a checkpoint, others hold open for writing; as `look`.
 
     Args:
-        charges: all of this robot's, so that others are known by name.
+        supervisors: all of this robot's, so that others are known by name.
     """
-    components = {charge.name: charge.component.pid for charge in charges if charge.component is not None}
-    running = [charge for charge in charges if charge.name in components and charge.figures.snapshots]
+    components = {supervisor.name: supervisor.component.pid for supervisor in supervisors if supervisor.component is not None}
+    running = [supervisor for supervisor in supervisors if supervisor.name in components and supervisor.figures.snapshots]
 
-    async def compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
-        component = charge.component
+    async def compared(around: Surroundings, supervisor: Supervisor, keeper: KeeperLink) -> tuple[str, ...]:
+        component = supervisor.component
         if component is None or not component.pid:
             return ()  # it has just ended
         terms, pid = component.keeper.terms, component.pid
         order = messages.Compare(terms=terms, running=pid, components=components)
-        async with _newest(around, charge.name) as snapshot:
+        async with _newest(around, supervisor.name) as snapshot:
             return (await _answer(keeper, order, snapshot)).lacks
 
     return await _told_by_one_keeper(around, running, compared)
@@ -93,21 +93,21 @@ async def _answer(keeper: KeeperLink, order: messages.Compare, snapshot: int) ->
 
 async def _told_by_one_keeper(
     around: Surroundings,
-    charges: Iterable[Charge],
-    compared: Callable[[Surroundings, Charge, KeeperLink], Awaitable[tuple[str, ...]]],
+    supervisors: Iterable[Supervisor],
+    compared: Callable[[Surroundings, Supervisor, KeeperLink], Awaitable[tuple[str, ...]]],
 ) -> Mapping[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     keeper: KeeperLink | None = None
     try:
-        for charge in charges:
-            await charge.cleared(CLEARING_S)
-            keeper = keeper or await around.places.nursery.onlooker()
+        for supervisor in supervisors:
+            await supervisor.cleared(CLEARING_S)
+            keeper = keeper or await around.places.process_pool.onlooker()
             try:
-                found[charge.name] = await compared(around, charge, keeper)
+                found[supervisor.name] = await compared(around, supervisor, keeper)
             except StoreError:
                 continue  # there is no checkpoint of it here yet, or no more
             except (CheckpointError, OSError) as trouble:
-                log.warning("%s: cannot check whether it could resume here: %s", charge.name, trouble)
+                log.warning("%s: cannot check whether it could resume here: %s", supervisor.name, trouble)
     except TROUBLE as trouble:
         log.warning("cannot check which components could resume here: %s", trouble)
     finally:
@@ -116,17 +116,17 @@ async def _told_by_one_keeper(
     return found
 
 
-async def _compared(around: Surroundings, charge: Charge, keeper: KeeperLink) -> tuple[str, ...]:
-    name, spec = charge.name, charge.figures.spec
+async def _compared(around: Surroundings, supervisor: Supervisor, keeper: KeeperLink) -> tuple[str, ...]:
+    name, spec = supervisor.name, supervisor.figures.spec
     async with _newest(around, name) as snapshot:
         outline = await asyncio.to_thread(format.read_outline, snapshot)
         if outline.engine == COOPERATIVE and around.here(name).command:
             return ()  # it is started by that
         terms = terms_here(spec.launch if spec is not None else None, around.here(name))
         is_ordinary = spec is not None and spec.owner != ROOT
-        order = messages.Compare(around.places.contents, terms, charge.figures.digests, own_eyes=is_ordinary)
+        order = messages.Compare(around.places.contents, terms, supervisor.figures.digests, own_eyes=is_ordinary)
         reply = await _answer(keeper, order, snapshot)
-    charge.figures.digests = reply.known
+    supervisor.figures.digests = reply.known
     try:
         if spec is not None:
             check_rights(name, outline, spec.owner, program_of(spec.launch).inheritance)

@@ -66,7 +66,7 @@ class KeeperLink(Struct):
         self.dialogue.close()
 
 
-class Nursery:
+class ProcessPool:
     """Starts guards and keepers. Lives in one loop."""
 
     def __init__(self, sockets: Path, starter: str) -> None:
@@ -216,7 +216,7 @@ class Nursery:
         return ours, child.pid
 
     async def _connected(self, path: Path, child: subprocess.Popen[bytes], what: str) -> socket.socket:
-        """Wait until somebody listens at a path.
+        """Wait until a process listens at a path.
 
         Raises:
             GuardError: it has ended, or takes longer than `BIRTH_S`.
@@ -254,7 +254,7 @@ def connect(path: Path) -> Dialogue:
     """Speak to the guard that listens at a path.
 
     Raises:
-        FileNotFoundError, ConnectionRefusedError: nobody does (yet, or any more).
+        FileNotFoundError, ConnectionRefusedError: none does (yet, or any more).
     """
     return _guard_at(path, _call(path))
 

@@ -19,7 +19,7 @@ from msgspec import Struct
 from agent.core_config import terms_here
 from agent.errors import TROUBLE
 from agent.system import clock
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.worker.components import launch
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
@@ -79,11 +79,11 @@ class ReadyCopy:
         self._news.set()
 
     def drop(self) -> None:
-        """None is wanted any more; what there is ends, and nobody waits for that."""
+        """None is wanted any more; what there is ends; its end is not awaited."""
         work, self._work = self._work, None
         ready, self._ready = self._ready, None
         self._figures.copy = CopyFigures()
-        self._around.places.nursery.relieve(self._name, False)
+        self._around.places.process_pool.relieve(self._name, False)
         if work is not None:
             work.cancel()
         if ready is not None:
@@ -114,14 +114,14 @@ class ReadyCopy:
         await asyncio.gather(*self._ending, return_exceptions=True)
 
     def _undone(self, ready: Ready) -> asyncio.Task[None]:
-        """End it; whoever waits for that may be cancelled: a guard that is left in the middle would be found as a component."""
+        """End it, also where the waiting task is cancelled: a guard that is left in the middle would be found as a component."""
         return self._task(ready.component.undo())
 
     def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
         return task
 
     # --- Following the checkpoints ---
@@ -210,11 +210,11 @@ class ReadyCopy:
     def _stands(self, ready: Ready, laid: messages.Laid) -> None:
         self._ready = ready
         self._figures.copy = CopyFigures(True, laid.size, laid.position)
-        self._around.places.nursery.relieve(self._name, True)
+        self._around.places.process_pool.relieve(self._name, True)
 
     async def _end(self, why: str) -> None:
         ready, self._ready = self._ready, None
         self._figures.copy = CopyFigures(why=why)
-        self._around.places.nursery.relieve(self._name, False)
+        self._around.places.process_pool.relieve(self._name, False)
         if ready is not None:
             await asyncio.shield(self._undone(ready))

@@ -47,41 +47,16 @@ async def brought_back(
         CheckpointError, AgentError: as `launch.restore` and `launch.begin_again`; nothing of it is left.
     """
     name, places, spec = act.component, around.places, act.spec
-    terms = terms_here(spec.launch if spec is not None else None, around.here(name))
+    options = _options(around, act, outage_ns)
     newest = await asyncio.to_thread(format.read_outline, chain[-1])
     if newest.engine != COOPERATIVE:
         if waiting is not None:
             await waiting.undo()
-        owner = spec.owner if spec is not None else None
-        task = Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None
-        return await launch.restore(
-            name,
-            chain,
-            places,
-            outage_ns=outage_ns,
-            owner=owner,
-            started=program_of(spec.launch).inheritance if spec is not None else None,
-            laps=laps,
-            task=task,
-            epoch=act.epoch,
-            terms=terms,
-            stood_still=act.why is Resumption.HANDED_OVER,
-        )
+        return await launch.restore(name, chain, places, options, laps)
     if spec is None:
         raise RestoreError(f"cannot start {name} again: this robot does not know its command; start it by failover run")
     program = again(around, spec, newest)
-    return await launch.begin_again(
-        name,
-        program,
-        chain,
-        places,
-        outage_ns=outage_ns,
-        owner=spec.owner,
-        epoch=act.epoch,
-        why=act.why,
-        waiting=waiting,
-        terms=terms,
-    )
+    return await launch.begin_again(name, program, chain, places, options, act.why, waiting)
 
 
 async def finished(around: Surroundings, act: acts.Restore, component: Component, outline: Snapshot, outage_ns: int) -> None:
@@ -93,12 +68,14 @@ async def finished(around: Surroundings, act: acts.Restore, component: Component
     Raises:
         CheckpointError, AgentError: as `launch.finish`; nothing of it is left.
     """
+    await launch.finish(component, outline, around.places, _options(around, act, outage_ns))
+
+
+def _options(around: Surroundings, act: acts.Restore, outage_ns: int) -> launch.RestoreOptions:
+    """How the component comes back, as its specification says where this robot has it."""
     spec = act.spec
-    await launch.finish(
-        component,
-        outline,
-        around.places,
-        outage_ns=outage_ns,
+    return launch.RestoreOptions(
+        outage_ns,
         owner=spec.owner if spec is not None else None,
         started=program_of(spec.launch).inheritance if spec is not None else None,
         task=Task(act.epoch, engine=AUTO) if spec is not None and spec.launch.engine == AUTO else None,
@@ -122,7 +99,7 @@ def again(around: Surroundings, spec: ComponentSpec, newest: Snapshot | None) ->
 def refusal(component: Component, status: int) -> str:
     """Why a program that was started again has not gone on from its state; "" if it has, or crashed, or ended well.
 
-    Whoever takes a state commits it at once (`Component.keeps`).
+    A program that takes a state commits it at once (`Component.keeps`).
 
     Args:
         status: its wait status.

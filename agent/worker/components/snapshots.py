@@ -10,6 +10,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from agent.system import clock
+from agent.system.threads import to_its_end
 from agent.worker.components import lost_copies
 from agent.worker.components.component import Captured, Component
 from agent.worker.components.context import Surroundings
@@ -47,7 +48,7 @@ class Snapshots(Struct, frozen=True):
             self.around.tell(events.Unchanged(self.name, act.epoch, act.sequence, captured.position))
             return
         try:
-            await asyncio.to_thread(self.around.store.put, captured.snapshot, prove=False)
+            await to_its_end(self.around.store.put, captured.snapshot, prove=False)
         finally:
             os.close(captured.snapshot)
         self.figures.captured(captured, self.around.here(self.name).freeze_budget_ms)

@@ -57,7 +57,7 @@ class Commits(Struct):
         return self.number > 0 and now_ns - self.newest_ns > limit_ns
 
     def remark(self, now_ns: int) -> str:
-        """What to say of a program that is overdue, for somebody who looks at ``failover status`` for the first time."""
+        """What to say of a program that is overdue, for a user who looks at ``failover status`` for the first time."""
         used = "its only one" if self.usual_ns is None else f"before that there was one every {seconds(self.usual_ns)}"
         return (
             f"last commit {seconds(now_ns - self.newest_ns)} ago, {used}: it commits no more, or it hangs; "
@@ -120,7 +120,7 @@ class Memory(Struct, frozen=True):
     """Bytes of private memory of this robot's agent.
 
     Attributes:
-        agent: of the heart and the lanes; ``keepers``: of those that follow a component here.
+        agent: of the main loop and the worker; ``keepers``: of those that follow a component here.
         remembered: of both, what holds pages that deltas are told from, and proved by; ``remembered_max``: its bound, xor_cache.
     """
 

@@ -21,7 +21,7 @@ from agent.core_config import begun_on
 from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.system import clock
 from agent.system.adopted_process import Guest
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.worker.components import launch, resume, under_way
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
@@ -45,7 +45,7 @@ log = logging.getLogger("failover.component")
 
 
 @dataclass(slots=True)
-class Charge:
+class Supervisor:
     """The component and what is to be done with it.
 
     Attributes:
@@ -84,7 +84,7 @@ class Charge:
     _to_prune: acts.Prune | None = None
     _pruning: asyncio.Task[None] | None = None
     _not_let_go: Exception | None = None
-    """Why the order to let it go was in vain; None: it was not, or somebody has been told."""
+    """Why the order to let it go was in vain; None: it was not, or a caller has been told."""
 
     def __post_init__(self) -> None:
         self._cleared.set()
@@ -153,7 +153,7 @@ class Charge:
         self._watch_the_end()
 
     async def let_go(self) -> None:
-        """Wait until the guard has been told of an order to let go: before that, the next lanes would find the program again.
+        """Wait until the guard has been told of an order to let go: before that, the next worker would find the program again.
 
         Raises:
             AgentError: it was in vain; with the reason.
@@ -179,7 +179,7 @@ class Charge:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
         return task
 
     # --- acts ---
@@ -323,7 +323,7 @@ class Charge:
         return await launch.start(self.name, program_of(spec.launch), self.around.places, epoch, spec.owner)
 
     def _named(self, pid: int) -> Guest:
-        """The process that a client named: the one that was asked whose it is, where no other life of these lanes did that.
+        """The process that a client named: the one that was asked whose it is, where no earlier worker did that.
 
         Raises:
             ProcessGoneError: it has ended.

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from agent.errors import TROUBLE, GuardError
 from agent.system import clock
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.system.permissions import SAID
 from agent.worker.components import launch
 from agent.worker.components.component import Component
@@ -52,10 +52,10 @@ class Standby:
         """
         self.cool()
         self._work = asyncio.create_task(self._keep_warm(program, owner, tell))
-        self._work.add_done_callback(end_lanes_on_mistake)
+        self._work.add_done_callback(end_worker_on_mistake)
 
     def cool(self) -> None:
-        """Nothing is to wait any more; what does is ended, and nobody waits for that."""
+        """Nothing is to wait any more; what does is ended; its end is not awaited."""
         work, self._work, self._ready = self._work, None, None
         if work is not None:
             work.cancel()
@@ -107,13 +107,13 @@ class Standby:
             if self._ready is component:
                 self._ready = None
             if component is not self._given:
-                undone = asyncio.create_task(component.undo())  # whole, whoever waits for it: what is left would be found again
+                undone = asyncio.create_task(component.undo())  # whole, also if we are cancelled: the rest would be found again
                 self._ending.add(undone)
                 undone.add_done_callback(self._ending.discard)
                 await asyncio.shield(undone)
 
     async def _born(self, program: Program, owner: int) -> Component:
-        """Start it; one that nobody wants by then is not left behind."""
+        """Start it; one that is not wanted any more by then is not left behind."""
         birth = asyncio.create_task(launch.start_to_wait(self._name, program, self._places, owner))
         try:
             return await asyncio.shield(birth)

@@ -147,7 +147,7 @@ class WhyArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class PageArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``story``: what another robot asks for when it tells a story; ``before``: life and number of a line."""
+    """Of ``story``: what a robot asks another one for when it merges event logs; ``before``: life and number of a line."""
 
     name: str = ""
     age_ms_max: Age = 0

@@ -15,7 +15,7 @@ from agent.guard.output_logs import STREAMS, OutputLogs
 from agent.main_loop.messages import Told
 from agent.system.permissions import check_right
 from agent.worker.components.paths import Places, log_directory
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.arguments import PieceArguments, arguments_of
 from agent.worker.control.server import Conversation
 from agent.worker.network.remote_orders import Errands
@@ -23,30 +23,30 @@ from checkpoint.model import OutputPiece
 from failover.core.types import ENDED, ComponentView, PeerView, State
 
 POLL_S: Final = 0.02
-"""How soon new output is passed on to whoever watches."""
+"""How soon new output is passed on to a client that watches."""
 
 PIECE_SIZE: Final = 128 << 10
-"""Bytes read from another robot at a time: less than the lane's largest message."""
+"""Bytes read from another robot at a time: less than the replication link's largest message."""
 
 LIVING: Final = ("alive", "suspect")
 
 
-class Lanes(Protocol):
-    """What of `agent.worker.process.Lanes` is needed here."""
+class Worker(Protocol):
+    """What of `agent.worker.process.Worker` is needed here."""
 
     settings: Settings
     places: Places
-    charges: dict[str, Charge]
+    supervisors: dict[str, Supervisor]
     errands: Errands
 
     async def ask(self, what: Any) -> Told: ...
 
 
-class Outflow:
+class OutputRelay:
     """Reads streams, here or elsewhere."""
 
-    def __init__(self, lanes: Lanes) -> None:
-        self._lanes = lanes
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
 
     async def pass_on(
         self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool
@@ -88,12 +88,12 @@ class Outflow:
     async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
         if not robot:
             return self._read_here(name, stream, offset, committed, by)
-        told = await self._lanes.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
+        told = await self._worker.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
         return OutputPiece(stream, told["offset"], told["content"])
 
     def _read_here(self, name: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
         """Raises RefusedError: these are still the logs of another user's component, which had the name before."""
-        logs = OutputLogs(log_directory(name, self._lanes.places))
+        logs = OutputLogs(log_directory(name, self._worker.places))
         try:
             if logs.owner is not None:
                 check_right(by, f"the output of {name} that is kept here", logs.owner)
@@ -103,29 +103,29 @@ class Outflow:
 
     async def _standing(self, name: str) -> tuple[bool, str]:
         """Whether the component's end is a record, and the robot to ask for what it wrote; "" for this one."""
-        charge = self._lanes.charges.get(name)
-        if charge is not None and charge.ended is not None and charge.ended.done():
+        supervisor = self._worker.supervisors.get(name)
+        if supervisor is not None and supervisor.ended is not None and supervisor.ended.done():
             return True, ""
-        if charge is not None and charge.component is not None:
+        if supervisor is not None and supervisor.component is not None:
             return False, ""
         view, peers = await self._view(name)
         return (view.state in ENDED, _where(view, peers)) if view is not None else (False, "")
 
     async def _has_ended(self, name: str) -> bool:
-        """The core's word: status shows it, and peers hear it, before it is written and our own charge is told.
+        """The core's word: status shows it, and peers hear it, before it is written and our own supervisor is told.
 
-        Held output waits for the charge: then the end is on record at every robot that is heard.
+        Held output waits for the supervisor: then the end is on record at every robot that is heard.
         """
         view, _ = await self._view(name)
         if view is None or view.state not in ENDED:
             return False
-        if not self._is_held(name) or view.primary != self._lanes.settings.config.robot:
+        if not self._is_held(name) or view.primary != self._worker.settings.config.robot:
             return True
-        charge = self._lanes.charges.get(name)
-        return charge is not None and charge.ended is not None and charge.ended.done()
+        supervisor = self._worker.supervisors.get(name)
+        return supervisor is not None and supervisor.ended is not None and supervisor.ended.done()
 
     def _is_held(self, name: str) -> bool:
-        logs = OutputLogs(log_directory(name, self._lanes.places))
+        logs = OutputLogs(log_directory(name, self._worker.places))
         try:
             return logs.is_held
         finally:
@@ -133,7 +133,7 @@ class Outflow:
 
     async def _view(self, name: str) -> tuple[ComponentView | None, tuple[PeerView, ...]]:
         """The component as this robot's core sees it, and the peers."""
-        told = await self._lanes.ask("status")
+        told = await self._worker.ask("status")
         if told.status is None:
             return None, ()
         return next((one for one in told.status.components if one.name == name), None), told.status.peers

@@ -127,7 +127,7 @@ class Questions:
             return {}
 
     async def why(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """What was decided, when and by whom: the stories of all robots that answer, in one.
+        """What was decided, when and by whom: the event logs of all robots that answer, in one.
 
         What programs said is left out but for root: a line does not tell whose component had the name then.
         """

@@ -13,7 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from agent.errors import AgentError, RefusedError
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.system.permissions import Caller, caller_of, uid_of
 from agent.worker.control.quotas import Admission
 from checkpoint.errors import UNDECODABLE, CheckpointError
@@ -62,7 +62,7 @@ Verb = Callable[[Conversation, dict[str, Any]], Awaitable[dict[str, Any]]]
 
 
 class ControlServer:
-    """The listening end. Lives in the lanes' loop."""
+    """The listening end. Lives in the worker's loop."""
 
     def __init__(self, path: Path, group: str, verbs: dict[str, Verb]) -> None:
         self._path = path
@@ -98,7 +98,7 @@ class ControlServer:
             raise AgentError(f"cannot listen on {self._path}: {error.strerror}; name another runtime_directory") from error
 
     async def close(self) -> None:
-        """Hang up on everybody and remove the socket."""
+        """Hang up on all clients and remove the socket."""
         if self._server is not None:
             self._server.close()
         for task in self._clients:
@@ -112,7 +112,7 @@ class ControlServer:
         assert task is not None
         self._clients.add(task)
         task.add_done_callback(self._clients.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
         try:
             await self._converse(reader, writer)
         except (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import Struct, field
 from msgspec.structs import asdict
 
 from agent.config import Settings
@@ -16,14 +17,14 @@ from agent.guard.output_pump import HOLD_LIMIT
 from agent.main_loop.messages import Life, Told
 from agent.system import clock
 from agent.worker.control import fencing_status
-from agent.worker.network.replication_link import Link, LinkState
+from agent.worker.network.replication_link import LinkState, PeerConnection
 from checkpoint.device_rules import merged, missing
 from checkpoint.engine import COOPERATIVE, PTRACE
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
     from agent.worker.components.statistics import Commits, Figures, Memory
-    from agent.worker.components.supervisor import Charge
+    from agent.worker.components.supervisor import Supervisor
     from checkpoint.store.store import Kept, Store
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
@@ -56,39 +57,51 @@ def version() -> str:
     return next((path.stem.partition("-")[2] for path in records), "unknown")
 
 
-def team_view(
-    settings: Settings,
-    life: Life,
-    told: Told,
-    charges: Mapping[str, Charge],
-    links: Mapping[str, Link],
-    notices: list[str],
-    interfaces: list[dict[str, object]],
-    store: Store | None,
-    memory: Memory | None = None,
-) -> dict[str, Any]:
+class WorkerView(Struct, frozen=True):
+    """What the worker knows beside the main loop's answer.
+
+    Attributes:
+        supervisors: by component; none at a witness.
+        links: the replication link to each peer.
+        notices: sentences.
+        interfaces: as the status shows them.
+        store: None at a witness.
+        memory: None at a witness.
+    """
+
+    links: Mapping[str, PeerConnection]
+    notices: list[str]
+    interfaces: list[dict[str, object]]
+    supervisors: Mapping[str, Supervisor] = field(default_factory=dict)
+    store: Store | None = None
+    memory: Memory | None = None
+
+
+def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> dict[str, Any]:
     """The whole picture."""
     view = told.status
-    notes = [*life.notes, *notices, *told.troubles]
+    notes = [*life.notes, *ours.notices, *told.troubles]
     beats = told.beats
     return {
         "robot": settings.config.robot,
         "team": settings.team.team,
         "role": settings.me.role,
-        "pid": life.heart,
+        "pid": life.main_loop,
         "version": version(),
         "life": life.boot,
         "insecure": settings.config.insecure,
         "realtime": settings.config.realtime and not life.notes,
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
-        "memory": asdict(memory) if memory is not None else None,
+        "memory": asdict(ours.memory) if ours.memory is not None else None,
         "fencing": fencing_status.sentence(fencing_status.watchdog()),
         "healthy": view.healthy if view else False,
         "notes": notes,
-        "links": interfaces,
-        "peers": [_peer(peer, links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
-        "components": [_component(one, charges.get(one.name), settings, store) for one in (view.components if view else ())],
+        "links": ours.interfaces,
+        "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
+        "components": [
+            _component(one, ours.supervisors.get(one.name), settings, ours.store) for one in (view.components if view else ())
+        ],
         "beats": {
             "sent": beats.sent,
             "heard": beats.heard,
@@ -103,7 +116,7 @@ def team_view(
     }
 
 
-def _peer(peer: PeerView, link: Link | None, told: Told, settings: Settings) -> dict[str, Any]:
+def _peer(peer: PeerView, link: PeerConnection | None, told: Told, settings: Settings) -> dict[str, Any]:
     reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread, *peer.refused))))
     return {
         "name": peer.robot,
@@ -141,12 +154,12 @@ def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | No
     return figures.lacks if figures is not None and view.state is State.STANDBY else None
 
 
-def told_lacks(view: ComponentView, charge: Charge | None, robot: str) -> list[str]:
+def told_lacks(view: ComponentView, supervisor: Supervisor | None, robot: str) -> list[str]:
     """The same for people; what a hook perhaps brings before the program goes on is no refusal yet."""
-    if charge is None:
+    if supervisor is None:
         return []
-    lacks = _lacks(view, charge.figures) or ()
-    if charge.is_prepared_first:
+    lacks = _lacks(view, supervisor.figures) or ()
+    if supervisor.is_prepared_first:
         return [f"{robot} lacks this now, and the hook before_resume must bring it: {lack}" for lack in lacks]
     return [f"{robot} could not resume it: {lack}" for lack in lacks]
 
@@ -176,9 +189,9 @@ def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     )
 
 
-def _component(view: ComponentView, charge: Charge | None, settings: Settings, store: Store | None) -> dict[str, Any]:
-    figures = charge.figures if charge is not None else None
-    running = charge.component if charge is not None else None
+def _component(view: ComponentView, supervisor: Supervisor | None, settings: Settings, store: Store | None) -> dict[str, Any]:
+    figures = supervisor.figures if supervisor is not None else None
+    running = supervisor.component if supervisor is not None else None
     newest = view.positions[0] if view.positions else None
     engine = running.engine if running is not None else figures.engine if figures is not None else PTRACE
     held = running is not None and running.logs.is_held
@@ -221,7 +234,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "unstored": view.unstored,
         "lacks": _lacks(view, figures),
         "contested": list(_contested(view, figures)),
-        "prepared_first": charge is not None and charge.is_prepared_first,
+        "prepared_first": supervisor is not None and supervisor.is_prepared_first,
         "promise": view.promise,
         "promise_differs": view.differs,
         "home": view.home,
@@ -232,7 +245,7 @@ def _component(view: ComponentView, charge: Charge | None, settings: Settings, s
         "reasons": list(figures.reasons) if figures else [],
         "notes": [
             *view.notes,
-            *told_lacks(view, charge, settings.config.robot),
+            *told_lacks(view, supervisor, settings.config.robot),
             *(f"NOT PROTECTED, a restore of it is refused: {reason}" for reason in _contested(view, figures)),
             *_own_notes(view, figures),
             *_over_budget(view, figures, settings),

@@ -19,7 +19,7 @@ from agent.system.adopted_process import Guest
 from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for
 from agent.worker.components import prerequisites
 from agent.worker.components.paths import Places
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.arguments import (
     HandoverArguments,
     LogsArguments,
@@ -31,7 +31,7 @@ from agent.worker.control.arguments import (
     StopArguments,
     arguments_of,
 )
-from agent.worker.control.output_relay import Outflow
+from agent.worker.control.output_relay import OutputRelay
 from agent.worker.control.queries import Lines, Questions
 from agent.worker.control.quotas import check_components
 from agent.worker.control.server import Conversation, Verb
@@ -52,23 +52,23 @@ START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
 
 
-class Lanes(Lines, Protocol):
-    """What of `agent.worker.process.Lanes` is needed here."""
+class Worker(Lines, Protocol):
+    """What of `agent.worker.process.Worker` is needed here."""
 
     places: Places
-    charges: dict[str, Charge]
+    supervisors: dict[str, Supervisor]
 
-    def charge(self, name: str) -> Charge: ...
+    def supervisor(self, name: str) -> Supervisor: ...
     async def lacking(self, name: str) -> tuple[str, ...]: ...
 
 
 class Verbs(Questions):
     """Every verb of the control socket."""
 
-    def __init__(self, lanes: Lanes) -> None:
-        super().__init__(lanes)
-        self._lanes = lanes
-        self._outflow = Outflow(lanes)
+    def __init__(self, worker: Worker) -> None:
+        super().__init__(worker)
+        self._worker = worker
+        self._output_relay = OutputRelay(worker)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -84,7 +84,13 @@ class Verbs(Questions):
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: the orders, and how things stand here."""
         promoted = functools.partial(self._permitted, self._promoted)
-        return {**super().errands(), **self.orders(), "piece": self._outflow.piece, "promoted": promoted, "lacks": self.lacks}
+        return {
+            **super().errands(),
+            **self.orders(),
+            "piece": self._output_relay.piece,
+            "promoted": promoted,
+            "lacks": self.lacks,
+        }
 
     def orders(self) -> dict[str, Order]:
         """Those that are carried out where the component runs, wherever they are given."""
@@ -98,7 +104,7 @@ class Verbs(Questions):
         return {name: functools.partial(self._permitted, act) for name, act in found.items()}
 
     async def _permitted(self, order: Order, arguments: dict[str, Any], by: int) -> dict[str, Any]:
-        """Carry an order out here, if whoever gives it may give it."""
+        """Carry an order out here, if its user may give it."""
         name = await self._known(str(arguments.get("name", "")))
         await self._check_right(by, name)
         return await order({**arguments, "name": name}, by)
@@ -108,10 +114,10 @@ class Verbs(Questions):
         name = await self._known(str(arguments.get("name", "")))
         arguments = {**arguments, "name": name}
         primary = (await self._view(name)).get("primary", "")
-        told = await self._lanes.ask("status")
+        told = await self._worker.ask("status")
         living = {peer.robot for peer in told.status.peers if peer.state in ("alive", "suspect")} if told.status else set()
         if primary in living:
-            return await self._lanes.errands.send(primary, verb, arguments, say.caller.uid)
+            return await self._worker.errands.send(primary, verb, arguments, say.caller.uid)
         return await self.orders()[verb](arguments, say.caller.uid)
 
     async def run(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -139,27 +145,28 @@ class Verbs(Questions):
             shared=self._shared(name, wanted.shared, wanted.carry),
             devices=self._device_rules(name, wanted.devices),
             connections=self._connections(name, wanted.connections),
-            shared_memory=wanted.shared_memory or self._lanes.settings.component(name).shared_memory,
+            shared_memory=wanted.shared_memory or self._worker.settings.component(name).shared_memory,
         )
-        charge = await self._begin(name, launch, inheritance.uid, say.caller.uid)
-        started: dict[str, Any] = {"name": name, "notes": list(charge.figures.notes), "reasons": list(charge.figures.reasons)}
-        if charge.component is not None:
-            component = charge.component
+        supervisor = await self._begin(name, launch, inheritance.uid, say.caller.uid)
+        figures = supervisor.figures
+        started: dict[str, Any] = {"name": name, "notes": list(figures.notes), "reasons": list(figures.reasons)}
+        if supervisor.component is not None:
+            component = supervisor.component
             started |= {"pid": component.pid, "inner_pid": component.inner_pid, "isolated": component.isolated}
-            started["notes"] = [*component.notes, *charge.figures.notes]
+            started["notes"] = [*component.notes, *figures.notes]
         if not wanted.wait:
             return started
         await say.update({"started": started})
-        await self._outflow.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
-        if charge.ended is not None and charge.ended.done():
-            report = charge.ended.result()
+        await self._output_relay.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
+        if supervisor.ended is not None and supervisor.ended.done():
+            report = supervisor.ended.result()
             return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
         view = await self._view(name)  # it ended on another robot
         return {"name": name, "exit_status": view.get("exit_status"), "failed": view["state"] == "failed", "reason": ""}
 
     def _environment(self, name: str, wanted: RunArguments) -> dict[str, str]:
         """The program's variables, also those that have libraries choose code for a mixed fleet."""
-        settings = self._lanes.settings
+        settings = self._worker.settings
         level = level_of(wanted.portable, settings.config, settings.component(name))
         return cpu_baseline.environment(wanted.env, level) if level else wanted.env
 
@@ -175,7 +182,7 @@ class Verbs(Questions):
     async def _taken_in(self, wanted: ProtectArguments, guest: Guest, caller: Caller) -> dict[str, Any]:
         """Protect a process that is the caller's."""
         assert guest.rights is not None, "it was asked whose it is"
-        for known in self._lanes.charges.values():
+        for known in self._worker.supervisors.values():
             if known.component is not None and known.component.pid == wanted.pid:
                 raise RefusedError(f"pid {wanted.pid} is protected already, as {known.name}; failover release ends that")
         name = await self._fresh_name(wanted.name, "", caller.uid)
@@ -189,25 +196,25 @@ class Verbs(Questions):
             devices=devices,
             connections=connections,
             shared=shared,
-            shared_memory=wanted.shared_memory or self._lanes.settings.component(name).shared_memory,
+            shared_memory=wanted.shared_memory or self._worker.settings.component(name).shared_memory,
         )
-        charge = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
-        return {"name": name, "pid": wanted.pid, "notes": list(charge.figures.notes)}
+        supervisor = await self._begin(name, launch, guest.rights.uid, caller.uid, guest)
+        return {"name": name, "pid": wanted.pid, "notes": list(supervisor.figures.notes)}
 
     async def release(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
         name = await self._known(arguments_of(NameArguments, "release", arguments).name)
-        charge = self._lanes.charge(name)
-        pid = charge.component.pid if charge.component is not None else None
+        supervisor = self._worker.supervisor(name)
+        pid = supervisor.component.pid if supervisor.component is not None else None
         await self._command(by, lambda number: events.Release(number, name))
-        await charge.let_go()  # the order came before the answer
+        await supervisor.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
 
     async def stop(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """End a component."""
         wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
-        end = self._lanes.charge(name).end()
+        end = self._worker.supervisor(name).end()
         await self._command(by, lambda number: events.Stop(number, name, wanted.signal))
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
@@ -229,7 +236,7 @@ class Verbs(Questions):
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot lacks of what a component needs to go on here."""
         name = arguments_of(NameArguments, "lacks", arguments).name
-        return {"lacks": list(await self._lanes.lacking(name) if name in await self._names() else ())}
+        return {"lacks": list(await self._worker.lacking(name) if name in await self._names() else ())}
 
     async def _check_fit(self, name: str, order: str, robot: str) -> None:
         """Ask the robot that a component is to move to whether it could go on there.
@@ -241,7 +248,7 @@ class Verbs(Questions):
         """
         if robot not in await self._reachable():
             return
-        if reasons := await prerequisites.asked_of(self._lanes.errands, robot, name):
+        if reasons := await prerequisites.asked_of(self._worker.errands, robot, name):
             sentence = f"cannot {order.format(name, robot)}, which could not resume it: {'; '.join(reasons)}"
             raise RefusedError(sentence, "MismatchError", reasons)
 
@@ -249,7 +256,7 @@ class Verbs(Questions):
         began_ns, before = clock.now_ns(), await self._view(name)
         answer = await self._command(by, make)
         view = await self._view(name)
-        if view["primary"] != self._lanes.settings.config.robot:
+        if view["primary"] != self._worker.settings.config.robot:
             view = await self._running_at(view["primary"], name)
         took_ms = (clock.now_ns() - began_ns) / 1e6
         told = {"name": name, "to": view["primary"], "epoch": view["epoch"], "took_ms": took_ms, "sentence": answer.sentence}
@@ -263,7 +270,7 @@ class Verbs(Questions):
         """
         deadline_ns = clock.now_ns() + int(START_PATIENCE_S * 1e9)
         while True:
-            view = await self._lanes.errands.send(robot, "standing", {"name": name})
+            view = await self._worker.errands.send(robot, "standing", {"name": name})
             if view.get("role") == "primary" and view["state"] in ("running", "degraded"):
                 return view
             if view.get("state") in ("ended", "failed") or view.get("primary") not in (robot, None):
@@ -284,17 +291,17 @@ class Verbs(Questions):
         return {"name": name, "robot": wanted.robot}
 
     async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Have a robot run what nobody is heard to run; or, unless it is ``sure``, tell what that would risk."""
+        """Have a robot run what no robot is heard to run; or, unless it is ``sure``, tell what that would risk."""
         wanted = arguments_of(PromoteArguments, "promote", arguments)
-        name, me = await self._known(wanted.name), self._lanes.settings.config.robot
+        name, me = await self._known(wanted.name), self._worker.settings.config.robot
         robot = wanted.robot or await self._newest_at(name)
-        if robot not in self._lanes.settings.team.robots:
-            known = ", ".join(sorted(self._lanes.settings.team.robots))
+        if robot not in self._worker.settings.team.robots:
+            known = ", ".join(sorted(self._worker.settings.team.robots))
             raise RefusedError(f"cannot promote {robot!r} for {name}: the team knows {known}")
         order = {"name": name, "robot": robot, "sure": wanted.sure}
         if robot == me:
             return await self._permitted(self._promoted, order, say.caller.uid)
-        return await self._lanes.errands.send(robot, "promoted", order, say.caller.uid)
+        return await self._worker.errands.send(robot, "promoted", order, say.caller.uid)
 
     async def _promoted(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Promote this robot, or tell what that would risk."""
@@ -306,7 +313,7 @@ class Verbs(Questions):
 
     async def _newest_at(self, name: str) -> str:
         """The living robot with the newest checkpoint; this one, or the lesser name, of several."""
-        me, team = self._lanes.settings.config.robot, self._lanes.settings.team.robots
+        me, team = self._worker.settings.config.robot, self._worker.settings.team.robots
         seen = [(me, await self._view(name))]
         others = await self._reachable()
         asked = (self._asked(peer, "standing", {"name": name}) for peer in others)
@@ -321,7 +328,7 @@ class Verbs(Questions):
         wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
         await self._check_right(say.caller.uid, name)
-        totals = await self._outflow.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
+        totals = await self._output_relay.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 
@@ -333,7 +340,7 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no path that means the same on every robot.
         """
-        return _named_whole("carry", (*wanted, *self._lanes.settings.component(name).carry))
+        return _named_whole("carry", (*wanted, *self._worker.settings.component(name).carry))
 
     def _shared(self, name: str, wanted: list[str], carried: list[str]) -> tuple[str, ...]:
         """What others write to as well: what was asked for, and what this robot's operator rules besides.
@@ -341,14 +348,14 @@ class Verbs(Questions):
         Raises:
             RefusedError: it is no path that means the same on every robot, or travels with the component.
         """
-        paths = _named_whole("share", (*wanted, *self._lanes.settings.component(name).shared))
+        paths = _named_whole("share", (*wanted, *self._worker.settings.component(name).shared))
         if both := contradiction(self._carried(name, carried), paths):
             raise RefusedError(both)
         return paths
 
     def _connections(self, name: str, wanted: str) -> str:
         """What becomes of a component's connections with others: what was asked for, else what this robot's operator wants."""
-        return wanted or self._lanes.settings.component(name).connections
+        return wanted or self._worker.settings.component(name).connections
 
     def _device_rules(self, name: str, wanted: dict[str, str]) -> tuple[tuple[str, str], ...]:
         """What becomes of a component's devices on every robot: what was asked for, and what this robot's operator wants here.
@@ -363,10 +370,10 @@ class Verbs(Questions):
                 rule_from(path, said)
         except ValueError as error:
             raise RefusedError(str(error)) from error
-        own = travelling(self._lanes.settings.component(name).device_rules())
+        own = travelling(self._worker.settings.component(name).device_rules())
         return tuple({**wanted, **dict(own)}.items())
 
-    async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Charge:
+    async def _begin(self, name: str, launch: Launch, owner: int, by: int, guest: Guest | None = None) -> Supervisor:
         """Have a component started or taken in, and wait until it is.
 
         Args:
@@ -376,51 +383,51 @@ class Verbs(Questions):
         Raises:
             RefusedError: the core says no, or it could not be started; with the reasons.
         """
-        config = self._lanes.settings.config
-        rules = rules_for(config, self._lanes.settings.component(name))
-        charge = self._lanes.charge(name)
-        charge.guest = guest
-        charge.started.clear()
-        charge.ended = None
-        end = charge.end()
+        config = self._worker.settings.config
+        rules = rules_for(config, self._worker.settings.component(name))
+        supervisor = self._worker.supervisor(name)
+        supervisor.guest = guest
+        supervisor.started.clear()
+        supervisor.ended = None
+        end = supervisor.end()
         try:
             spec = ComponentSpec(name, config.robot, launch, rules, owner)
             await self._command(by, lambda number: events.Run(number, spec))
         except RefusedError as refusal:
-            raise RefusedError(str(refusal), refusal.kind, charge.figures.reasons) from refusal
-        begun = asyncio.ensure_future(charge.started.wait())
+            raise RefusedError(str(refusal), refusal.kind, supervisor.figures.reasons) from refusal
+        begun = asyncio.ensure_future(supervisor.started.wait())
         try:
             both: set[asyncio.Future[Any]] = {begun, end}
             await asyncio.wait(both, timeout=START_PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
         finally:
             begun.cancel()
-            charge.guest = None
+            supervisor.guest = None
         if end.done() and end.result().failed:
             verb = "protect" if launch.pid else "start"
-            raise RefusedError(f"cannot {verb} {name}: {end.result().reason}", "RefusedError", charge.figures.reasons)
-        if not charge.started.is_set():
+            raise RefusedError(f"cannot {verb} {name}: {end.result().reason}", "RefusedError", supervisor.figures.reasons)
+        if not supervisor.started.is_set():
             raise RefusedError(f"{name} has not begun in {START_PATIENCE_S:.0f} s; see failover why {name}")
-        return charge
+        return supervisor
 
     async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:
         """Have the core decide, by the right of this user. Raises RefusedError: it says no."""
-        answer = await self._lanes.command(lambda number: replace(make(number), by=asking(by)))
+        answer = await self._worker.command(lambda number: replace(make(number), by=asking(by)))
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return answer
 
     async def _check_right(self, uid: int, name: str) -> None:
-        """Raises RefusedError: the component is somebody else's."""
+        """Raises RefusedError: the component is another user's."""
         check_right(uid, name, (await self._view(name)).get("owner"))
 
     async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
         """A name for something new: as given, under this robot's own path, or made from the command.
 
         Raises:
-            RefusedError: it is no name, or one that somebody else has used and not released; or this user has too many.
+            RefusedError: it is no name, or one that another user has used and not released; or this user has too many.
         """
-        own = f"/{self._lanes.settings.team.team}/{self._lanes.settings.config.robot}/"
-        told = await self._lanes.ask("status")
+        own = f"/{self._worker.settings.team.team}/{self._worker.settings.config.robot}/"
+        told = await self._worker.ask("status")
         known = {one.name: one for one in told.status.components} if told.status else {}
         if not wanted:
             stem = own + (os.path.basename(command) or "program")
@@ -428,7 +435,7 @@ class Verbs(Questions):
             free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
             wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
         name = wanted if wanted.startswith("/") else own + wanted
-        check_components(uid, name, known.values(), self._lanes.settings.config.components_per_user)
+        check_components(uid, name, known.values(), self._worker.settings.config.components_per_user)
         if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
             check_right(uid, name, known[name].owner)
         try:

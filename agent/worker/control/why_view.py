@@ -21,10 +21,10 @@ from failover.core.event_log.decisions import Line, Sighting
 from failover.core.event_log.merge import Timed, merged
 
 PAGE_SIZE: Final = 128 << 10
-"""Bytes of lines in one answer over the bulk lane, whose messages are small."""
+"""Bytes of lines in one answer over the replication link, whose messages are small."""
 
 PAGES_MAX: Final = 32
-"""Asked of one robot for one story: all that it keeps."""
+"""Asked of one robot for one answer: all that it keeps."""
 
 PATIENCE_S: Final = 3.0
 """How long one page of another robot is waited for; its disk may be slow."""
@@ -35,8 +35,8 @@ CALENDAR_DOUBT_NS: Final = 10**9
 NS_PER_MS: Final = 10**6
 
 
-class Lanes(Protocol):
-    """What of `agent.worker.process.Lanes` is needed here."""
+class Worker(Protocol):
+    """What of `agent.worker.process.Worker` is needed here."""
 
     settings: Settings
     errands: Errands
@@ -53,7 +53,7 @@ class Reading(Struct, frozen=True):
 
 
 class Heard(Struct):
-    """One robot's story as it came.
+    """One robot's event log as it came.
 
     Attributes:
         offset_ns: its calendar minus ours; known within ``doubt_ns``.
@@ -72,23 +72,23 @@ class Heard(Struct):
 class Telling:
     """Both ends: asks the others, and answers them."""
 
-    def __init__(self, lanes: Lanes) -> None:
-        self._lanes = lanes
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
 
     async def whole(self, component: str, robot: str, age_ms_max: int) -> dict[str, Any]:
-        """The story of every robot, or of one, of one component ("" for all); lines older than that are left out (0: none is).
+        """The event logs of all robots, or of one, of one component ("" for all), without the lines that are older (0: with all).
 
         Raises:
             RefusedError: the team has no such robot.
         """
-        settings = self._lanes.settings
+        settings = self._worker.settings
         members = [settings.config.robot, *sorted(settings.peers)]
         if robot and robot not in members:
             raise RefusedError(f"why: the team knows no robot {robot!r}, only {', '.join(members)}")
         asked = [robot] if robot else members
-        stories = await asyncio.gather(*(self._story(one, component, age_ms_max) for one in asked))
-        told = merged({one.robot: _timed(one) for one in stories})
-        return {"story": [_shown(one) for one in told], "robots": [_witness(one) for one in stories]}
+        logs = await asyncio.gather(*(self._log_of(one, component, age_ms_max) for one in asked))
+        told = merged({one.robot: _timed(one) for one in logs})
+        return {"story": [_shown(one) for one in told], "robots": [_witness(one) for one in logs]}
 
     async def page(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """This robot's own lines for another robot: the newest that fit before ``before``, with its clocks."""
@@ -109,13 +109,13 @@ class Telling:
         }
 
     async def _own(self, component: str, age_ms_max: int) -> tuple[list[Line], int]:
-        """This robot's lines, oldest first; what the heart has not written yet is asked for before the disk is read."""
-        told = await self._lanes.ask("why")
+        """This robot's lines, oldest first; what the main loop has not written yet is asked for before the disk is read."""
+        told = await self._worker.ask("why")
         try:
-            kept = await asyncio.to_thread(event_log.read, Path(self._lanes.settings.config.state_directory))
+            kept = await asyncio.to_thread(event_log.read, Path(self._worker.settings.config.state_directory))
         except OSError as error:
             raise RefusedError(f"this robot cannot read its event log: {error.strerror}") from error
-        found = {_place(line): line for line in (*kept.lines, *told.story)}
+        found = {_place(line): line for line in (*kept.lines, *told.unwritten)}
         now = _reading()
         chosen = [
             line
@@ -125,10 +125,10 @@ class Telling:
         ]
         return chosen, kept.damaged
 
-    async def _story(self, robot: str, component: str, age_ms_max: int) -> Heard:
+    async def _log_of(self, robot: str, component: str, age_ms_max: int) -> Heard:
         heard = Heard(robot)
         try:
-            if robot == self._lanes.settings.config.robot:
+            if robot == self._worker.settings.config.robot:
                 heard.lines, heard.damaged = await self._own(component, age_ms_max)
                 heard.reading = _reading()
             else:
@@ -147,7 +147,7 @@ class Telling:
         for _ in range(PAGES_MAX):
             asked_ns = clock.wall_ns(clock.now_ns())
             question = {"name": component, "age_ms_max": age_ms_max, "before": before}
-            page = await self._lanes.errands.send(heard.robot, "story", question, patience_s=PATIENCE_S)
+            page = await self._worker.errands.send(heard.robot, "story", question, patience_s=PATIENCE_S)
             _set_clock(heard, page, asked_ns, clock.wall_ns(clock.now_ns()))
             lines = [event_log.unpacked(bytes(content).rstrip(b"\n")) for content in page["lines"]]
             whole = [line for line in lines if line is not None]
@@ -207,7 +207,7 @@ def _on_our_clock(line: Line, heard: Heard) -> Timed:
 
 
 def _witness(heard: Heard) -> dict[str, Any]:
-    """What is said about one robot's part in the story; see `failover.client.control.WHY`."""
+    """What is said about one robot's part in the answer; see `failover.client.control.WHY`."""
     return {
         "robot": heard.robot,
         "answered": not heard.reason,
@@ -220,7 +220,7 @@ def _witness(heard: Heard) -> dict[str, Any]:
 
 
 def _shown(timed: Timed) -> dict[str, Any]:
-    """One line of the story; see `failover.client.control.WHY`."""
+    """One line of the event log; see `failover.client.control.WHY`."""
     line, facts = timed.line, timed.line.decision.facts
     return {
         "at": timed.at_ns / 10**9,

@@ -16,14 +16,14 @@ from typing import Final
 from agent.config import Settings
 from agent.errors import LaneError
 from agent.worker.network.links import Links
-from agent.worker.network.replication_link import BulkLane, Keys, LinkState, Unread
+from agent.worker.network.replication_link import Callbacks, Keys, LinkState, ReplicationLink, Unread
 from failover.config.team import Robot, split_address
 from failover.core.wire.messages import Bulk
 
 BEAT_KEY_SIZE: Final = 32
 
 BULK: Final = 0
-"""Number of the bulk lane among the ways; the others follow in the order of the beat addresses."""
+"""Number of the replication link among the ways; the others follow in the order of the beat addresses."""
 
 Heard = Callable[[int, str, Bulk], None]
 """Called with (way, peer, message)."""
@@ -34,12 +34,12 @@ Changed = Callable[[int, str, LinkState, str], None]
 log = logging.getLogger("failover.lane")
 
 
-class Ways:
-    """The lanes of one robot. Lives in one asyncio loop.
+class AllConnections:
+    """The connections of one robot. Lives in one asyncio loop.
 
     Attributes:
         bulk: the one that snapshots travel on.
-        troubles: sentences: lanes that could not be had.
+        troubles: sentences: links that could not be had.
     """
 
     def __init__(
@@ -49,25 +49,25 @@ class Ways:
         self._connected: set[tuple[int, str]] = set()
         self._beat_keys: dict[str, bytes] = {}
         self._their_keys: dict[tuple[int, str], bytes] = {}
-        self._lanes: list[BulkLane] = []
+        self._all: list[ReplicationLink] = []
         name = settings.config.robot
         bulks = {peer: robot.bulk for peer, robot in settings.peers.items()}
-        hear, change = functools.partial(heard, BULK), functools.partial(changed, BULK)
-        self.bulk = BulkLane(name, settings.me.bulk, bulks, keys, hear, change, links, unread)
-        self._lanes.append(self.bulk)
+        tell = Callbacks(functools.partial(heard, BULK), functools.partial(changed, BULK), unread)
+        self.bulk = ReplicationLink(name, settings.me.bulk, bulks, keys, tell, links)
+        self._all.append(self.bulk)
         for way, (bind, peers) in enumerate(further_links(settings), start=1):
-            hear, change = functools.partial(heard, way), functools.partial(changed, way)
-            self._lanes.append(BulkLane(name, bind, peers, keys, hear, change, unread=unread))
+            tell = Callbacks(functools.partial(heard, way), functools.partial(changed, way), unread)
+            self._all.append(ReplicationLink(name, bind, peers, keys, tell))
 
     def open(self) -> None:
         """Listen on every link. A further link that cannot be had is done without, and said.
 
         Raises:
-            LaneError: the bulk lane's address cannot be had.
+            LaneError: the replication link's address cannot be had.
         """
-        for way, lane in enumerate(self._lanes):
+        for way, link in enumerate(self._all):
             try:
-                lane.open()
+                link.open()
             except LaneError as error:
                 if way == BULK:
                     raise
@@ -76,21 +76,21 @@ class Ways:
 
     async def close(self) -> None:
         """Close every connection."""
-        for lane in self._lanes:
-            await lane.close()
+        for link in self._all:
+            await link.close()
 
     def say(self, peer: str, message: Bulk) -> bool:
         """Queue a word to a peer, over the first way that is connected; False: there is none, it was dropped."""
-        lane = next((lane for lane in self._lanes if _is_connected(lane, peer)), None)
-        return lane is not None and lane.say(peer, message)
+        link = next((link for link in self._all if _is_connected(link, peer)), None)
+        return link is not None and link.say(peer, message)
 
     def answer(self, way: int, peer: str, message: Bulk) -> bool:
         """Queue a word to a peer over one way."""
-        return self._lanes[way].say(peer, message)
+        return self._all[way].say(peer, message)
 
     def refuse(self, way: int, peer: str, reason: str) -> None:
         """Talk no further with this peer there until it connects anew."""
-        self._lanes[way].links[peer].refuse(reason)
+        self._all[way].links[peer].refuse(reason)
 
     def carried_words(self, way: int, peer: str, state: LinkState) -> bool:
         """Called at each change of a connection: whether words to the peer took this way until now, and may be lost with it."""
@@ -107,13 +107,13 @@ class Ways:
         link = self.bulk.links.get(peer)
         if link is None:
             return "it is no robot of this team"
-        if any(_is_connected(lane, peer) for lane in self._lanes):
+        if any(_is_connected(one, peer) for one in self._all):
             return ""
         return f"the replication link is {link.state}" + (f", {link.reason}" if link.reason else "")
 
     def beat_key(self, peer: str) -> bytes:
         """The key for our beats to a peer on a new connection: a fresh one with the first, told again on any further."""
-        connected = sum(_is_connected(lane, peer) for lane in self._lanes)
+        connected = sum(_is_connected(link, peer) for link in self._all)
         if connected <= 1 or peer not in self._beat_keys:
             self._beat_keys[peer] = secrets.token_bytes(BEAT_KEY_SIZE)
         return self._beat_keys[peer]
@@ -130,7 +130,7 @@ class Ways:
 
 
 def further_links(settings: Settings) -> list[tuple[str, dict[str, str]]]:
-    """For each link beside the bulk lane's: where to listen, and every peer's address there."""
+    """For each link beside the replication link's: where to listen, and every peer's address there."""
     found = []
     for number, address in enumerate(settings.me.beats):
         bind = _beside(address, settings.me)
@@ -145,11 +145,11 @@ def further_links(settings: Settings) -> list[tuple[str, dict[str, str]]]:
 
 
 def _beside(beat_address: str, robot: Robot) -> str:
-    """The host of a beat address with the bulk lane's port; "" where it is the bulk lane's own host."""
+    """The host of a beat address with the replication link's port; "" where it is the replication link's own host."""
     host, _ = split_address(beat_address, "beat address")
     bulk, port = split_address(robot.bulk, "bulk address")
     return "" if host == bulk else f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _is_connected(lane: BulkLane, peer: str) -> bool:
-    return peer in lane.links and lane.links[peer].state is LinkState.CONNECTED
+def _is_connected(link: ReplicationLink, peer: str) -> bool:
+    return peer in link.links and link.links[peer].state is LinkState.CONNECTED

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from agent.system import rtnetlink
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.worker.network.links import Links
 
 SETTLE_S: Final = 0.05
@@ -24,7 +24,7 @@ log = logging.getLogger("failover.links")
 
 
 class Wires:
-    """Refreshes `Links` and passes on what changed. Lives in the lanes' loop."""
+    """Refreshes `Links` and passes on what changed. Lives in the worker's loop."""
 
     def __init__(self, links: Links, changed: Callable[[list[str]], Awaitable[None]]) -> None:
         self._links = links
@@ -44,7 +44,7 @@ class Wires:
         self._stirred.set()
         first = self._links.refresh()
         self._task = asyncio.create_task(self._follow(first))
-        self._task.add_done_callback(end_lanes_on_mistake)
+        self._task.add_done_callback(end_worker_on_mistake)
 
     def close(self) -> None:
         """Look no longer."""

@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from agent.errors import TROUBLE, RefusedError
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.system.permissions import NOBODY
 from checkpoint.errors import UNDECODABLE
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Errand, ErrandDone
@@ -28,14 +28,14 @@ UNDER_WAY_MAX: Final = 64
 """Errands of one peer that are carried out at a time; more are refused."""
 
 CONTENT_MAX: Final = CHUNK_SIZE_MAX
-"""Bytes of an answer: the lane takes no larger message than a chunk of a snapshot."""
+"""Bytes of an answer: the replication link takes no larger message than a chunk of a snapshot."""
 
 Order = Callable[[dict[str, Any], int], Awaitable[dict[str, Any]]]
 """Carries one verb out on this robot: its arguments, the uid of who gave it → its result."""
 
 
 class Errands:
-    """Both ends: what was sent from here, and what came from others. Lives in the lanes' loop."""
+    """Both ends: what was sent from here, and what came from others. Lives in the worker's loop."""
 
     def __init__(self, say: Callable[[str, Bulk], object], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
         """
@@ -89,7 +89,7 @@ class Errands:
             waiting.set_result(message)
 
     def lost(self, peer: str) -> None:
-        """The connection has gone: nobody knows whether the order arrived."""
+        """The connection has gone: it is not known whether the order arrived."""
         for (robot, number), waiting in self._waiting.items():
             if robot == peer and not waiting.done():
                 sentence = "the connection was lost before its answer; failover status tells whether it was done"
@@ -104,7 +104,7 @@ class Errands:
         task = asyncio.create_task(self._carry_out(peer, message))
         under_way.add(task)
         task.add_done_callback(under_way.discard)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
 
     async def close(self) -> None:
         """Give up what is under way."""

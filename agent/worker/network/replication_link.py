@@ -26,7 +26,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from agent.errors import LaneError
 from agent.system.connection_quota import Arrivals, plain
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.system.rtnetlink import allow_absent
 from agent.worker.network.links import Device
 from failover.config.team import for_lookup, split_address
@@ -83,7 +83,7 @@ class LinkState(enum.StrEnum):
 
 
 class Keys(Struct, frozen=True):
-    """This robot's pair and everybody's public keys by name; Z85. Empty strings: no encryption."""
+    """This robot's pair of keys and all members' public keys by name; Z85. Empty strings: no encryption."""
 
     public: str
     secret: str
@@ -91,7 +91,7 @@ class Keys(Struct, frozen=True):
 
     @property
     def present(self) -> bool:
-        """Whether the lane is authenticated and encrypted."""
+        """Whether the link is authenticated and encrypted."""
         return bool(self.secret)
 
 
@@ -129,6 +129,14 @@ Unread = Callable[[str, str], None]
 """Called with (peer, why) whenever something comes from a peer's address that does not prove to be its; "" for no peer's."""
 
 
+class Callbacks(Struct, frozen=True):
+    """Whom a link tells what happens on it."""
+
+    receive: Receive
+    changed: Changed
+    unread: Unread = lambda *_: None
+
+
 def new_keys() -> tuple[str, str]:
     """A fresh (public, secret) pair, Z85."""
     public, secret = zmq.curve_keypair()
@@ -147,7 +155,7 @@ def public_key_of(secret: str) -> str:
         raise LaneError("this robot's secret key is not a CURVE key of 40 characters; failover team enrol makes one") from error
 
 
-class Link:
+class PeerConnection:
     """The way to one peer: a DEALER socket, what waits for it, and how its connection stands."""
 
     def __init__(
@@ -157,8 +165,7 @@ class Link:
         peer: str,
         address: str,
         keys: Keys,
-        changed: Changed,
-        unread: Unread,
+        callbacks: Callbacks,
         device: Device | None = None,
     ) -> None:
         """
@@ -169,8 +176,7 @@ class Link:
         self.device = device
         self.state = LinkState.CONNECTING
         self.reason = ""
-        self._changed = changed
-        self._unread = unread
+        self._callbacks = callbacks
         self._own_key, self._their_key = shown(keys.public), shown(keys.peers.get(peer, ""))
         self._words: deque[bytes] = deque(maxlen=QUEUE_LIMIT)
         self._chunk: tuple[bytes, asyncio.Future[None]] | None = None
@@ -194,7 +200,7 @@ class Link:
         self._socket.connect(self._address)
         self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
         for task in self._tasks:
-            task.add_done_callback(end_lanes_on_mistake)
+            task.add_done_callback(end_worker_on_mistake)
 
     def say(self, message: Bulk) -> bool:
         """Queue a small message; it overtakes chunks. False: there is no connection, it was dropped."""
@@ -259,7 +265,7 @@ class Link:
             elif kind in HANDSHAKE_FAILURES:
                 reason = _refusal(self.peer, kind, self._own_key, self._their_key)
                 self._enter(LinkState.REFUSED, reason)
-                self._unread(self.peer, reason)
+                self._callbacks.unread(self.peer, reason)
                 if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                     self._loop.call_later(RECONNECT_MOST_MS / 1_000, self._knock_again)
             elif kind == zmq.EVENT_DISCONNECTED and self.state is not LinkState.REFUSED:
@@ -281,7 +287,7 @@ class Link:
         if state is not LinkState.CONNECTED:
             self._words.clear()
             self._fail_chunk(reason)
-        self._changed(self.peer, state, reason)
+        self._callbacks.changed(self.peer, state, reason)
 
     def _fail_chunk(self, reason: str) -> None:
         waiting, self._chunk = self._chunk, None
@@ -289,7 +295,7 @@ class Link:
             waiting[1].set_exception(LaneError(f"the replication link to {self.peer} went down: {reason}"))
 
 
-class BulkLane:
+class ReplicationLink:
     """All connections of this robot. Lives in one asyncio loop."""
 
     def __init__(
@@ -298,10 +304,8 @@ class BulkLane:
         bind: str,
         peers: Mapping[str, str],
         keys: Keys,
-        receive: Receive,
-        changed: Changed,
+        callbacks: Callbacks,
         devices: Devices = ANY_DEVICE,
-        unread: Unread = lambda *_: None,
     ) -> None:
         """
         Args:
@@ -316,12 +320,10 @@ class BulkLane:
         self._bind = bind
         self._peers = peers
         self._keys = keys
-        self._receive = receive
-        self._changed = changed
-        self._unread = unread
+        self._callbacks = callbacks
         self._context = zmq.asyncio.Context()
         self._tasks: list[asyncio.Task[None]] = []
-        self.links: dict[str, Link] = {}
+        self.links: dict[str, PeerConnection] = {}
         self.strangers = 0
         self._stranger = ""
         self._mismatch: dict[str, str] = {}
@@ -329,7 +331,7 @@ class BulkLane:
         self._arrivals = Arrivals(split_address(bind, "bulk address")[1], self._hosts())
 
     def open(self) -> None:
-        """Listen, and begin to connect to everybody.
+        """Listen, and begin to connect to all peers.
 
         Raises:
             LaneError: the address cannot be had.
@@ -357,7 +359,7 @@ class BulkLane:
         self._tasks.append(asyncio.create_task(self._hear(router)))
         self._tasks.append(asyncio.create_task(self._watch(monitor)))
         for task in self._tasks:
-            task.add_done_callback(end_lanes_on_mistake)
+            task.add_done_callback(end_worker_on_mistake)
         for peer in self._peers:
             self._connect(peer)
 
@@ -393,7 +395,7 @@ class BulkLane:
         for peer, link in list(self.links.items()):
             if self._device_to(peer) not in (None, link.device):
                 await link.close()
-                self._changed(peer, LinkState.CONNECTING, "its interface is another one now")
+                self._callbacks.changed(peer, LinkState.CONNECTING, "its interface is another one now")
                 self._connect(peer)
 
     async def _listen_anew(self, router: zmq.asyncio.Socket) -> None:
@@ -411,7 +413,7 @@ class BulkLane:
 
     def _connect(self, peer: str) -> None:
         address, device = self._peers[peer], self._device_to(peer)
-        self.links[peer] = Link(self._context, self._me, peer, address, self._keys, self._changed, self._unread, device)
+        self.links[peer] = PeerConnection(self._context, self._me, peer, address, self._keys, self._callbacks, device)
 
     def _device_to(self, peer: str) -> Device | None:
         return self._devices.device(split_address(self._peers[peer], "bulk address")[0])
@@ -421,7 +423,7 @@ class BulkLane:
         return self.links[peer].say(message)
 
     async def ship(self, peer: str, chunk: Chunk) -> None:
-        """Send one chunk; see `Link.ship`."""
+        """Send one chunk; see `PeerConnection.ship`."""
         await self.links[peer].ship(chunk)
 
     def troubles(self) -> list[str]:
@@ -457,7 +459,7 @@ class BulkLane:
                 peer = self._speaker(frames)
                 message = decode_bulk(frames[1].bytes) if peer and len(frames) == 2 else None
                 if message is not None:
-                    self._receive(peer, message)
+                    self._callbacks.receive(peer, message)
                 elif peer:
                     self._misunderstood[peer] += 1
                 else:
@@ -512,9 +514,9 @@ class BulkLane:
         for peer in peers:
             known = shown(self._keys.peers[peer])
             self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
-            self._unread(peer, self._mismatch[peer])
+            self._callbacks.unread(peer, self._mismatch[peer])
         if not peers:
-            self._unread("", f"a sender at {address} presents the key {key}")
+            self._callbacks.unread("", f"a sender at {address} presents the key {key}")
 
     def _refused(self, stranger: str) -> None:
         """Count one that is not in the team; the log hears of it once, for it may knock for ever."""

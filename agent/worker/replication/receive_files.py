@@ -17,6 +17,7 @@ from typing import Final
 
 from msgspec import Struct
 
+from agent.system.threads import to_its_end
 from agent.worker.replication.transfer import Refusal
 from checkpoint.errors import StoreError
 from checkpoint.snapshot.required_files import Need
@@ -116,7 +117,7 @@ class Stock:
         return ""
 
     def lost(self, peer: str) -> None:
-        """The lane to a peer is gone; it will ask again."""
+        """The link to a peer is gone; it will ask again."""
         self._awaited.pop(peer, None)
         self._named = {key: named for key, named in self._named.items() if key[0] != peer}
 
@@ -136,7 +137,7 @@ class Stock:
 
     async def take(self, peer: str, offer: Content, descriptor: int) -> None:
         """Keep it; its digest is right."""
-        await asyncio.to_thread(self._store.contents.put, descriptor, offer.digest, own=True)
+        await to_its_end(self._store.contents.put, descriptor, offer.digest, own=True)
         self._awaited.get(peer, {}).pop(offer.digest, None)
 
     def not_taken(self, peer: str, offer: Content, why: str) -> None:

@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from agent.config import ComponentConfig
 from agent.guard.output_logs import STREAMS, logs_of
+from agent.system.threads import to_its_end
 from agent.worker.components.paths import Places, complete_logs, log_directory
 from agent.worker.replication.transfer import Refusal
 from checkpoint.engine import COOPERATIVE
@@ -78,10 +79,10 @@ class Deposit:
         self._admitted[act.component] = act
         if act.sender:
             self._senders[act.component] = act.sender
-        self._places.nursery.expect(sum(bool(known.sender) for known in self._admitted.values()))
+        self._places.process_pool.expect(sum(bool(known.sender) for known in self._admitted.values()))
 
     def last_sender(self, component: str) -> str:
-        """From whom its snapshots come, or came until this robot claimed it; "" from nobody."""
+        """From whom its snapshots come, or came until this robot claimed it; "" for none."""
         return self._senders.get(component, "")
 
     def admits(self, peer: str, offer: Offer) -> None:
@@ -118,7 +119,7 @@ class Deposit:
         async with self._turns.setdefault(offer.component, asyncio.Lock()):
             try:
                 self.admits(peer, offer)
-                snapshot = await asyncio.to_thread(self._put, offer, descriptor)
+                snapshot = await to_its_end(self._put, offer, descriptor)
             except Refusal as refusal:
                 log.info("dropped a snapshot of %s from %s: %s", offer.component, peer, refusal)
                 return
@@ -140,7 +141,7 @@ class Deposit:
     def accept(self, act: Accept) -> None:
         """It counts as held here: the ready copy and the status follow; its output waits for `show`."""
         offer, snapshot = self._stored.pop((act.component, act.position), (None, None))
-        if offer is None or snapshot is None:  # stored by an earlier life of these lanes
+        if offer is None or snapshot is None:  # an earlier worker stored it
             return
         unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
         unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED, offer.spec.owner))
@@ -168,7 +169,7 @@ class Deposit:
         """Have the logs hold all up to a position.
 
         Args:
-            is_elsewhere: another robot is known to hold it, whoever took it in.
+            is_elsewhere: another robot is known to hold it, also where this one took it in.
         """
         unshown = self._unshown.setdefault(component, deque())
         directory = log_directory(component, self._places)
@@ -185,13 +186,13 @@ class Deposit:
                 logs.apply(one.output, is_safe=True)
         finally:
             logs.close()
-        if is_gap:  # what came before was taken in by an earlier life of these lanes
+        if is_gap:  # an earlier worker took in what came before
             self._complete(component, directory, position, is_safe=True)
         while unshown and unshown[0].position <= position:
             unshown.popleft()
 
     def _complete(self, component: str, directory: Path, position: Position, *, is_safe: bool) -> None:
-        """An earlier life of these lanes took it in, or too many wait: read it from the files."""
+        """An earlier worker took it in, or too many wait: read it from the files."""
         descriptors = self._store.open_chain(component, position)
         try:
             complete_logs(directory, descriptors, is_safe=is_safe)

@@ -19,6 +19,7 @@ from typing import Final
 from msgspec import Struct, field
 
 from agent.errors import LaneError
+from agent.system.threads import to_its_end
 from agent.worker.replication.receive_files import is_in_place, is_plausible, named, size_told
 from agent.worker.replication.transfer import Shipper
 from checkpoint.errors import CheckpointError
@@ -77,7 +78,7 @@ class Bringing:
     ) -> None:
         """
         Args:
-            say: on the bulk lane; False: it is not connected.
+            say: on the replication link; False: it is not connected.
             note: told (component, peer, sentence) what is on its way, for the status; "" when nothing is any more.
         """
         self._shipper = shipper
@@ -115,7 +116,7 @@ class Bringing:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def heard(self, peer: str, message: Lacking) -> None:
-        """A peer's answer; one that nobody waits for is dropped."""
+        """A peer's answer; one that is not awaited is dropped."""
         asked = self._asked.get(message.number)
         if asked is not None and asked[0] == peer and not asked[1].done():
             asked[1].set_result(message)
@@ -154,7 +155,7 @@ class Bringing:
             del self._asked[number]
 
     async def _send_all(self, peer: str, known: _Peer, component: str, lacking: dict[bytes, Need]) -> None:
-        """Send each once, whoever else waits for it; the smallest first, so that most is there soon."""
+        """Send each once, also where several wait for it; the smallest first, so that most is there soon."""
         until_s = time.monotonic() + PATIENCE_S
         waiting = sorted(lacking.values(), key=lambda need: need.size)
         rest = sum(need.size for need in waiting)
@@ -169,7 +170,7 @@ class Bringing:
             rest -= need.size
 
     async def _arrival(self, peer: str, task: asyncio.Task[None], until_s: float, rest: int) -> None:
-        """Wait for one; whoever gives up waiting does not give it up."""
+        """Wait for one; a task that gives up waiting does not give it up."""
         done, _ = await asyncio.wait((task,), timeout=max(until_s - time.monotonic(), 0))
         if not done:
             raise LaneError(f"{size_told(rest)} of its program files are still on their way to {peer}")
@@ -196,7 +197,7 @@ class Bringing:
 def _end(known: _Peer, digest: bytes, done: asyncio.Task[None]) -> None:
     known.under_way.pop(digest, None)
     if not done.cancelled():
-        done.exception()  # noted: whoever waited has been told, if anybody did
+        done.exception()  # noted: the tasks that waited have been told
 
 
 def named_needs(needs: list[Need]) -> str:
@@ -238,7 +239,7 @@ class Sources:
                 continue
             descriptor = await self._from_keeper(component, need)
             try:
-                await asyncio.to_thread(self._store.contents.put, descriptor, need.digest)
+                await to_its_end(self._store.contents.put, descriptor, need.digest)
             finally:
                 os.close(descriptor)
             log.info("%s: kept %s as the program has it; its path leads to it no more", component, need.path)

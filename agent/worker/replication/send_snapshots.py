@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 
 from agent.errors import AgentError, LaneError
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
 from agent.worker.components import under_way
 from agent.worker.replication.send_files import Bringing
 from agent.worker.replication.transfer import Shipper, digest_of
@@ -57,7 +57,7 @@ class Dispatch:
         self.cancel(CancelShip(act.component, act.epoch, act.position, act.to))
         task = self._tasks[key] = asyncio.create_task(self._ship(act))
         task.add_done_callback(lambda done: self._tasks.pop(key, None) if self._tasks.get(key) is done else None)
-        task.add_done_callback(end_lanes_on_mistake)
+        task.add_done_callback(end_worker_on_mistake)
 
     def cancel(self, act: CancelShip) -> None:
         """Give a transfer up; nothing is told."""

@@ -20,8 +20,10 @@ from blake3 import blake3
 from msgspec import Struct, field
 
 from agent.errors import LaneError
-from agent.system.crash import end_lanes_on_mistake
+from agent.system.crash import end_worker_on_mistake
+from agent.system.threads import to_its_end
 from checkpoint.errors import StoreError
+from checkpoint.store.disk import Disk, DiskFile
 from failover.core.wire.messages import (
     CHUNK_SIZE_MAX,
     SNAPSHOT_SIZE_MAX,
@@ -55,8 +57,8 @@ INCOMING_LIMIT: Final = 64
 """Transfers that one peer may have open here: one a component is all that it needs."""
 
 
-class Lane(Protocol):
-    """What of `agent.worker.network.replication_link.BulkLane` is needed here."""
+class Link(Protocol):
+    """What of `agent.worker.network.replication_link.ReplicationLink` is needed here."""
 
     def say(self, peer: str, message: Bulk) -> bool: ...
     async def ship(self, peer: str, chunk: Chunk) -> None: ...
@@ -86,12 +88,12 @@ class _Outgoing(Struct):
 class Shipper:
     """The transfers that leave this robot."""
 
-    def __init__(self, lane: Lane, bytes_a_second: float = 0.0) -> None:
+    def __init__(self, link: Link, bytes_a_second: float = 0.0) -> None:
         """
         Args:
             bytes_a_second: cap on all transfers together; 0 for none.
         """
-        self._lane = lane
+        self._link = link
         self._pace = Pace(bytes_a_second)
         self._numbers = itertools.count(time.monotonic_ns())
         self._outgoing: dict[int, _Outgoing] = {}
@@ -109,7 +111,7 @@ class Shipper:
         number = next(self._numbers)
         transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
         try:
-            if not self._lane.say(peer, msgspec.structs.replace(offer, transfer=number)):
+            if not self._link.say(peer, msgspec.structs.replace(offer, transfer=number)):
                 raise LaneError(f"the replication link to {peer} is not connected")
             for offset in range(0, offer.size, CHUNK_SIZE_MAX):
                 size = min(CHUNK_SIZE_MAX, offer.size - offset)
@@ -117,11 +119,11 @@ class Shipper:
                 if isinstance(offer, Content):
                     await self._give_way()
                 await self._pace.wait(size)
-                await self._lane.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
+                await self._link.ship(peer, Chunk(number, offset, os.pread(descriptor, size, offset)))
             transfer.sent = True
             await self._until(transfer, lambda: transfer.taken, STORED_S)
         except (LaneError, asyncio.CancelledError):
-            self._lane.say(peer, Cancel(number))
+            self._link.say(peer, Cancel(number))
             raise
         finally:
             del self._outgoing[number]
@@ -169,7 +171,7 @@ class Shipper:
 
 
 class Pace:
-    """A cap on a flow: whoever is ahead of it waits."""
+    """A cap on a flow: a sender that is ahead of it waits."""
 
     def __init__(self, bytes_a_second: float) -> None:
         self._rate = bytes_a_second
@@ -206,7 +208,7 @@ class Desk(Protocol[Kind]):
         """All bytes are in the file and their digest is right. The descriptor is closed afterwards.
 
         Raises:
-            StoreError: the disk does not take a content; whoever sent it is told.
+            StoreError: the disk does not take a content; its sender is told.
         """
 
     async def make_room(self, size: int) -> None:
@@ -221,6 +223,7 @@ class _Incoming(Struct):
 
     offer: Offered
     chunks: asyncio.Queue[Chunk]
+    credit: int = WINDOW
     task: asyncio.Task[None] | None = None
 
 
@@ -230,12 +233,12 @@ class Receiver:
     Bytes are written by a thread, chunk by chunk; credit is given as they are written.
     """
 
-    def __init__(self, lane: Lane, directory: Path, desk: Desk[Any]) -> None:
+    def __init__(self, link: Link, directory: Path, desk: Desk[Any]) -> None:
         """
         Args:
             directory: on the store's file system, for the unnamed files.
         """
-        self._lane = lane
+        self._link = link
         self._directory = directory
         self._desk = desk
         self._incoming: dict[tuple[str, int], _Incoming] = {}
@@ -248,11 +251,11 @@ class Receiver:
         try:
             self._check(peer, offer)
         except Refusal as refusal:
-            self._lane.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
+            self._link.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
             return
         transfer = self._incoming[peer, offer.transfer] = _Incoming(offer, asyncio.Queue(WINDOW_CHUNKS))
         transfer.task = asyncio.create_task(self._receive(peer, transfer))
-        transfer.task.add_done_callback(end_lanes_on_mistake)
+        transfer.task.add_done_callback(end_worker_on_mistake)
 
     def chunk(self, peer: str, chunk: Chunk) -> None:
         """Take one chunk in; one without credit ends its transfer."""
@@ -263,7 +266,7 @@ class Receiver:
             transfer.chunks.put_nowait(chunk)
         except asyncio.QueueFull:
             self._drop((peer, chunk.transfer))
-            self._lane.say(peer, Refuse(chunk.transfer, "a chunk came without credit"))
+            self._link.say(peer, Refuse(chunk.transfer, "a chunk came without credit"))
 
     def cancelled(self, peer: str, message: Cancel) -> None:
         """The sender gave up."""
@@ -293,39 +296,38 @@ class Receiver:
         try:
             await self._desk.make_room(offer.size)
             descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+            signs = asyncio.create_task(self._repeat_credit(peer, transfer))
             try:
                 await self._fill(peer, transfer, descriptor)
                 if isinstance(offer, Offer):
                     self._incoming.pop((peer, offer.transfer), None)  # a newer one does not end what is whole
-                signs = asyncio.create_task(self._show_that_it_is_stored(peer, offer))
-                try:
-                    await self._desk.take(peer, offer, descriptor)
-                finally:
-                    signs.cancel()
-                self._lane.say(peer, Taken(offer.transfer))
+                await self._desk.take(peer, offer, descriptor)
+                self._link.say(peer, Taken(offer.transfer))
             finally:
+                signs.cancel()
                 os.close(descriptor)
         except OSError as error:
             why = f"cannot write it there: {error.strerror}"
             log.warning("gave up %s from %s: %s", _named(offer), peer, why)
-            self._lane.say(peer, Refuse(offer.transfer, why))
+            self._link.say(peer, Refuse(offer.transfer, why))
             self._desk.not_taken(peer, offer, why)
         except (LaneError, StoreError) as error:
             log.warning("gave up %s: %s", _named(offer), error)
-            self._lane.say(peer, Refuse(offer.transfer, str(error)))
+            self._link.say(peer, Refuse(offer.transfer, str(error)))
         finally:
             self._incoming.pop((peer, offer.transfer), None)
 
-    async def _show_that_it_is_stored(self, peer: str, offer: Offered) -> None:
-        """Repeat the last credit, so that the sender knows that this robot has not forgotten it."""
+    async def _repeat_credit(self, peer: str, transfer: _Incoming) -> None:
+        """So that the sender knows that this robot has not forgotten it, however slow the disk is."""
         while True:
             await asyncio.sleep(SIGN_S)
-            self._lane.say(peer, Credit(offer.transfer, offer.size + WINDOW))
+            self._link.say(peer, Credit(transfer.offer.transfer, transfer.credit))
 
     async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
         offer, digest, end = transfer.offer, blake3(), 0
         what = SNAPSHOT if isinstance(offer, Offer) else FILE
-        self._lane.say(peer, Credit(offer.transfer, WINDOW))
+        file = DiskFile(Disk(), descriptor)
+        self._link.say(peer, Credit(offer.transfer, transfer.credit))
         while end < offer.size:
             try:
                 async with asyncio.timeout(PATIENCE_S):
@@ -334,9 +336,10 @@ class Receiver:
                 raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
             if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
                 raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
-            await asyncio.to_thread(_keep, descriptor, chunk, digest)
+            await to_its_end(_keep, file, chunk.content, digest)
             end += len(chunk.content)
-            self._lane.say(peer, Credit(offer.transfer, end + WINDOW))
+            transfer.credit = end + WINDOW
+            self._link.say(peer, Credit(offer.transfer, transfer.credit))
         if digest.digest() != offer.digest:
             raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
 
@@ -352,9 +355,9 @@ def _named(offer: Offered) -> str:
     return f"a file of {offer.size} bytes ({offer.digest.hex()[:16]}…)"
 
 
-def _keep(descriptor: int, chunk: Chunk, digest: blake3) -> None:
-    os.pwrite(descriptor, chunk.content, chunk.offset)
-    digest.update(chunk.content)
+def _keep(file: DiskFile, content: bytes, digest: blake3) -> None:
+    file.write(content)
+    digest.update(content)
 
 
 def digest_of(descriptor: int, size: int) -> bytes:

@@ -19,8 +19,10 @@ from checkpoint.pages.page_set import Words
 from checkpoint.program import scratch_name
 
 NONE: Final[Words] = np.empty((0, 2), dtype=np.uint64)
-NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]", "[uprobes]"))
-"""Mappings of the kernel's own: made anew on restore."""
+BOARD: Final = "[board]"
+"""How a mapping of the team's board is told (`checkpoint.resources.ipc.boards`): pages of zeros where the program resumes."""
+NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]", "[uprobes]", BOARD))
+"""Mappings of the kernel's own, and of the board: made anew on restore."""
 
 
 class Scan(Struct, frozen=True, eq=False):

@@ -30,20 +30,9 @@ from checkpoint.linux.procfs.descriptors import descriptors_to
 from checkpoint.linux.procfs.live_thread import pidfd_of
 from checkpoint.linux.procfs.procfs import MapsLine
 from checkpoint.linux.spawn import vdso
-from checkpoint.linux.trace.remote_syscalls import (
-    ABANDONED,
-    BATCH_TIMEOUT_S,
-    CODE_SIZE,
-    MAGIC,
-    SIZE,
-    TABLE_SIZE,
-    Batch,
-    BorrowedPages,
-    Guest,
-    give_back,
-    patience_ns,
-    resumed,
-)
+from checkpoint.linux.trace.remote_syscalls import BATCH_TIMEOUT_S, BorrowedPages
+from checkpoint.linux.trace.syscall_batch import ABANDONED, CODE_SIZE, MAGIC, SIZE, TABLE_SIZE, Batch
+from checkpoint.linux.trace.syscall_desk import Guest, give_back, patience_ns, resumed
 from checkpoint.linux.trace.tracee import Tracee, rest
 
 FAULTS_FLAGS: Final = abi.O_CLOEXEC | abi.O_NONBLOCK

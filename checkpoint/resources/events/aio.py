@@ -31,6 +31,7 @@ from checkpoint.linux.procfs.procfs import MapsLine
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Vma
 from checkpoint.resources.open_file import OpenFile
+from checkpoint.sentences import AS_SOON_AS
 
 CAPABILITIES: Final = (
     preserved(
@@ -42,7 +43,7 @@ CAPABILITIES: Final = (
     refused(
         Area.PIPES,
         "asynchronous direct I/O (O_DIRECT) that is under way, or on a file system that does not tell what is under way",
-        "wait: failover captures it as soon as the I/O is done; use a file system on a block device",
+        f"wait: {AS_SOON_AS} the I/O is done; use a file system on a block device",
         "opened for direct I/O (O_DIRECT), and its file system does not say",
     ),
     refused(

@@ -33,6 +33,7 @@ from checkpoint.model import Fact, Resource
 from checkpoint.resources import other_holders
 from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.restore_context import Rebuilding, number_of
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "watches"
 
@@ -45,7 +46,7 @@ CAPABILITIES: Final = (
     refused(
         Area.PIPES,
         "an inotify instance with unread events",
-        "wait: failover captures it as soon as the program has read them",
+        f"wait: {AS_SOON_AS} the program has read them",
         "with events that the program has not read yet",
     ),
     refused(
@@ -122,7 +123,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     what = f"{held.name} is an inotify instance"
     if held.observed.get("unread"):
-        return f"{what} with events that the program has not read yet: failover captures it as soon as the program has read them"
+        return f"{what} with events that the program has not read yet: {AS_SOON_AS} the program has read them"
     for number, path, _ in _watches(held):
         if not path:
             return f"{what} whose watch {number} is of a file that no path leads to: let the program remove that watch"

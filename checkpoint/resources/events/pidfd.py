@@ -24,6 +24,7 @@ from checkpoint.model import Fact, Resource
 from checkpoint.resources import other_holders
 from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.restore_context import Rebuilding, number_of
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "pidfds"
 
@@ -99,7 +100,7 @@ def _pid_in(one: Descriptor) -> int:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Why a pidfd cannot be kept: it stands for somebody else."""
+    """Why a pidfd cannot be kept: it stands for another process."""
     if held.first.target != TARGET:
         return None
     pid = _target(held)
@@ -126,10 +127,7 @@ def findings(held: Sequence[Resource]) -> Iterator[Finding]:
         thread = number_of(one.facts.get("thread", 0)) if one.kind == KIND else 0
         if thread and passed & {_list(pair)[0] for pair in _list(one.facts["descriptors"])}:
             whom = f"the single thread {thread} that is on its way in a unix socket, too"
-            text = (
-                f"{one.name} is a pidfd of {whom}, which is not kept yet: "
-                "failover captures it as soon as the program has received that"
-            )
+            text = f"{one.name} is a pidfd of {whom}, which is not kept yet: {AS_SOON_AS} the program has received that"
             yield Finding(KIND, one.name, REFUSED, text)
 
 

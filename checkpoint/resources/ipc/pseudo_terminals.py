@@ -40,6 +40,7 @@ from checkpoint.resources import other_holders
 from checkpoint.resources.ipc import standard_streams
 from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "terminals"
 
@@ -53,7 +54,7 @@ CAPABILITIES: Final = (
     refused(
         Area.TERMINALS,
         "a pseudo-terminal with data that waits to be read, or with a line discipline of another kind",
-        "wait: failover captures it as soon as the data is read; let the program use the ordinary line discipline",
+        f"wait: {AS_SOON_AS} the data is read; let the program use the ordinary line discipline",
         "with {} bytes that wait in it",
         "with line discipline",
     ),
@@ -141,7 +142,7 @@ def _is_hung_up(held: OpenFile) -> bool:
 
 
 def _has_hung_up(terminal: int) -> bool:
-    """Whether nobody has the other end. Being asked, the kernel first delivers what is still on its way."""
+    """Whether the other end is open nowhere. Being asked, the kernel first delivers what is still on its way."""
     poll = select.poll()
     poll.register(terminal, select.POLLIN)
     return bool(dict(poll.poll(0)).get(terminal, 0) & select.POLLHUP)
@@ -211,10 +212,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     number, waiting, discipline = (number_of(seen.get(name, N_TTY)) for name in ("terminal", "waiting", "discipline"))
     if waiting:
-        return (
-            f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: "
-            "failover captures it as soon as the program has read them"
-        )
+        return f"{held.name} is a pseudo-terminal with {waiting} bytes that wait in it: {AS_SOON_AS} the program has read them"
     if discipline != N_TTY:
         return f"{held.name} is a pseudo-terminal with line discipline {discipline}: only the ordinary one (N_TTY) is kept"
     if not seen["hung_up"] and (other := _other_opener(held, number)):
@@ -349,7 +347,7 @@ class Controlling(Struct, frozen=True):
     """The controlling terminal of a session.
 
     Attributes:
-        slave: a descriptor of it; None where nobody has it open any more.
+        slave: a descriptor of it; None where it is open nowhere any more.
         master: one of its other end, where that is open.
         foreground: the process group in its foreground, 0 for none.
     """
@@ -393,7 +391,7 @@ def settle(table: CallTable, held: Sequence[Resource], pid: int) -> None:
     assert isinstance(descriptors, list) and isinstance(descriptors[0], list)
     number = number_of(descriptors[0][0])
     is_closed = slave.facts["end"] != SLAVE
-    if is_closed:  # it is a session's terminal also when nobody has it open
+    if is_closed:  # it is a session's terminal also when it is open nowhere
         number = table.obtain(f"open the other end of {slave.name}", "ioctl", number, TIOCGPTPEER, os.O_RDWR | os.O_NOCTTY)
     table.call(f"take {slave.name} as the controlling terminal", "ioctl", number, termios.TIOCSCTTY, 0)
     foreground = number_of(led[number_of(slave.facts["terminal"])].facts["foreground"])

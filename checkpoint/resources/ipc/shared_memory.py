@@ -32,6 +32,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptor import Descriptor
 from checkpoint.linux.procfs.procfs import DELETED, MapsLine
 from checkpoint.model import Fact, Resource
+from checkpoint.resources.ipc import boards
 from checkpoint.resources.ipc.middlewares import Middleware, made_by
 
 KIND: Final = "detached_memory"
@@ -93,6 +94,8 @@ def mapped_elsewhere(pid: int, lines: Iterable[MapsLine], kin: Collection[int] =
     lines, found = tuple(lines), []
     asker = min(kin, default=pid)
     for key, name in dict(_objects_of(lines)).items():
+        if boards.is_board(pid, name, key):
+            continue
         mappers = _mappers(asker, time.monotonic_ns() // 1_000_000_000).get(_told(key), ())
         others = (other for other in mappers if other != pid and other not in kin and not _belongs(other, {pid, *kin}))
         if (other := next(others, None)) is not None:

@@ -42,7 +42,6 @@ CAPABILITIES: Final = (
         "the place of each process in control groups (cgroup v2 and v1)",
         "the same, where the group exists or is the program's own; else the restore says which place it lost. Limits of a group "
         "are not kept, and threads get the place of their process",
-        "pid {}",
         "this kernel has no such hierarchy",
         "that hierarchy is not mounted here",
         "the group is not one of user {} here",
@@ -185,7 +184,7 @@ def put_back(state: Snapshot, pids: Sequence[int], owner: int | None) -> tuple[s
             version = f"v1, {place.hierarchy}" if place.hierarchy else "v2"
             now = groups_of(pid).get(place.hierarchy)
             where = f"; it is in {now} now" if now is not None else ""
-            notes.append(f"{_name_of(pid)} was in the control group {place.path} ({version}){where}: {lost}")
+            notes.append(f"pid {_name_of(pid)} was in the control group {place.path} ({version}){where}: {lost}")
     return tuple(dict.fromkeys(notes))
 
 
@@ -196,7 +195,7 @@ def _thread_notes(resources: Sequence[Resource], pid: int) -> Iterator[str]:
             assert isinstance(groups, list)
             for group in groups:
                 assert isinstance(group, str)
-                yield f"threads of {_name_of(pid)} were in the control group {group}; they are in that of their process now"
+                yield f"threads of pid {_name_of(pid)} were in the control group {group}; they are in that of their process now"
 
 
 def _places(resources: Sequence[Resource]) -> Iterator[_Place]:
@@ -213,8 +212,8 @@ def _places(resources: Sequence[Resource]) -> Iterator[_Place]:
 
 def _name_of(pid: int) -> str:
     with contextlib.suppress(CheckpointError):
-        return f"pid {pid} ({procfs.status(pid).name})"
-    return f"pid {pid}"
+        return f"{pid} ({procfs.status(pid).name})"
+    return str(pid)
 
 
 def _lost(pid: int, place: _Place, usual: str | None, mounts: _Mounts, owner: int | None) -> str:

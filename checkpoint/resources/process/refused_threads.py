@@ -25,6 +25,7 @@ from checkpoint.linux.procfs.timers import parse_timers
 from checkpoint.linux.trace import seccomp as trace_seccomp
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.resources.process import seccomp, unshared_threads
+from checkpoint.sentences import AS_SOON_AS
 
 CAPABILITIES: Final = (
     preserved(
@@ -73,7 +74,7 @@ CAPABILITIES: Final = (
     refused(
         Area.PROCESS,
         "a process that shares its memory with its parent (vfork, clone(2))",
-        "wait: failover captures it as soon as it has executed a program",
+        f"wait: {AS_SOON_AS} it has executed a program",
         "it shares its {} with its parent",
     ),
 )

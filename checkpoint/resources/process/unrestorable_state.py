@@ -16,7 +16,7 @@ from checkpoint.arch import cpu
 from checkpoint.arch.calls import Call, Unkept
 from checkpoint.capability import Area, by_rule, refused
 from checkpoint.errors import CaptureError
-from checkpoint.linux.trace.remote_syscalls import Answers, Batch
+from checkpoint.linux.trace.syscall_batch import Answers, Batch
 from checkpoint.linux.trace.tracee import Tracee
 
 PR_GET_IO_FLUSHER: Final = 58

@@ -36,6 +36,7 @@ from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import queued_datagrams, sockets
 from checkpoint.resources.sockets.inet_addresses import in_words, is_ours, level_of, size_of, sockaddr, unpacked
 from checkpoint.resources.sockets.peer_credentials import Disguise
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "internet_sockets"
 
@@ -58,7 +59,7 @@ CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         "a UDP socket with an unfinished datagram (UDP_CORK)",
-        "wait: failover captures it as soon as the datagram is sent",
+        f"wait: {AS_SOON_AS} the datagram is sent",
         "begun and not sent yet (UDP_CORK)",
     ),
     refused(
@@ -242,10 +243,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
     kinds = {int(socket.SOCK_STREAM): "a TCP socket", int(socket.SOCK_DGRAM): "a UDP socket"}
     name = kinds.get(number_of(seen["type"]), "a raw socket")
     if seen["unfinished"]:
-        return (
-            f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): "
-            "failover captures it as soon as it is sent"
-        )
+        return f"{held.name} is a UDP socket with a datagram that was begun and not sent yet (UDP_CORK): {AS_SOON_AS} it is sent"
     return sockets.refuse_filter(held) or other_holders.refuse(held, name)
 
 

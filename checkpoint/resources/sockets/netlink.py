@@ -28,6 +28,7 @@ from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import sockets
 from checkpoint.resources.sockets.peer_credentials import Disguise
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "netlink_sockets"
 
@@ -121,10 +122,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
             "let the program close it"
         )
     if seen["busy"]:
-        return (
-            f"{held.name} is a netlink socket in which an answer of the kernel waits: "
-            "failover captures it as soon as the program has read that"
-        )
+        return f"{held.name} is a netlink socket in which an answer of the kernel waits: {AS_SOON_AS} the program has read that"
     return sockets.refuse_filter(held) or other_holders.refuse(held, "a netlink socket")
 
 

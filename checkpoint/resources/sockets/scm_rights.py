@@ -20,6 +20,7 @@ from checkpoint.linux import abi
 from checkpoint.linux.procfs.descriptors import descriptor
 from checkpoint.model import Fact
 from checkpoint.resources.open_file import Kin, Lent, Opened, OpenFile
+from checkpoint.sentences import AS_SOON_AS
 
 if TYPE_CHECKING:
     from checkpoint.resources.sockets.sockets import Noted
@@ -29,7 +30,7 @@ CAPABILITIES: Final = (
         Area.SOCKETS,
         "a descriptor on its way in a unix socket that the program itself has closed, if it is of a terminal, watch or "
         "device, or has a lock",
-        "wait: failover captures it as soon as the program has received it",
+        f"wait: {AS_SOON_AS} the program has received it",
         "is on its way in a unix socket",
     ),
 )
@@ -73,7 +74,7 @@ def _taken_along(opened: Opened, ours: int) -> int:
 
 
 def unnoted(number: int, before: int) -> AbstractContextManager[None]:
-    """Like `checkpoint.resources.sockets.sockets.Noted`, of what the program has no descriptor of: nobody could put it back."""
+    """Like `checkpoint.resources.sockets.sockets.Noted`, of what the program has no descriptor of: it could not be put back."""
     return contextlib.nullcontext()
 
 
@@ -98,7 +99,7 @@ def refuse(held: OpenFile, kind: str, owned: Collection[str]) -> str | None:
         return None
     return (
         f"{held.first.target} is on its way in a unix socket, which the program has closed: "
-        "failover captures it as soon as the program has received it"
+        f"{AS_SOON_AS} the program has received it"
     )
 
 

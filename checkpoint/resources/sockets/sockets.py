@@ -38,6 +38,7 @@ from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Fact, Resource
 from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
+from checkpoint.sentences import AS_SOON_AS
 
 CAPABILITIES: Final = (
     refused(
@@ -163,7 +164,7 @@ Identify = Callable[[int], int]
 """Given a descriptor of ours that was on its way to the program: which of its own is the same, else `UNKNOWN`."""
 
 Noted = Callable[[int, int], AbstractContextManager[None]]
-"""Given a descriptor of the program and its socket's SO_PEEK_OFF: writes both down for the body, for whoever comes after us if we
+"""Given a descriptor of the program and its socket's SO_PEEK_OFF: writes both down for the body, and for the next keeper if we
 die in it."""
 
 
@@ -244,7 +245,7 @@ def ends(kind: str, name: str, what: str, surroundings: Surroundings, more: str 
         more: what that means for the program.
     """
     if surroundings.terms.refuses_connections:
-        cure = "failover captures it as soon as the program has closed the connection"
+        cure = f"{AS_SOON_AS} the program has closed the connection"
         return Finding(kind, name, REFUSED, f'{what} by a restore, which connections = "refuse" rules out: {cure}')
     return Finding(kind, name, NOTED, f"{what} when the program comes back{more}")
 

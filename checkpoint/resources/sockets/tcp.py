@@ -44,6 +44,7 @@ from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import inet, sockets
 from checkpoint.resources.sockets.inet import CLOSED, LISTENING
 from checkpoint.resources.sockets.inet_addresses import in_words, is_ours, size_of, sockaddr
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "tcp_connections"
 
@@ -64,7 +65,7 @@ CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         "a TCP connection of the program with itself that is full",
-        "wait: failover captures it as soon as the data has arrived, or was read",
+        f"wait: {AS_SOON_AS} the data has arrived, or was read",
         "have not arrived at its other end",
         "in which more than {} MiB wait",
         "in which an out-of-band byte waits (MSG_OOB)",
@@ -222,26 +223,20 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
     """Why a connection of the program with itself cannot be made again."""
     what = f"{one.name} is a TCP connection of the program with itself"
     if one.facts.get("urgent"):
-        yield f"{what}, in which an out-of-band byte waits (MSG_OOB): failover captures it as soon as the program has read that"
+        yield f"{what}, in which an out-of-band byte waits (MSG_OOB): {AS_SOON_AS} the program has read that"
     if one.facts.get("encrypted"):
         yield f"{what}, which the kernel encrypts (TCP_ULP): have the program's library do so"
     if one.facts["state"] == CLOSED:
         return
     underway = _number(one, "unsent") + _number(one, "sent") - _number(other, "received") + (other.facts["state"] in _PEER_ENDED)
     if underway > 0:
-        yield (
-            f"{what}, {underway} bytes of which have not arrived at its other end: "
-            "failover captures it as soon as they have arrived"
-        )
+        yield f"{what}, {underway} bytes of which have not arrived at its other end: {AS_SOON_AS} they have arrived"
     if _number(one, "unread") > sockets.QUEUE_LIMIT:
-        yield (
-            f"{what}, in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: "
-            "failover captures it as soon as the program has read them"
-        )
+        yield f"{what}, in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: {AS_SOON_AS} the program has read them"
 
 
 def note(held: Resource) -> str | None:
-    """What becomes of a connection whose other end is somebody else's; None of one that had ended, or is asked for anew."""
+    """What becomes of a connection whose other end is another program's; None of one that had ended, or is asked for anew."""
     if held.facts["state"] in (CLOSED, SYN_SENT) and not _number(held, "unread"):
         return None
     why = f" ({reason})" if isinstance(reason := held.facts.get(LEFT), str) else ""

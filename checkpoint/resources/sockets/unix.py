@@ -38,6 +38,7 @@ from checkpoint.resources.open_file import Opened, OpenFile, Surroundings
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import peer_credentials, scm_rights, sockets, unix_names
 from checkpoint.resources.sockets.unix_names import NOT_WAITING
+from checkpoint.sentences import AS_SOON_AS
 
 KIND: Final = "unix_sockets"
 
@@ -65,28 +66,28 @@ CAPABILITIES: Final = (
     refused(
         Area.SOCKETS,
         'a connection with others, of TCP or of a unix socket, where the operator wants that (`connections = "refuse"`)',
-        "wait: failover captures it as soon as the program has closed the connection",
+        f"wait: {AS_SOON_AS} the program has closed the connection",
     ),
     refused(
         Area.SOCKETS,
         "a unix socket with descriptors on their way between several processes, with an out-of-band byte, or with over 4 "
         "MiB of data that waits",
-        "wait: failover captures it as soon as the program has taken them",
-        "in which an out-of-band byte waits (MSG_OOB): failover",
+        f"wait: {AS_SOON_AS} the program has taken them",
+        "in which an out-of-band byte waits (MSG_OOB): {}",
         "with descriptors on their way",
-        "MiB wait: failover captures it as soon as",
+        "MiB wait: {}",
     ),
     refused(
         Area.SOCKETS,
         "a unix listener where a connection waits of a process of the program that has sent data already, or of a client that "
         "has gone",
-        "wait: failover captures it as soon as the program has accepted the connection",
+        f"wait: {AS_SOON_AS} the program has accepted the connection",
         "waits to be accepted",
     ),
 )
 
 BOTH_DIRECTIONS: Final = 3
-_ACCEPTED: Final = "failover captures it as soon as the program has accepted it"
+_ACCEPTED: Final = f"{AS_SOON_AS} the program has accepted it"
 _EXITING: Final = (
     ("dbus", "clients of libdbus and GDBus do so by default"),
     ("/bus", "clients of libdbus and GDBus do so by default"),
@@ -192,25 +193,16 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
         return None
     what = f"{held.name} is a unix socket"
     if any(isinstance(numbers, list) and sockets.UNKNOWN in numbers for numbers in _list(seen["passed"])):
-        return (
-            f"{what} with descriptors on their way in it (SCM_RIGHTS) that failover cannot examine: "
-            "failover captures it as soon as they arrive"
-        )
+        return f"{what} with descriptors on their way in it (SCM_RIGHTS) that failover cannot examine: {AS_SOON_AS} they arrive"
     if seen["passed"] and held.kin.pids and held.lent is None:
-        return (
-            f"{what} with descriptors on their way in it between several processes: "
-            "failover captures it as soon as the program has received them"
-        )
+        return f"{what} with descriptors on their way in it between several processes: {AS_SOON_AS} the program has received them"
     if 0 in _list(seen["clients"]):
         return f"{what} where a connection waits to be accepted whose client has gone: {_ACCEPTED}"
     if seen["urgent"]:
-        return f"{what} in which an out-of-band byte waits (MSG_OOB): failover captures it as soon as the program has read that"
+        return f"{what} in which an out-of-band byte waits (MSG_OOB): {AS_SOON_AS} the program has read that"
     if seen["too_long"]:
-        return (
-            f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: "
-            "failover captures it as soon as the program has read them"
-        )
-    ends = _is_lost(seen) and bool(seen["peer"])  # whoever holds it too keeps what the program loses
+        return f"{what} in which more than {sockets.QUEUE_LIMIT >> 20} MiB wait: {AS_SOON_AS} the program has read them"
+    ends = _is_lost(seen) and bool(seen["peer"])  # another holder keeps what the program loses
     of_others = None if ends else other_holders.refuse(held, "a unix socket")
     return unix_names.refuse(held) or sockets.refuse_filter(held) or of_others
 

@@ -61,6 +61,16 @@ GO: Final = b"g"
 """What a host waits for before it starts its agent."""
 
 
+class Pace(Struct, frozen=True):
+    """How often the robots send heartbeats, and how long one is good for."""
+
+    beat_ms: int
+    lease_ms: int
+
+
+USUAL_PACE: Final = Pace(BEAT_MS, LEASE_MS)
+
+
 class Means(Struct, frozen=True):
     """What this machine allows: each True makes the robots more like two machines."""
 
@@ -223,9 +233,8 @@ class Stage:
         settings: str = "",
         interruption: Interruption | None = None,
         cables: Sequence[tuple[str, str]] = CABLES,
+        pace: Pace = USUAL_PACE,
         *,
-        beat_ms: int = BEAT_MS,
-        lease_ms: int = LEASE_MS,
         tell: Tell = lambda _: None,
     ) -> None:
         """
@@ -237,7 +246,7 @@ class Stage:
         """
         self._cables = cables
         patience = "" if "boot_patience_s" in settings else f"boot_patience_s = {BOOT_PATIENCE_S}\n"
-        self._pace = f"beat_ms = {beat_ms}\nlease_ms = {lease_ms}\n{patience}"
+        self._pace = f"beat_ms = {pace.beat_ms}\nlease_ms = {pace.lease_ms}\n{patience}"
         self.directory = directory
         self._settings = settings
         self._tell = tell
@@ -372,7 +381,7 @@ def run(command: list[str]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of the loopback that nobody uses now, as TCP and as UDP, and that the system does not lend to whoever asks for any.
+    """Ports of the loopback that are free now, as TCP and as UDP, and that the system does not lend to whoever asks for any.
 
     So a robot that was away for a while finds its own free when it comes back.
     """

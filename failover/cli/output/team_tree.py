@@ -77,7 +77,7 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
     if peer is None:
-        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", "", _lanes(status)), "good")
+        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", "", _connections(status)), "good")
     state = peer["state"]
     lost = peer.get("beats_lost")
     links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
@@ -85,12 +85,12 @@ def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | N
     return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links), mood)
 
 
-def _lanes(status: Mapping[str, Any]) -> str:
+def _connections(status: Mapping[str, Any]) -> str:
     peers = status["peers"]
     connected = sum(peer.get("lane") == "connected" for peer in peers)
     refused = sum((status.get("beats") or {}).get("refused", {}).values())
-    lanes = f"{connected} of {len(peers)} connected" if peers else "no peers"
-    return lanes + (f", {refused} beats refused" if refused else "")
+    connections = f"{connected} of {len(peers)} connected" if peers else "no peers"
+    return connections + (f", {refused} beats refused" if refused else "")
 
 
 def _branch(components: Sequence[Mapping[str, Any]], indent: str) -> list[Row]:

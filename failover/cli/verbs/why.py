@@ -16,7 +16,7 @@ LATE_TOLD_MS: Final = 5.0
 """An own lateness below this has delayed nothing."""
 
 SHOWN_MAX: Final = 100
-"""Decisions that are told where nobody said how far back: the last ones."""
+"""Decisions that are told where --since is not given: the last ones."""
 
 NEAR_MS: Final = 1.0
 """Clocks that are closer together need no word."""
@@ -30,16 +30,16 @@ def why(arguments: argparse.Namespace) -> int:
     if arguments.json:
         render.as_json(answer)
         return 0
-    story = answer["story"]
-    earlier = 0 if arguments.since else max(len(story) - SHOWN_MAX, 0)
-    story = story[earlier:]
+    lines = answer["story"]
+    earlier = 0 if arguments.since else max(len(lines) - SHOWN_MAX, 0)
+    lines = lines[earlier:]
     witnesses = render.spoken(told_of_robots(answer.get("robots") or ()))
-    if not story:
+    if not lines:
         print("no decisions yet" + (f" about {arguments.name}" if arguments.name else ""))
     elif arguments.brief:
-        render.table(COLUMNS, [brief(line) for line in story])
+        render.table(COLUMNS, [brief(line) for line in lines])
     else:
-        print(render.spoken("\n\n".join(paragraph(line) for line in story)))
+        print(render.spoken("\n\n".join(paragraph(line) for line in lines)))
     if earlier:
         print(f"\n{earlier} earlier decisions are not shown; failover why --since 7d, or --json, tells more")
     if witnesses:
@@ -48,12 +48,12 @@ def why(arguments: argparse.Namespace) -> int:
 
 
 def brief(line: Mapping[str, Any]) -> tuple[str, ...]:
-    """One line of the story as a row of a table."""
+    """One line of the event log as a row of a table."""
     return instant(line.get("at")), *(str(line.get(key) or "") for key in ("robot", "component", "did"))
 
 
 def paragraph(line: Mapping[str, Any]) -> str:
-    """One line of the story with all that stands behind it."""
+    """One line of the event log with all that stands behind it."""
     about = line.get("component") or "the robot itself"
     head = f"{instant(line.get('at'))}  {line.get('robot')}  {about}"
     body = [str(line.get("did") or ""), *(f"- {fact}" for fact in facts(line))]
@@ -113,7 +113,7 @@ def _at_stake(line: Mapping[str, Any]) -> list[str]:
 
 
 def told_of_robots(robots: Sequence[Mapping[str, Any]]) -> str:
-    """Who told this story, whose clock is off, and who did not answer."""
+    """Which robots answered, whose clock is off, and who did not answer."""
     told = []
     for one in robots:
         if not one.get("answered"):

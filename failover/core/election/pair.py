@@ -142,7 +142,7 @@ def _takes(component: Component, robot: str, entry: Entry) -> bool:
 
 
 def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, is_planned: bool = False) -> None:
-    """Open a new epoch as its primary-to-be. The ballot holds it before anybody hears of it."""
+    """Open a new epoch as its primary-to-be. The vote record holds it before another robot hears of it."""
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.claimed = not component.alone_right
     component.begun, component.bare = component.has_begun, False

@@ -15,7 +15,7 @@ from failover.core.event_log.decisions import Line
 
 
 class Timed(Struct, frozen=True):
-    """A line, and when it was by the clock of whoever tells the story; that may be wrong by ``doubt_ns`` either way."""
+    """A line, and when it was by the clock of the robot that kept it; that may be wrong by ``doubt_ns`` either way."""
 
     line: Line
     at_ns: int
@@ -30,9 +30,9 @@ def precedes(first: Line, later: Line) -> bool:
     return any((one.boot, one.counter) >= (first.life, first.decision.facts.counter) for one in heard)
 
 
-def merged(stories: Mapping[str, Sequence[Timed]]) -> list[Timed]:
+def merged(logs: Mapping[str, Sequence[Timed]]) -> list[Timed]:
     """All lines in one order. Each robot's own must be in order already."""
-    waiting = {robot: list(reversed(story)) for robot, story in stories.items() if story}
+    waiting = {robot: list(reversed(log)) for robot, log in logs.items() if log}
     told: list[Timed] = []
     while waiting:
         robot = _next(waiting)
@@ -44,7 +44,7 @@ def merged(stories: Mapping[str, Sequence[Timed]]) -> list[Timed]:
 
 def _next(waiting: Mapping[str, Sequence[Timed]]) -> str:
     """The robot whose first line that is left comes next."""
-    heads = {robot: story[-1] for robot, story in waiting.items()}
+    heads = {robot: log[-1] for robot, log in waiting.items()}
     free = {robot: head for robot, head in heads.items() if not _is_preceded(head, heads)} or heads  # a circle: clocks alone
     earliest = min(free, key=lambda robot: (free[robot].at_ns, robot))
     same = [robot for robot, head in free.items() if _cannot_tell(head, free[earliest])]

@@ -123,7 +123,7 @@ RULES = ("", *Rule)
 """A rule's place in here is its number in a beat."""
 
 
-# The bulk lane: connection-oriented, authenticated and encrypted by the transport; in order while a connection lives.
+# The replication link: connection-oriented, authenticated and encrypted by the transport; in order while a connection lives.
 
 CHUNK_SIZE_MAX = 256 * 1024
 """Bytes of a snapshot per chunk: at 1 Gbit/s a small message behind one waits 2 ms."""

@@ -30,7 +30,7 @@ def free_port() -> int:
 
 
 @pytest.fixture
-def lanes() -> Iterator[tuple[BeatLane, BeatLane]]:
+def worker() -> Iterator[tuple[BeatLane, BeatLane]]:
     """Of robot1 and robot2, with two links each."""
     first, second = robot(2), robot(2)
     ours, theirs = BeatLane(first, {"robot2": second}), BeatLane(second, {"robot1": first})
@@ -40,14 +40,14 @@ def lanes() -> Iterator[tuple[BeatLane, BeatLane]]:
 
 
 def waits(lane: BeatLane) -> bool:
-    """Whether something comes, as the heart's loop finds out."""
+    """Whether something comes, as the main loop finds out."""
     with closing(select.epoll()) as loop:
         loop.register(lane.fileno(), select.EPOLLIN)
         return bool(loop.poll(PATIENCE_MS / 1e3))
 
 
-def test_a_beat_comes_over_every_link_and_says_when(lanes: tuple[BeatLane, BeatLane]) -> None:
-    ours, theirs = lanes
+def test_a_beat_comes_over_every_link_and_says_when(worker: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = worker
     before_ns = clock.now_ns()
     ours.send("robot2", BEAT)
     sent_ns = clock.now_ns()
@@ -59,12 +59,12 @@ def test_a_beat_comes_over_every_link_and_says_when(lanes: tuple[BeatLane, BeatL
         assert before_ns - 1_000_000 < clock.of_wall_ns(wall_ns) < sent_ns + 1_000_000
 
 
-def test_where_nothing_waits_nothing_comes(lanes: tuple[BeatLane, BeatLane]) -> None:
-    assert list(lanes[0].receive()) == []
+def test_where_nothing_waits_nothing_comes(worker: tuple[BeatLane, BeatLane]) -> None:
+    assert list(worker[0].receive()) == []
 
 
-def test_a_flood_is_taken_in_parts_and_none_of_it_is_lost(lanes: tuple[BeatLane, BeatLane]) -> None:
-    ours, theirs = lanes
+def test_a_flood_is_taken_in_parts_and_none_of_it_is_lost(worker: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = worker
     for number in range(TURN_LIMIT):
         ours.send("robot2", MAGIC + b"%d" % number)
     assert waits(theirs)
@@ -73,8 +73,8 @@ def test_a_flood_is_taken_in_parts_and_none_of_it_is_lost(lanes: tuple[BeatLane,
     assert sorted(int(frame[2:]) for part in parts for frame in part) == sorted([*range(TURN_LIMIT)] * 2)
 
 
-def test_what_does_not_begin_as_a_beat_is_dropped_by_the_kernel_and_counted(lanes: tuple[BeatLane, BeatLane]) -> None:
-    ours, theirs = lanes
+def test_what_does_not_begin_as_a_beat_is_dropped_by_the_kernel_and_counted(worker: tuple[BeatLane, BeatLane]) -> None:
+    ours, theirs = worker
     longest = MAGIC + bytes(FRAME_SIZE_MAX - len(MAGIC))
     for frame in (b"", b"f", b"GET / HTTP/1.1", longest + b"\0", *[bytes(1_000)] * 5_000):
         ours.send("robot2", frame)

@@ -12,9 +12,9 @@ import pytest
 from msgspec.structs import replace
 
 from agent import event_log
-from agent.event_log import StoryFile, packed, read, unpacked
+from agent.event_log import EventLogFile, packed, read, unpacked
 from agent.main_loop import event_log_writer
-from agent.main_loop.event_log_writer import REPEAT_NS, WAITING_MAX, Scribe
+from agent.main_loop.event_log_writer import REPEAT_NS, WAITING_MAX, EventLogWriter
 from failover.core.event_log.decisions import Decision, Facts, Line, Sighting
 
 PATIENCE_S = 20.0
@@ -43,7 +43,7 @@ def test_a_line_survives_its_bytes() -> None:
 
 def test_lines_survive_the_end_of_their_writer_and_the_next_goes_on_after_them(tmp_path: Path) -> None:
     for life in (1, 2):
-        file = StoryFile(tmp_path)
+        file = EventLogFile(tmp_path)
         file.append([line(1, f"life {life}", life)])
         file.close()
     assert sentences(tmp_path) == ["life 1", "life 2"]
@@ -56,7 +56,7 @@ def test_wherever_a_power_cut_tears_the_end_the_lines_before_it_and_after_it_are
         path.unlink(missing_ok=True)
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(whole[:size])
-        file = StoryFile(tmp_path)
+        file = EventLogFile(tmp_path)
         file.append([line(1, "after", 2)])
         file.close()
         kept = read(tmp_path)
@@ -65,7 +65,7 @@ def test_wherever_a_power_cut_tears_the_end_the_lines_before_it_and_after_it_are
 
 
 def test_an_altered_line_is_skipped_and_counted(tmp_path: Path) -> None:
-    file = StoryFile(tmp_path)
+    file = EventLogFile(tmp_path)
     file.append([line(1, "first"), line(2, "second")])
     file.close()
     path = tmp_path / event_log.DIRECTORY / event_log.NEWER
@@ -76,7 +76,7 @@ def test_an_altered_line_is_skipped_and_counted(tmp_path: Path) -> None:
 
 def test_the_two_halves_stay_bounded_and_hold_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(event_log, "HALF_SIZE_MAX", 4_000)
-    file = StoryFile(tmp_path)
+    file = EventLogFile(tmp_path)
     for number in range(1, 200):
         file.append([line(number, str(number))])
         assert sum(path.stat().st_size for path in (tmp_path / event_log.DIRECTORY).iterdir()) < 3 * 4_000
@@ -85,17 +85,17 @@ def test_the_two_halves_stay_bounded_and_hold_the_newest(tmp_path: Path, monkeyp
     assert kept == list(range(kept[0], 200)) and len(kept) > 8
 
 
-def test_what_a_scribe_was_told_is_read_in_order_by_the_next_life(tmp_path: Path) -> None:
-    scribe = Scribe(tmp_path, "robot1", 7)
+def test_what_a_writer_was_told_is_read_in_order_by_the_next_life(tmp_path: Path) -> None:
+    writer = EventLogWriter(tmp_path, "robot1", 7)
     for number in range(40):
-        scribe.note([Decision(number, "/lab/x", f"number {number}")])
-    scribe.close(PATIENCE_S)
+        writer.note([Decision(number, "/lab/x", f"number {number}")])
+    writer.close(PATIENCE_S)
     assert sentences(tmp_path) == [f"number {number}" for number in range(40)]
     assert {(one.robot, one.life) for one in read(tmp_path).lines} == {("robot1", 7)}
 
 
 def test_a_disk_that_hangs_delays_nobody_and_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reader, writer = os.pipe()
+    reader, waker = os.pipe()
     hangs = threading.Event()
 
     def hang(_descriptor: int) -> None:
@@ -103,48 +103,48 @@ def test_a_disk_that_hangs_delays_nobody_and_is_said(tmp_path: Path, monkeypatch
         os.read(reader, 1)
 
     monkeypatch.setattr(os, "fdatasync", hang)
-    scribe = Scribe(tmp_path, "robot1", 1)
-    scribe.note([Decision(0, "/lab/x", "the first")])
+    writer = EventLogWriter(tmp_path, "robot1", 1)
+    writer.note([Decision(0, "/lab/x", "the first")])
     assert hangs.wait(PATIENCE_S)
     for number in range(WAITING_MAX + 100):
-        scribe.note([Decision(number, "/lab/x", f"number {number}")])
-    waiting = scribe.unwritten()
+        writer.note([Decision(number, "/lab/x", f"number {number}")])
+    waiting = writer.unwritten()
     assert len(waiting) == WAITING_MAX and waiting[-1].decision.sentence == f"number {WAITING_MAX + 99}"
-    os.write(writer, bytes(100))
-    until(lambda: scribe.trouble.startswith("100 decisions are missing"), "the missing ones to be said")
-    scribe.close(PATIENCE_S)
-    os.close(writer)
+    os.write(waker, bytes(100))
+    until(lambda: writer.trouble.startswith("100 decisions are missing"), "the missing ones to be said")
+    writer.close(PATIENCE_S)
+    os.close(waker)
     os.close(reader)
 
 
 def test_a_full_disk_is_said_and_once_there_is_room_nothing_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(event_log_writer, "RETRY_S", 0.01)
-    written = StoryFile.append
+    written = EventLogFile.append
     full = [True]
 
-    def append(file: StoryFile, lines: list[Line]) -> None:
+    def append(file: EventLogFile, lines: list[Line]) -> None:
         if full[0]:
             raise OSError(28, "No space left on device")
         written(file, lines)
 
-    monkeypatch.setattr(StoryFile, "append", append)
-    scribe = Scribe(tmp_path, "robot1", 1)
-    scribe.note([Decision(1, "/lab/x", "a takeover")])
-    until(lambda: "No space left" in scribe.trouble, "the trouble to be said")
-    assert [one.decision.sentence for one in scribe.unwritten()] == ["a takeover"]
+    monkeypatch.setattr(EventLogFile, "append", append)
+    writer = EventLogWriter(tmp_path, "robot1", 1)
+    writer.note([Decision(1, "/lab/x", "a takeover")])
+    until(lambda: "No space left" in writer.trouble, "the trouble to be said")
+    assert [one.decision.sentence for one in writer.unwritten()] == ["a takeover"]
     full[0] = False
-    until(lambda: not scribe.unwritten(), "the disk to take it")
-    scribe.close(PATIENCE_S)
-    assert sentences(tmp_path) == ["a takeover"] and scribe.trouble == ""
+    until(lambda: not writer.unwritten(), "the disk to take it")
+    writer.close(PATIENCE_S)
+    assert sentences(tmp_path) == ["a takeover"] and writer.trouble == ""
 
 
 def test_the_same_sentence_again_and_again_is_counted_and_not_written(tmp_path: Path) -> None:
-    scribe = Scribe(tmp_path, "robot1", 1)
+    writer = EventLogWriter(tmp_path, "robot1", 1)
     same = Decision(0, "/lab/x", "a snapshot did not arrive")
     for second in range(30):
-        scribe.note([replace(same, at_ns=second * 10**9)])
-        scribe.note([Decision(second, "/lab/y", "something else about another")] if second == 3 else [])
-    scribe.note([replace(same, at_ns=REPEAT_NS)])
-    scribe.close(PATIENCE_S)
+        writer.note([replace(same, at_ns=second * 10**9)])
+        writer.note([Decision(second, "/lab/y", "something else about another")] if second == 3 else [])
+    writer.note([replace(same, at_ns=REPEAT_NS)])
+    writer.close(PATIENCE_S)
     kept = [(one.decision.component, one.repeats) for one in read(tmp_path).lines]
     assert kept == [("/lab/x", 0), ("/lab/y", 0), ("/lab/x", 29)]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from agent.main_loop.outbox import Due, Outbox
 from checkpoint.model import Position
 from failover.core.acts import Acknowledge, Act, Ready, SetLease
-from failover.core.types import Ballot, Record
+from failover.core.types import Record, VoteRecord
 from failover.core.wire.messages import Beat, Echo, Entry
 
 BEAT_NS = 20_000_000
 ECHOES = (Echo("robot2", 1, 5), Echo("robot3", 1, 9))
-OLD = Ballot((Record("/a", epoch=3, primary="robot2"), Record("/b", epoch=1, primary="robot3")))
-NEW = Ballot((Record("/a", epoch=4, primary="robot1"), Record("/b", epoch=1, primary="robot3")))
+OLD = VoteRecord((Record("/a", epoch=3, primary="robot2"), Record("/b", epoch=1, primary="robot3")))
+NEW = VoteRecord((Record("/a", epoch=4, primary="robot1"), Record("/b", epoch=1, primary="robot3")))
 
 
 def beat(counter: int, settled: int = 0) -> Beat:
@@ -28,11 +28,11 @@ def outbox() -> Outbox:
     return box
 
 
-def test_without_a_ballot_everything_leaves_at_once() -> None:
+def test_without_a_vote_record_everything_leaves_at_once() -> None:
     assert outbox().take(Ready(send=(beat(2),), act=(act(1),)), BEAT_NS) == Due(None, (beat(2),), (act(1),))
 
 
-def test_acts_wait_for_the_ballot_they_depend_on_and_keep_their_order() -> None:
+def test_acts_wait_for_the_vote_record_they_depend_on_and_keep_their_order() -> None:
     box = outbox()
     first = box.take(Ready(NEW, act=(act(1),)), 1)
     assert first == Due((1, NEW), (), ())
@@ -50,7 +50,7 @@ def test_leases_do_not_pile_up_behind_a_disk_that_is_full() -> None:
     assert box.kept(1, NEW, 1000).acts == (act(1), SetLease("/a", 4, 999), SetLease("/b", 1, 999))
 
 
-def test_a_later_ballot_covers_the_earlier_ones() -> None:
+def test_a_later_vote_record_covers_the_earlier_ones() -> None:
     box = outbox()
     box.take(Ready(NEW, act=(act(1),)), 1)
     box.take(Ready(NEW, act=(act(2),)), 2)

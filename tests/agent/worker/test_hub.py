@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from agent import config as configuration
-from agent.main_loop.messages import ToLanes
+from agent.main_loop.messages import ToWorker
 from agent.worker.network.connections import BULK
-from agent.worker.process import Lanes
+from agent.worker.process import Worker
 from checkpoint.keeper.messages import Channel, pair
 from checkpoint.model import Position
 from failover.config import team
@@ -43,12 +43,12 @@ def heard(settings: configuration.Settings, peer: str, message: Any, monkeypatch
     async def hear() -> list[Any]:
         ours, theirs = pair()
         with ours, theirs:
-            lanes = Lanes(settings, Channel(ours, ToLanes))
+            worker = Worker(settings, Channel(ours, ToWorker))
             said: list[Any] = []
-            monkeypatch.setattr(lanes._ways, "say", lambda _peer, answer: said.append(answer))
-            monkeypatch.setattr(lanes._lane, "say", lambda _peer, answer: said.append(answer))
-            monkeypatch.setattr(lanes.errands, "received", lambda _peer, errand: said.append(errand))
-            lanes._hear(BULK, peer, message)
+            monkeypatch.setattr(worker._connections, "say", lambda _peer, answer: said.append(answer))
+            monkeypatch.setattr(worker._replication_link, "say", lambda _peer, answer: said.append(answer))
+            monkeypatch.setattr(worker.errands, "received", lambda _peer, errand: said.append(errand))
+            worker._hear(BULK, peer, message)
             return said
 
     return asyncio.run(hear())

@@ -20,8 +20,8 @@ from checkpoint import arch
 from checkpoint.arch import aarch64, aarch64_xstate, x86_64
 from checkpoint.arch.calls import Call, EntryCalls, TablePlaces
 from checkpoint.arch.components import Component, Layout
-from checkpoint.linux.trace import remote_syscalls
-from checkpoint.linux.trace.remote_syscalls import Plan
+from checkpoint.linux.trace import syscall_batch
+from checkpoint.linux.trace.syscall_batch import Plan
 
 SOURCES = Path(__file__).parents[3] / "checkpoint"
 PARTS = {"cpu": "", "stubs": "_stub", "extended": "_xstate", "levels": "_levels"}
@@ -230,9 +230,9 @@ def disassembled(code: bytes, tmp_path: Path) -> list[str]:
 
 def test_a_batch_of_the_longest_calls_fits_at_its_desk() -> None:
     frame = aarch64.frame_size(0)
-    for size, limit in ((aarch64.LARGE_DESK_SIZE, remote_syscalls.CALL_LIMIT), (aarch64.SMALL_DESK_SIZE + frame, 4)):
+    for size, limit in ((aarch64.LARGE_DESK_SIZE, syscall_batch.CALL_LIMIT), (aarch64.SMALL_DESK_SIZE + frame, 4)):
         code = aarch64.batch_code(0x10000, [LONGEST] * limit, PLACES)
-        assert len(code) + len(remote_syscalls.MAGIC) <= size
+        assert len(code) + len(syscall_batch.MAGIC) <= size
         plan = Plan(size, limit)
         assert plan.outputs < size - frame
 

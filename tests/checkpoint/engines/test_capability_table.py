@@ -17,14 +17,14 @@ from checkpoint.engines import capability_table
 from checkpoint.engines.ptrace import capability_rows
 from checkpoint.engines.ptrace.capture import tree as capture_tree
 from checkpoint.engines.ptrace.facts import birth_order, probe
-from checkpoint.engines.ptrace.restore import process, process_state, restore, threads, vdso_syscalls
+from checkpoint.engines.ptrace.restore import process, process_state, restore, rights, threads, timers, vdso_syscalls
 from checkpoint.engines.ptrace.restore import tree as restored_tree
 from tests import capability_table as written_table
 
 RESOURCES = Path(resources.__file__).parent
 
 SPEAKS_FOR = {
-    capability_rows: (probe, restore, process, threads, process_state, vdso_syscalls),
+    capability_rows: (probe, restore, process, threads, process_state, rights, timers, vdso_syscalls),
     birth_order: (capture_tree, restored_tree),
 }
 """Rows that stand in one file for sentences in others."""

@@ -33,8 +33,8 @@ from checkpoint.keeper.messages import Channel, ChannelError, Reply
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_vessel
-from checkpoint.linux.trace import entry, remote_syscalls
-from checkpoint.linux.trace.remote_syscalls import Desk
+from checkpoint.linux.trace import entry, remote_syscalls, syscall_desk
+from checkpoint.linux.trace.syscall_desk import Desk
 from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -211,7 +211,7 @@ def test_a_keeper_that_is_late_does_not_send_the_program_back_to_where_it_stood(
             session.capture(CaptureOrder(base=False, generation=1, sequence=2))
         assert goes_on(worker)
         assert len(tried) == RAN_ON_MAX, "it was tried again, with more patience"
-        assert remote_syscalls.patience_ns(Tracee(worker.pid)) == remote_syscalls.BUSY_TIMEOUT_NS
+        assert syscall_desk.patience_ns(Tracee(worker.pid)) == syscall_desk.BUSY_TIMEOUT_NS
         monkeypatch.undo()
         captured_at_last(session, CaptureOrder(base=False, generation=1, sequence=2))
     expect_undisturbed(worker)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder
-from checkpoint.engines.ptrace.capture.session import PtraceSession
+from checkpoint.engines.ptrace.capture.standstill import Standstill
 from checkpoint.linux.procfs.descriptors import copy_of, descriptors
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import Program, captured_at_last, ended, expect_ok, protected, start_tracee
@@ -43,14 +43,14 @@ def test_what_is_chosen_right_after_the_freeze_is_not_part_of_the_snapshot(
 ) -> None:
     with ended(start_tracee(compiled("files", "-O2"), tmp_path, "owner_signal")) as tracee:
         number = number_of(tracee, "/owned")
-        thaw = PtraceSession._thaw
+        thaw = Standstill.thaw
 
-        def thaw_and_choose(session: PtraceSession) -> int:
-            ended_ns = thaw(session)
+        def thaw_and_choose(standstill: Standstill) -> int:
+            ended_ns = thaw(standstill)
             send(tracee, number, wanted, tracee.pid if to_itself else 0)
             return ended_ns
 
-        monkeypatch.setattr(PtraceSession, "_thaw", thaw_and_choose)
+        monkeypatch.setattr(Standstill, "thaw", thaw_and_choose)
         with protected(tracee) as session:
             assert sent_by(session.capture(CaptureOrder(1, 1)), "/owned") == (signal.SIGUSR2, 1)
         monkeypatch.undo()
@@ -63,11 +63,11 @@ def test_an_owner_that_nobody_knew_of_is_asked_for_in_the_next_freeze(
     compiled: Compiled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     freezes: list[int] = []
-    freeze = PtraceSession._freeze
+    freeze = Standstill.freeze
 
-    def counted(session: PtraceSession) -> int:
+    def counted(standstill: Standstill) -> int:
         freezes.append(1)
-        return freeze(session)
+        return freeze(standstill)
 
     with ended(start_tracee(compiled("files", "-O2"), tmp_path, "odd_name")) as tracee:
         number = number_of(tracee, "line (deleted)")
@@ -75,7 +75,7 @@ def test_an_owner_that_nobody_knew_of_is_asked_for_in_the_next_freeze(
             first = captured_at_last(session, CaptureOrder(1, 1))
             assert sent_by(first, "line (deleted)") == (0, 0)
             send(tracee, number, signal.SIGUSR1, tracee.pid)
-            monkeypatch.setattr(PtraceSession, "_freeze", counted)
+            monkeypatch.setattr(Standstill, "freeze", counted)
             assert sent_by(session.capture(CaptureOrder(1, 2)), "line (deleted)") == (signal.SIGUSR1, 1)
             assert len(freezes) == 2
             assert sent_by(session.capture(CaptureOrder(1, 3)), "line (deleted)") == (signal.SIGUSR1, 1)

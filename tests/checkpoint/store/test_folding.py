@@ -18,8 +18,7 @@ from checkpoint.model import PageRun, Snapshot
 from checkpoint.snapshot import format, frames
 from checkpoint.snapshot.byte_sources import opened
 from checkpoint.snapshot.layout import FRAME_SIZE
-from checkpoint.store import chain
-from checkpoint.store import store as store_module
+from checkpoint.store import chain, fold_rules
 from checkpoint.store.base_on_disk import stored_base
 from checkpoint.store.folding import Folding
 from checkpoint.store.store import open_store
@@ -166,7 +165,7 @@ def test_a_fold_holds_a_bounded_part_of_the_deltas_pages(tmp_path: Path, monkeyp
         state = dict.fromkeys(range(DELTA_PAGES), page(f"base, changed {number}"))
         whole.append(snapshot(state, carried=state, parent=whole[-1].position, sequence=number + 2, vmas=ROOM))
     size = DELTA_PAGES * PAGE
-    monkeypatch.setattr(store_module, "FOLDED_AT_ONCE_SIZE", 4 * size)
+    monkeypatch.setattr(fold_rules, "FOLDED_AT_ONCE_SIZE", 4 * size)
     try:
         for one in whole:
             told, _ = sender.told(one, 2 * size)

@@ -138,7 +138,7 @@ def damage(path: Path) -> None:
 
 
 def test_a_snapshot_that_was_damaged_and_sent_again_survives_pruning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("checkpoint.store.store.FOLD_DELTA_PART", 1000)  # a chain that is folded would not need the file
+    monkeypatch.setattr("checkpoint.store.fold_rules.FOLD_DELTA_PART", 1000)  # a chain that is folded would not need the file
     made = history(4)
     with opened(tmp_path / "store") as store:
         for one in made:

@@ -6,7 +6,7 @@ from failover.core.election.consent import STATES
 from failover.core.events import Received, Tick
 from failover.core.membership import UNSTEADY_BEATS, Membership
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, Config, State
+from failover.core.types import MS, Config, State, VoteRecord
 from failover.core.wire.messages import Beat, Entry
 
 PAIR = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100)
@@ -65,7 +65,7 @@ def test_our_own_lateness_is_not_the_peers() -> None:
 
 
 def test_a_step_is_due_the_instant_a_peer_counts_as_dead() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     node.step(Received(beat(1), "eth0"), 3 * MS)
     dead_ns = 3 * MS + PAIR.loyalty_ns
     asked: list[int] = []
@@ -88,7 +88,7 @@ def beating(node: Node, first: int, last: int) -> int:
 
 
 def test_a_robot_rests_while_nothing_is_protected_and_its_peer_is_heard() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     assert rests_at(node, 0) == [False]
     at = beating(node, 1, 5)
     missing = at + 2 * LOYALTY_MS // 3
@@ -98,7 +98,7 @@ def test_a_robot_rests_while_nothing_is_protected_and_its_peer_is_heard() -> Non
 
 
 def test_a_robot_that_hears_of_a_component_rests_no_more_until_it_has_ended() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     runs = Entry("/lab/x", STATES.index(State.PRIMARY), 1, "robot2")
     node.step(Received(Beat("robot2", 1, 1, 1, 1, 1, (), (runs,)), "eth0"), 10 * MS)
     assert rests_at(node, 11) == [False]
@@ -110,7 +110,7 @@ def test_a_robot_that_hears_of_a_component_rests_no_more_until_it_has_ended() ->
 
 def test_a_beat_that_waited_while_its_hearer_rested_was_not_late() -> None:
     def patience_ms_after(*came_ms: int) -> int:
-        node = Node(PAIR, 1, Ballot(), 0)
+        node = Node(PAIR, 1, VoteRecord(), 0)
         beating(node, 1, 5)
         for at in range(60, 110, 10):
             node.step(Tick(), at * MS)

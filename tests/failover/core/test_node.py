@@ -35,7 +35,7 @@ from failover.core.events import (
 )
 from failover.core.membership import Peer
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, OnUnsupported, Record, Rules, State
+from failover.core.types import MS, ComponentSpec, Config, Held, Launch, OnUnsupported, Record, Rules, State, VoteRecord
 from failover.core.wire.messages import Beat, Echo, Entry
 from failover.errors import RulesError
 
@@ -55,34 +55,34 @@ def only(ready: acts.Ready, kind: type[A]) -> list[A]:
     return [act for act in ready.act if isinstance(act, kind)]
 
 
-def test_the_ballot_holds_the_claim_that_the_same_step_tells_of() -> None:
-    ready = Node(ALONE, 1, Ballot(), 0).step(Run(1, SPEC), 0)
+def test_the_vote_record_holds_the_claim_that_the_same_step_tells_of() -> None:
+    ready = Node(ALONE, 1, VoteRecord(), 0).step(Run(1, SPEC), 0)
     assert ready.persist is not None and ready.persist.records[0].epoch == ready.send[0].entries[0].epoch == 1
 
 
-def test_a_ballot_survives_its_bytes() -> None:
-    written = Ballot((Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC),))
+def test_a_vote_record_survives_its_bytes() -> None:
+    written = VoteRecord((Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC),))
     assert vote_record.decode(vote_record.encode(written)) == written
-    assert vote_record.decode(b"") == Ballot()
+    assert vote_record.decode(b"") == VoteRecord()
     with pytest.raises(RulesError, match="cannot read the vote record"):
         vote_record.decode(b"{")
 
 
 def test_an_event_of_an_older_epoch_changes_nothing() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node)
     late = Captured("/lab/x", 0, Position(64, 1, b"d"), None)
     assert not only(node.step(late, 2 * MS), acts.Acknowledge)
 
 
 def test_one_capture_is_in_flight_at_a_time() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     assert len(only(running(node), acts.Capture)) == 1
     assert not any(only(node.step(Tick(), at * MS), acts.Capture) for at in range(2, 5_000, 20))
 
 
 def test_alone_a_capture_counts_from_this_robots_own_store() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     (capture,) = only(running(node), acts.Capture)
     assert isinstance(capture, acts.Capture) and capture.base
     position = Position(capture.generation, capture.sequence, b"d")
@@ -93,7 +93,7 @@ def test_alone_a_capture_counts_from_this_robots_own_store() -> None:
 
 
 def test_what_this_robot_alone_holds_is_not_called_safe_while_there_could_be_a_standby() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     node.step(Run(1, SPEC), 0)
     starts = [at for at in range(0, 5_000, 20) if only(node.step(Tick(), at * MS), acts.Start)]
     assert starts, "nobody else was heard: it starts alone"
@@ -105,7 +105,7 @@ def test_what_this_robot_alone_holds_is_not_called_safe_while_there_could_be_a_s
 
 
 def test_a_program_that_commits_nothing_makes_no_snapshots_and_its_lag_grows() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     (capture,) = only(running(node), acts.Capture)
     assert isinstance(capture, acts.Capture)
     held = Position(capture.generation, capture.sequence, b"d")
@@ -124,7 +124,7 @@ def test_a_program_that_commits_nothing_makes_no_snapshots_and_its_lag_grows() -
 
 
 def test_an_unchanged_state_that_is_not_the_newest_checkpoint_is_sent_whole() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     (capture,) = only(running(node), acts.Capture)
     assert isinstance(capture, acts.Capture)
     (again,) = only(node.step(Unchanged("/lab/x", 1, capture.sequence, Position(1, 1, b"old")), 5 * MS), acts.Capture)
@@ -132,7 +132,7 @@ def test_an_unchanged_state_that_is_not_the_newest_checkpoint_is_sent_whole() ->
 
 
 def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node)
     node.step(CaptureFailed("/lab/x", 1, "fd 7 is a socket", unsupported=True), 5 * MS)
     (seen,) = node.status(6 * MS).components
@@ -141,7 +141,7 @@ def test_what_cannot_be_captured_degrades_and_names_the_reason() -> None:
 
 
 def test_a_program_that_has_committed_nothing_yet_is_captured_as_soon_as_it_has() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node)
     ready = node.step(NothingToCapture("/lab/x", 1, "it has committed nothing yet"), 5 * MS)
     assert not ready.act
@@ -156,7 +156,7 @@ def test_a_program_that_has_committed_nothing_yet_is_captured_as_soon_as_it_has(
 
 
 def test_a_snapshot_that_was_lost_degrades_nothing_while_there_is_nothing_to_take() -> None:
-    node = Node(replace(ALONE, ship_ms=500), 1, Ballot(), 0)
+    node = Node(replace(ALONE, ship_ms=500), 1, VoteRecord(), 0)
     running(node)
     node.step(Tick(), 600 * MS)
     assert node.status(5_000 * MS).components[0].protection == "degraded"
@@ -167,7 +167,7 @@ def test_a_snapshot_that_was_lost_degrades_nothing_while_there_is_nothing_to_tak
 
 
 def test_a_snapshot_that_takes_long_is_not_begun_anew_while_it_is_under_way() -> None:
-    node = Node(replace(ALONE, ship_ms=500), 1, Ballot(), 0)
+    node = Node(replace(ALONE, ship_ms=500), 1, VoteRecord(), 0)
     captures = [act for act in running(node).act if isinstance(act, acts.Capture)]
     for now_ms in range(400, 4_000, 400):
         ready = node.step(UnderWay("/lab/x", 1), now_ms * MS)
@@ -179,7 +179,7 @@ def test_a_snapshot_that_takes_long_is_not_begun_anew_while_it_is_under_way() ->
 
 
 def test_a_first_commit_in_the_middle_of_a_capture_is_not_passed_over() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node)
     assert not only(node.step(Committed("/lab/x", 1), 3 * MS), acts.Capture), "one is in flight"
     assert only(node.step(NothingToCapture("/lab/x", 1, "nothing yet"), 5 * MS), acts.Capture)
@@ -187,7 +187,7 @@ def test_a_first_commit_in_the_middle_of_a_capture_is_not_passed_over() -> None:
 
 def test_stop_protecting_means_no_more_captures() -> None:
     spec = ComponentSpec("/lab/x", launch=Launch(("x",)), rules=Rules(on_unsupported=OnUnsupported.STOP_PROTECTING))
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node, spec)
     node.step(CaptureFailed("/lab/x", 1, "fd 7 is a socket", unsupported=True), 5 * MS)
     assert not only(node.step(Tick(), 5_000 * MS), acts.Capture)
@@ -195,7 +195,7 @@ def test_stop_protecting_means_no_more_captures() -> None:
 
 
 def test_a_beat_is_due_all_the_time() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     beats, now = 0, 0
     while now < 1_000 * MS:
         beats += len(node.step(Tick(), now).send)
@@ -204,14 +204,14 @@ def test_a_beat_is_due_all_the_time() -> None:
 
 
 def test_a_late_own_loop_accuses_nobody() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     node.step(Received(Beat("robot2", 1, 1), "wire"), 1 * MS)
     node.step(Tick(), 5_000 * MS)
     assert node.status(5_000 * MS).peers[0].state != "dead"
 
 
 def test_unknown_states_and_strangers_change_nothing() -> None:
-    node = Node(PAIR, 1, Ballot(), 0)
+    node = Node(PAIR, 1, VoteRecord(), 0)
     mad = Beat("robot2", 1, 1, total=1, entries=(Entry("/lab/x", 99, 4, "robot2"),))
     node.step(Received(mad, "wire"), 1 * MS)
     node.step(Received(Beat("nobody", 1, 1, total=1, entries=(Entry("/lab/y", 3, 4, "nobody"),)), "wire"), 2 * MS)
@@ -220,14 +220,14 @@ def test_unknown_states_and_strangers_change_nothing() -> None:
 
 def test_a_restarted_robot_does_not_start_anew_what_it_gave_away() -> None:
     record = Record("/lab/x", 3, "robot1", State.PRIMARY, ("robot2",), spec=SPEC)
-    node = Node(PAIR, 2, Ballot((record,)), 0, (Held("/lab/x", (Position(192, 5, b"d"),)),))
+    node = Node(PAIR, 2, VoteRecord((record,)), 0, (Held("/lab/x", (Position(192, 5, b"d"),)),))
     ready = node.step(Tick(), 100 * MS)
     assert not only(ready, acts.Restore) and not only(ready, acts.Start)
 
 
 def test_who_takes_a_component_over_takes_no_more_snapshots_of_it() -> None:
     """A robot that stood still in the middle of sending one goes on with that when it wakes up."""
-    node, position = Node(PAIR, 1, Ballot(), 0), Position(65, 1, b"d")
+    node, position = Node(PAIR, 1, VoteRecord(), 0), Position(65, 1, b"d")
     entry = Entry(SPEC.name, STATES.index(State.PRIMARY), 1, "robot2", standby="robot1")
     heard = node.step(Received(Beat("robot2", 1, 1, 1, 0, 1, (Echo("robot1", 1, 1),), (entry,)), "wire"), 10 * MS)
     assert [(act.sender, act.epoch) for act in only(heard, acts.Admit)] == [("robot2", 1)]
@@ -240,7 +240,7 @@ def test_who_takes_a_component_over_takes_no_more_snapshots_of_it() -> None:
 
 def test_a_snapshot_that_comes_after_the_claim_is_neither_accepted_nor_shown() -> None:
     """It was being stored when the standby claimed; the claim goes on from the one before."""
-    node, first, late = Node(PAIR, 1, Ballot(), 0), Position(65, 1, b"d"), Position(65, 2, b"e")
+    node, first, late = Node(PAIR, 1, VoteRecord(), 0), Position(65, 1, b"d"), Position(65, 2, b"e")
     entry = Entry(SPEC.name, STATES.index(State.PRIMARY), 1, "robot2", standby="robot1")
     node.step(Received(Beat("robot2", 1, 1, 1, 0, 1, (Echo("robot1", 1, 1),), (entry,)), "wire"), 10 * MS)
     taken = node.step(Stored(SPEC.name, 1, first, "robot2", SPEC), 20 * MS).act
@@ -255,7 +255,7 @@ def test_after_a_restart_a_standby_shows_what_it_holds_of_the_present_primacy_an
     ours, theirs = Position(64, 9, b"d"), Position(64 * 2 + 1, 3, b"e")
     record = Record(SPEC.name, 2, "robot2", State.STANDBY, spec=SPEC)
     for held, shown in (((ours,), []), ((ours, theirs), [theirs])):
-        node = Node(PAIR, 2, Ballot((record,)), 0, (Held(SPEC.name, held),))
+        node = Node(PAIR, 2, VoteRecord((record,)), 0, (Held(SPEC.name, held),))
         assert [act.position for act in only(node.step(Tick(), 1 * MS), acts.Show)] == shown
 
 
@@ -298,7 +298,7 @@ ORDERS: tuple[Command, ...] = (
 
 @pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
 def test_an_order_about_a_name_that_another_user_has_taken_meanwhile_does_nothing(order: Command) -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node, replace(SPEC, owner=1000))
     (answer,) = node.step(replace(order, by=1001), 2 * MS).act
     assert isinstance(answer, acts.Answer) and not answer.ok and "belongs to uid 1000" in answer.sentence
@@ -309,7 +309,7 @@ def test_an_order_about_a_name_that_another_user_has_taken_meanwhile_does_nothin
 
 
 def test_a_released_name_is_free_for_another_user_and_what_is_kept_under_it_is_not() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     running(node, replace(SPEC, owner=1000))
     node.step(Release(2, SPEC.name, by=1000), 2 * MS)
     (answer,) = only(node.step(Release(3, SPEC.name, by=1001), 3 * MS), acts.Answer)
@@ -318,7 +318,7 @@ def test_a_released_name_is_free_for_another_user_and_what_is_kept_under_it_is_n
 
 
 def test_a_command_about_an_unknown_component_is_answered() -> None:
-    (answer,) = Node(ALONE, 1, Ballot(), 0).step(Release(4, "/lab/z"), 0).act
+    (answer,) = Node(ALONE, 1, VoteRecord(), 0).step(Release(4, "/lab/z"), 0).act
     assert isinstance(answer, acts.Answer) and not answer.ok and "failover status" in answer.sentence
 
 
@@ -334,15 +334,15 @@ def test_a_command_about_an_unknown_component_is_answered() -> None:
         (Echo("robot1", 1 << 60, 7), 0),
     ],
 )
-def test_a_robot_finds_out_that_others_remember_a_life_that_its_ballot_does_not(echo: Echo, remembered: int) -> None:
-    node = Node(PAIR, 4, Ballot(), 0)
+def test_a_robot_finds_out_that_others_remember_a_life_that_its_vote_record_does_not(echo: Echo, remembered: int) -> None:
+    node = Node(PAIR, 4, VoteRecord(), 0)
     node.step(Tick(), 0)
     assert node.outlived_by(Beat("robot2", 1, 1, 0, 0, 0, (echo,), ())) == remembered
 
 
 @pytest.mark.parametrize(("launch", "verb"), [(SPEC.launch, "run"), (Launch(pid=41), "protect")], ids=["run", "protect"])
 def test_a_start_is_refused_in_the_words_of_the_order(launch: Launch, verb: str) -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     node.step(Run(1, SPEC), 0)
     (refusal,) = only(node.step(Run(2, replace(SPEC, launch=launch)), MS), acts.Answer)
     assert not refusal.ok and refusal.sentence.startswith(f"cannot {verb} {SPEC.name}: ")
@@ -350,7 +350,7 @@ def test_a_start_is_refused_in_the_words_of_the_order(launch: Launch, verb: str)
 
 @pytest.mark.parametrize(("lost_ns", "lost_s"), [(500 * MS, 0.5), (-1, 8.1)], ids=["known", "not known"])
 def test_a_component_that_resumes_says_what_was_lost_and_not_how_long_it_did_not_run(lost_ns: int, lost_s: float) -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     (capture,) = only(running(node), acts.Capture)
     assert isinstance(capture, acts.Capture)
     position = Position(capture.generation, capture.sequence, b"d")

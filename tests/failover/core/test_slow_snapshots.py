@@ -11,7 +11,7 @@ from failover.core import acts
 from failover.core.election.consent import STATES
 from failover.core.events import Captured, CaptureFailed, Event, Received, Run, Started, Tick
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Launch, State
+from failover.core.types import MS, ComponentSpec, Config, Launch, State, VoteRecord
 from failover.core.wire.messages import Beat, Echo, Entry
 
 PART = "/lab/x"
@@ -24,7 +24,9 @@ INSTEAD = "instead of every"
 class Primary:
     """robot1, which runs the component and was told that robot2 follows it."""
 
-    node: Node = field(default_factory=lambda: Node(Config("robot1", ("robot2",), beat_ms=BEAT_MS, grace_ms=100), 1, Ballot(), 0))
+    node: Node = field(
+        default_factory=lambda: Node(Config("robot1", ("robot2",), beat_ms=BEAT_MS, grace_ms=100), 1, VoteRecord(), 0)
+    )
     now_ms: int = 0
     beats: int = 0
     sent: int = 0

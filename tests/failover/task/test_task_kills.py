@@ -154,7 +154,7 @@ def a_life_cut_short(root: Path, cut_at: int) -> tuple[CuttingDisk, int] | None:
 def test_power_may_be_cut_at_any_write_of_the_state_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("failover.task.file_store.SMALL_PAGES", 1)  # deltas, so that folding is cut, too
     monkeypatch.setattr("failover.task.file_store.TIDY_S", 0.0)
-    monkeypatch.setattr("checkpoint.store.store.CHEAP_DELTA_COUNT", 2)
+    monkeypatch.setattr("checkpoint.store.fold_rules.CHEAP_DELTA_COUNT", 2)
     resumed = KeptState(schema_of("voyage"))
     for cut_at in itertools.count():
         old = tmp_path / f"old{cut_at}"

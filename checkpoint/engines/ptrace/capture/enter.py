@@ -20,7 +20,7 @@ from checkpoint.linux.memory.digest_tracker import DigestTracker
 from checkpoint.linux.memory.tracker import Tracker
 from checkpoint.linux.memory.write_protect import PagemapTracker
 from checkpoint.linux.procfs import procfs
-from checkpoint.linux.trace import entry, interrupted_syscalls, remote_syscalls, seccomp
+from checkpoint.linux.trace import entry, interrupted_syscalls, seccomp, syscall_batch
 from checkpoint.linux.trace.remote_syscalls import BorrowedPages
 from checkpoint.linux.trace.seccomp import FILTERED
 from checkpoint.linux.trace.threads import Threads
@@ -73,7 +73,7 @@ def _try_to_enter(threads: Threads, interruptions: Interruptions, *, last: bool)
     """Enter once, by the first thread; None while the program still stands in the code of a tracer that died.
 
     Args:
-        last: waiting has helped nothing: pages that somebody was in are left to the program.
+        last: waiting has helped nothing: pages that a thread was in are left to the program.
     """
     modes = seccomp.modes(threads.pid)
     with stopped(threads):
@@ -107,22 +107,22 @@ def _enter_once(
     stands_inside = any(
         entry.is_in_stub(place, tracee.memory, lines) or any(borrowed.holds(place) for borrowed in left) for place in places
     )
-    if stands_inside or (not last and any(borrowed.state() == remote_syscalls.ARMED for borrowed in left)):
+    if stands_inside or (not last and any(borrowed.state() == syscall_batch.ARMED for borrowed in left)):
         if last:
             raise CaptureError(f"pid {tracee.pid} does not leave the code of an earlier tracer; protect it again")
         return None
     for one, found in ((tracee, decoded), *others):
         interruptions.of(one).settled(found)  # remembers the call that it stands in
     for borrowed in left:
-        if borrowed.state() == remote_syscalls.ARMED:
+        if borrowed.state() == syscall_batch.ARMED:
             borrowed.abandon()
         _put_back(threads.pid, borrowed)
-    free = [borrowed for borrowed in left if borrowed.state() != remote_syscalls.ABANDONED]
+    free = [borrowed for borrowed in left if borrowed.state() != syscall_batch.ABANDONED]
     if free:
         entered = entry.reenter(tracee, free[0], registers, mask)
     else:
         entered = entry.enter(tracee, lines, registers, mask)
-    batch = remote_syscalls.Batch(entered.pages.table)
+    batch = syscall_batch.Batch(entered.pages.table)
     questions = unrestorable_state.Questions(batch)
     for number in {entered.inside, *entry.left_open(tracee.pid)}:
         batch.add("close", number)

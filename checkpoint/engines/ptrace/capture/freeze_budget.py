@@ -19,6 +19,9 @@ WEIGHT: Final = 0.2
 """Of the newest freeze in what is expected of the next."""
 LONG_COPY_NS: Final = 200_000_000
 """Where no budget is set: a freeze whose copying would take longer is given up for some more passes while the program runs."""
+LONG_CAPTURE_NS: Final = 8_000_000_000
+"""Where no budget is set: after so long a capture makes no pass that does not catch up with the program, and takes the rest in
+one freeze, however long that is. Else an overloaded robot has no checkpoint of a program that writes 300 MB/s for minutes."""
 
 
 class OverBudgetError(CaptureError):
@@ -41,7 +44,7 @@ class FreezeBudget:
         self._rest_ns: float = FIRST_REST_NS
         self._tail_ns: float = FIRST_REST_NS / 2
         self._page_ns: float = FIRST_PAGE_NS
-        self._whole_ns = clock()
+        self._whole_ns = self._begun_ns = clock()
         self._until_ns = 0
         self._copy_ns: float = 0
         self._copied_ns = 0
@@ -54,6 +57,15 @@ class FreezeBudget:
     def page_count(self) -> int:
         """Pages that the next freeze may copy; at least one, for where nothing is left of the budget no pass helps."""
         return max(1, int((self._budget_ns - self._rest_ns) / self._page_ns))
+
+    def begin_capture(self) -> None:
+        """A capture begins, of several freezes if need be."""
+        self._begun_ns = self._clock()
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the capture has taken so long that it ends with the next freeze."""
+        return not self._budget_ns and self._clock() - self._begun_ns > LONG_CAPTURE_NS
 
     # In a freeze
 
@@ -68,7 +80,7 @@ class FreezeBudget:
         is_free = is_free or (bool(self._budget_ns) and self.overrun_in_ns(now) == 0)
         self._until_ns = now + self._budget_ns if self._budget_ns and not is_free else 0
         self._copied_ns = 0
-        self._copy_ns = 0 if self._budget_ns or is_free or is_last else LONG_COPY_NS
+        self._copy_ns = 0 if self._budget_ns or is_free or is_last or self.is_long else LONG_COPY_NS
 
     def overrun_in_ns(self, now: int | None = None) -> int | None:
         """When a freeze may take longer than the budget, from now on; None: never."""

@@ -25,8 +25,8 @@ from checkpoint.linux.procfs.procfs import KeptFiles, Stat, Status
 from checkpoint.linux.procfs.timers import parse_timers
 from checkpoint.linux.trace import seccomp
 from checkpoint.linux.trace.bulk_reads import Readings, Unread, Waiting
-from checkpoint.linux.trace.remote_syscalls import Answers
 from checkpoint.linux.trace.seccomp import FREE, Confinement
+from checkpoint.linux.trace.syscall_batch import Answers
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.resources import signal_owners
 from checkpoint.resources.open_file import Opened, OpenFile, Owners

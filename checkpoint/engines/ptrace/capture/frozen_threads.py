@@ -27,8 +27,9 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptor_cache import TEXTS_KEPT
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.trace.bulk_reads import NO_FILE, Reading, Unread
-from checkpoint.linux.trace.remote_syscalls import SMALL, Answers, Batch, Desk, Guest
 from checkpoint.linux.trace.seccomp import FILTERED, FREE, Confinement
+from checkpoint.linux.trace.syscall_batch import SMALL, Answers, Batch
+from checkpoint.linux.trace.syscall_desk import Desk, Guest
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from checkpoint.model import Rseq
@@ -161,7 +162,7 @@ class ThreadQuestions:
         return address, flags, size
 
     def clear_tid_in(self, answers: Answers) -> int:
-        """The address that the kernel clears when the thread ends: whoever joins it waits there.
+        """The address that the kernel clears when the thread ends: a thread that joins it waits there.
 
         Raises:
             UnsupportedError: this kernel does not tell.
@@ -231,7 +232,7 @@ class ThreadOnlooker:
                     continue  # it has ended
 
     def _settle(self) -> None:
-        """Note where threads stood at the last look, also if nobody wanted to know: the kernel forgets which call that was."""
+        """Note where threads stood at the last look, also where that is not asked for: the kernel forgets which call that was."""
         asked, self._asked = self._asked, ()
         for standing in asked:
             standing.settle()

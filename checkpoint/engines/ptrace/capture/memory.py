@@ -41,7 +41,7 @@ from checkpoint.pages import page_set
 from checkpoint.pages.merge import Copy
 from checkpoint.pages.page_set import Words
 from checkpoint.resources.events import aio
-from checkpoint.resources.ipc import system_v_memory
+from checkpoint.resources.ipc import boards, system_v_memory
 from checkpoint.resources.ipc.shared_memory import Object, seen_detached
 from checkpoint.runtime import parallel
 
@@ -175,6 +175,8 @@ class MemoryCapture:
         self._told_elsewhere: SharedPlaces = frozenset()
         self._detached: Collection[Object] = frozenset()
         self._had_shared = False
+        self._boards: Words = NONE
+        self._boards_named: Words = NONE
         self._mapped: Words = NONE
         self._vdso: Words = NONE
         self._followed: Words = NONE
@@ -241,7 +243,7 @@ class MemoryCapture:
         for scan in copied.late:
             copied.spoil(scan)
         copied.late.clear()
-        last = 0
+        last = page_set.total_size(copied.valid)
         for turn in range(BUDGET_PASS_LIMIT if enough or is_again else PASS_LIMIT):
             if not self._is_behind(copied, enough or (LARGE_COUNT if turn or base else WORTH_COUNT), base=base):
                 break
@@ -251,7 +253,7 @@ class MemoryCapture:
             self._refresh_if_moved()
             self._maps.prepare()
             last, before = page_set.total_size(missing), last
-            if turn >= PASS_LIMIT and last >= CATCHING_UP * before:
+            if (turn >= PASS_LIMIT or (before and self.budget.is_long)) and last >= CATCHING_UP * before:
                 break
         copied.owed = page_set.difference(self._since_acknowledged(base=base)[0], copied.valid)
         return copied
@@ -448,7 +450,8 @@ class MemoryCapture:
     def _sort(self) -> None:
         self._has_moved = True
         theirs = (line for line in self._maps.lines if not self.borrowed.holds(line.start))
-        self.lines = tuple(seen_detached(line, self._detached) for line in theirs)
+        told = (boards.as_told(self._memory.pid, line) for line in theirs)
+        self.lines = tuple(seen_detached(line, self._detached) for line in told)
         self._private = [line for line in self.lines if memory_tracker.is_private(line)]
         self._sort_shared()
         self.has_rings = any(map(aio.is_ring, self._shared_lines))
@@ -457,6 +460,7 @@ class MemoryCapture:
         self._orphans = memory_tracker.extents_of([line for line in self.lines if memory_tracker.is_orphan(line)])
         self._mapped = memory_tracker.extents_of([line for line in self.lines if line.name not in memory_tracker.NOT_CARRIED])
         self._vdso = memory_tracker.extents_of([line for line in self.lines if line.name == VDSO])
+        self._boards = memory_tracker.extents_of([line for line in self.lines if line.name == memory_tracker.BOARD])
 
     def _scan(self, *, everywhere: bool) -> Scan:
         """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
@@ -466,6 +470,10 @@ class MemoryCapture:
             self.start_over()
             raise
         self._has_moved = False
+        board = page_set.difference(self._boards, self._boards_named) if len(self._boards) else NONE
+        self._boards_named = self._boards
+        if len(board):  # what was there before is to come back as zeros
+            scan = Scan(scan.written, page_set.union(scan.cleared, board))
         if not self._shared_lines and not self._had_shared:
             return scan
         self._had_shared = bool(self._shared_lines)

@@ -37,7 +37,7 @@ from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
 from checkpoint.resources import refusals
 from checkpoint.resources.events import aio
 from checkpoint.resources.files import clean_private_pages
-from checkpoint.resources.ipc import system_v_memory
+from checkpoint.resources.ipc import boards, system_v_memory
 from checkpoint.resources.open_file import Opened
 from checkpoint.resources.process import audit_login, job_control, mlockall, parent_death_signals, scheduling, seccomp
 from checkpoint.resources.survey import gather
@@ -316,6 +316,7 @@ class CapturedProcess:
         return (
             *mlockall.describe(of_program, ours),
             *system_v_memory.describe(look.taken.lines, self.detached),
+            *boards.describe_mappings(look.taken.lines),
             *clean_private_pages.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
             *self._limits(look.standing),
             *scheduling.describe(self.pid),

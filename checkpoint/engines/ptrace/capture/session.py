@@ -3,11 +3,11 @@
 One capture::
 
     copy         most pages, while it runs (`capture.memory`)                     the program runs
-    freeze       stop its threads; registers, mask, pending signals               it is frozen
+    freeze       stop its threads (`capture.standstill`); registers, signals      it is frozen
     scan, copy   which pages were written since, and their bytes
     ask          a batch of system calls inside it (`capture.frozen_process`); descriptors; output counts
     thaw         everything as it was
-    describe     zero pages dropped, digests, files identified, refusals          it runs
+    build        pages, digests, files, refusals (`capture.snapshot_builder`)     it runs
 
 If the program writes a page after the capture has copied it, the capture copies it again. So the freeze does not grow with the
 size of the memory. As long as the capture copies faster than the program writes, the freeze does not grow with the time since the
@@ -20,22 +20,21 @@ same time.
 from __future__ import annotations
 
 import contextlib
-import gc
-import itertools
 import time
-from collections.abc import Iterator, Mapping
 from typing import Final
 
-from msgspec import Struct, field
 from msgspec.structs import replace
 
-from checkpoint.engine import NOTED, PTRACE, REFUSED, CaptureOrder, ProtectOrder
+from checkpoint.engine import CaptureOrder, ProtectOrder, Report
+from checkpoint.engines.ptrace.capture.detached_memory import DetachedMemory
 from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget, OverBudgetError
+from checkpoint.engines.ptrace.capture.frozen_component import Frozen, opened, shared_inodes
 from checkpoint.engines.ptrace.capture.memory import RunningCopy
-from checkpoint.engines.ptrace.capture.pages import Pages, joined, with_parcel
 from checkpoint.engines.ptrace.capture.process import RAN_ON_MAX, CapturedProcess, Look
+from checkpoint.engines.ptrace.capture.snapshot_builder import SnapshotBuilder
+from checkpoint.engines.ptrace.capture.standstill import Standstill
 from checkpoint.engines.ptrace.capture.tree import CapturedTree, MovedError, SeenOthers
-from checkpoint.engines.ptrace.facts import describe, memory_limits, probe
+from checkpoint.engines.ptrace.facts import memory_limits, probe
 from checkpoint.engines.stream_output import Outputs
 from checkpoint.errors import (
     CaptureError,
@@ -46,35 +45,24 @@ from checkpoint.errors import (
     UnsupportedError,
     let_go,
 )
-from checkpoint.linux import abi, system_v_ipc
-from checkpoint.linux.memory.remote_memory import Memory
+from checkpoint.linux import system_v_ipc
 from checkpoint.linux.procfs import descendants, procfs
 from checkpoint.linux.procfs.descendants import Kinship
 from checkpoint.linux.procfs.live_thread import SPOKESMEN_MAX, told_by_spokesman
-from checkpoint.linux.procfs.procfs import MapsLine
-from checkpoint.linux.realtime_boost import Precedence
 from checkpoint.linux.system_v_ipc import Segment
-from checkpoint.linux.trace.stop_events import Reports
 from checkpoint.model import Position, Snapshot
-from checkpoint.pages import page_set
-from checkpoint.pages.page_set import PageTable, Words
-from checkpoint.program import cpu_baseline, epoch_variable
+from checkpoint.program import epoch_variable
 from checkpoint.resources import registry
 from checkpoint.resources.carried import capture as carried_capture
-from checkpoint.resources.carried.capture import NO_PARCEL, CarriedTrees, Parcel, Seen
-from checkpoint.resources.ipc import shared_memory, system_v_memory
-from checkpoint.resources.open_file import OpenFile, Surroundings
-from checkpoint.resources.process import control_groups, refused_threads, thread_credentials
+from checkpoint.resources.carried.capture import CarriedTrees, Seen
+from checkpoint.resources.open_file import Surroundings
+from checkpoint.resources.process import refused_threads, thread_credentials
 from checkpoint.resources.sockets import tcp_handover
-from checkpoint.resources.sockets.tcp_handover import Departing
-from checkpoint.resources.survey import glance, look
+from checkpoint.resources.survey import glance
 from checkpoint.runtime import parallel
 from checkpoint.segment.output_counters import Totals
-from checkpoint.snapshot import credentials, process_tree
 from checkpoint.store.base_in_process import UnreadBase
-from checkpoint.store.chain import position_of
 
-NS_PER_US: Final = 1000
 MOVED_S: Final = 2.0
 """How long a capture is made again because processes came and went in the middle of it."""
 MOVED_PAUSE_S: Final = 0.005
@@ -82,33 +70,10 @@ FREEZES_MAX: Final = 4
 """Freezes of one capture that may be given up because they would take too long."""
 
 
-class Frozen(Struct, frozen=True):
-    """Everything that one freeze brought home; nothing in it needs the process any more.
-
-    Attributes:
-        first: of the first process.
-        others: what was seen of the others; None where there are none.
-        freeze_us: how long the program stood still; of several times, which a capture that is made again has, the longest.
-        seen: its carried files.
-        departing: its connections, where it may stand still for good.
-        segments: System V shared memory of this machine, where any of them has some attached.
-    """
-
-    first: Look
-    others: SeenOthers | None
-    freeze_us: int
-    seen: Seen = field(default_factory=Seen)
-    departing: Departing = tcp_handover.NOBODY
-    segments: Mapping[int, Segment] = field(default_factory=dict)
-
-
 class PtraceSession:
     """One protected component; every call from the thread that opened it. See ``checkpoint.engine.Session``.
 
-    Invariants: between captures nobody traces it; ``_table`` is the state at the last capture that was handed out.
-
-    Attributes:
-        frozen_size: bytes of pages that the last capture copied while the program stood still.
+    Invariant: between captures no process traces it.
     """
 
     def __init__(
@@ -117,38 +82,41 @@ class PtraceSession:
         first: CapturedProcess,
         kin: Kinship,
         surroundings: Surroundings,
-        trees: CarriedTrees | None = None,
+        trees: CarriedTrees | None,
+        outputs: Outputs | None,
+        report: Report,
     ) -> None:
         self.pid = first.threads.process
         self.component = order.component
-        self.notes = first.notes
-        self.totals: Totals = (0, 0)
-        self.frozen_size = 0
         self._surroundings = surroundings
-        self._detached: tuple[shared_memory.Mapped, ...] = ()
-        self._names_detached: dict[shared_memory.Object, str] = {}
-        self._level = cpu_baseline.level_in(told_by_spokesman(self.pid, lambda tid: procfs.read_bytes(tid, "environ")))
+        self._detached = DetachedMemory()
         self._first = first
         self._tree = CapturedTree(first, kin)
-        self._outputs: Outputs | None = None
+        self._outputs = outputs
         self._carried = trees
-        self._departing = tcp_handover.NOBODY
-        self._table = PageTable.empty(abi.PAGE_SIZE)
-        self._totals_at: dict[Position, Totals] = {}
         self._refused = False
         self._is_single = True
-        self._held = False
-        self._longest_us = 0
-        self._collects = False
-        self._precedence = Precedence()
-        self._reports = Reports()
         self._budget = FreezeBudget(order.terms.freeze_budget_ns, order.terms.freeze_overrun_ns)
         self._budget_ms = order.terms.freeze_budget_ns / 1e6
         first.memory.budget = self._budget
+        self._standstill = Standstill(first, self._tree, self._budget)
+        changing = {found.text for found in report.findings if found.kind in registry.OF_ALL}
+        self.notes = (*first.notes, *report.notes)
+        lasting = tuple(note for note in self.notes if note not in changing)
+        self._builder = SnapshotBuilder(self.pid, order, self._budget, outputs, trees, self._refuse, lasting)
         self._owner = order.terms.owner
         self._epoch = 0
         self._closed = False
-        self._changing: frozenset[str] = frozenset()
+
+    @property
+    def totals(self) -> Totals:
+        """See ``checkpoint.engine.Session.totals``."""
+        return self._builder.totals
+
+    @property
+    def frozen_size(self) -> int:
+        """Bytes of pages that the last capture copied while the program stood still."""
+        return self._builder.frozen_size
 
     # Opening and closing
 
@@ -171,7 +139,7 @@ class PtraceSession:
             kin = Kinship(pid, descendants.reaper_of(pid, is_guarded=order.streams is not None))
             first = CapturedProcess.entered_first(pid, order)
             try:
-                session = cls(order, first, kin, surroundings, trees)
+                session = cls(order, first, kin, surroundings, trees, outputs, report)
             except BaseException:
                 first.close()
                 raise
@@ -181,9 +149,6 @@ class PtraceSession:
             if trees:
                 trees.close()
             raise
-        session._outputs = outputs
-        session.notes += report.notes
-        session._changing = frozenset(found.text for found in report.findings if found.kind in registry.OF_ALL)
         return session
 
     def close(self) -> None:
@@ -191,8 +156,8 @@ class PtraceSession:
         if self._closed:
             return
         self._closed = True
-        if self._held:
-            self._thaw()
+        if self._standstill.is_held:
+            self._standstill.thaw()
         self._tree.close()
         self._first.close()
         if self._outputs:
@@ -204,7 +169,7 @@ class PtraceSession:
         """See ``checkpoint.engine.Session.acknowledge``. A position that is not known (any more) changes nothing."""
         if self._first.memory.acknowledge(position):
             self._tree.acknowledge(position)
-            self._forget_totals()
+            self._builder.forget_unneeded(self._first.memory.positions())
 
     def open_file(self, path: str, digest: bytes) -> int:
         """See ``checkpoint.engine.Session.open_file``."""
@@ -212,13 +177,6 @@ class PtraceSession:
             with contextlib.suppress(CheckpointError, FileNotFoundError):  # another one may have it
                 return process.identities.open(path, digest)
         raise CaptureError(f"cannot open {path} of {self.component} (pid {self.pid}): none of its processes has it any more")
-
-    def _forget_totals(self) -> None:
-        """Of positions that no delta can be relative to any more."""
-        known = self._first.memory.positions()
-        self._totals_at = {position: totals for position, totals in self._totals_at.items() if position in known}
-        if self._carried:
-            self._carried.keep(known)
 
     # Capturing
 
@@ -264,7 +222,9 @@ class PtraceSession:
                 raise
             raise explained from error
         try:
-            return self._described(order, parent, frozen)
+            built = self._builder.built(order, parent, frozen, self._first, self._surroundings, self._detached)
+            self._builder.forget_unneeded(self._first.memory.positions())
+            return built
         except (FileNotFoundError, ProcessLookupError) as error:
             gone = ProcessGoneError(f"{self.component} (pid {self.pid}) ended while failover captured it")
             raise self._explained(gone) from error
@@ -286,7 +246,7 @@ class PtraceSession:
             UnsupportedError: it cannot be kept so (before Linux 6.9, or one of several processes); nothing was touched.
         """
         try:
-            if self._held or not self._first.has_lost_its_voice():
+            if self._standstill.is_held or not self._first.has_lost_its_voice():
                 return False
         except ProcessGoneError:
             return False
@@ -294,7 +254,7 @@ class PtraceSession:
         first = CapturedProcess.entered_first(self.pid, self._first.order)
         self._first.close()
         first.memory.budget = self._budget
-        self._first = first
+        self._first = self._standstill.first = first
         self._tree.follow(first)
         if self._carried:
             self._carried.pid = first.pid
@@ -307,13 +267,16 @@ class PtraceSession:
             may_stay: the pages of a single process need not be read.
         """
         deadline = time.monotonic() + MOVED_S
-        self._longest_us = 0
+        self._standstill.longest_us = 0
         copied: RunningCopy | None = None
         given_up = 0
+        self._budget.begin_capture()
         while True:
             try:
-                self._tree.admit(held=self._held)
-                self._detach()
+                self._tree.admit(held=self._standstill.is_held)
+                if self._surroundings.detached is not None:
+                    covered = self._detached.find((self._first, *self._tree.processes()))
+                    self._surroundings = replace(self._surroundings, detached=covered)
                 if base and (others := self._tree.processes()):
                     self._refuse(memory_limits.refuse_capture((self.pid, *(process.pid for process in others))))
                 may_stay = may_stay and not self._tree.processes()
@@ -337,42 +300,6 @@ class PtraceSession:
                 given_up += 1
                 if given_up == FREEZES_MAX:
                     raise self._over_budget(given_up) from late
-
-    def _detach(self) -> None:
-        """Where the rules say so: find the shared memory that others have mapped, too, and tell of it as of its own."""
-        known = self._surroundings.detached
-        if known is None:
-            return
-        processes = (self._first, *self._tree.processes())
-        for process in processes:
-            process.memory.refresh()
-        lines = {process.pid: process.memory.lines for process in processes}
-        self._detached = shared_memory.of_all(lines)
-        mapped = {(line.device, line.inode) for of_one in lines.values() for line in of_one if line.shared}
-        names = {one.key: one.name for one in self._detached}
-        self._names_detached = {key: name for key, name in (self._names_detached | names).items() if key in mapped}
-        objects = self._names_detached
-        covered = shared_memory.covered(itertools.chain.from_iterable(lines.values()), objects)
-        self._surroundings = replace(self._surroundings, detached=covered)
-        for process in processes:
-            process.detach(covered.keys())
-
-    def _require_detached(self, first: Look, others: SeenOthers | None) -> None:
-        """All that others have mapped is told as its own, and whole.
-
-        Raises:
-            CaptureError: it was shared, or unmapped, in the middle of the capture; the next one succeeds.
-        """
-        known = self._surroundings.detached
-        if known is None:
-            return
-        looks = [(self._first, first), *(others.looks() if others else ())]
-        lines = {process.pid: seen.taken.lines for process, seen in looks}
-        found = shared_memory.of_all(lines)
-        covered = shared_memory.covered(_lines_of_all(first, others), known)
-        if any(one.key not in known for one in found) or any(covered[key] < size for key, size in known.items()):
-            what = "another process has mapped shared memory of it in the middle of the capture, or it has unmapped some"
-            raise CaptureError(f"cannot capture {self.component} (pid {self.pid}): {what}; capture it again")
 
     def _over_budget(self, given_up: int) -> CaptureError:
         """What is said when no freeze of a capture fits the budget."""
@@ -399,7 +326,7 @@ class PtraceSession:
         return copied
 
     def _enough(self) -> int:
-        """Pages that each process may leave for the freeze; 0 where nobody has set a budget."""
+        """Pages that each process may leave for the freeze; 0 where no budget is set."""
         return max(1, self._budget.page_count // (1 + len(self._tree.processes()))) if self._budget else 0
 
     def _look_from_outside(self) -> None:
@@ -436,10 +363,10 @@ class PtraceSession:
         self._first.memory.buffer.begin()
         if copied is None:
             self._first.prepare(base=base)
-        elif not self._held:
+        elif not self._standstill.is_held:
             for process in (self._first, *self._tree.processes()):
                 process.rehearse()
-        began = self._freeze()
+        began = self._standstill.freeze()
         try:
             self._budget.require()
             others = None
@@ -452,38 +379,24 @@ class PtraceSession:
             first = self._first.look(copied, self._outputs, base=base, opened=others.opened[self._first.pid] if others else None)
             if others:
                 self._tree.look(others, first, self._surroundings, base=base)
-            seen = self._carried.look(self._shared_inodes(first, others)) if self._carried else Seen()
+            seen = self._carried.look(shared_inodes(first, others)) if self._carried else Seen()
             segments = self._segments(others)
             if hold:
                 self._require_whole(first, others)
             if hold and self._surroundings.connections:
-                self._departing = tcp_handover.depart(self._opened(first, others))
+                self._standstill.departing = tcp_handover.depart(opened(first, others))
         except BaseException as error:
-            self._note_freeze(began, self._thaw())
-            self._raise_if_late(error)
+            self._standstill.note(began, self._standstill.thaw())
+            self._standstill.raise_if_late(error)
             raise
-        ended = self._hold() if hold else self._thaw()
+        ended = self._standstill.hold() if hold else self._standstill.thaw()
         self._budget.ended(ended)
-        return Frozen(first, others, self._note_freeze(began, ended), seen, self._departing, segments)
-
-    def _raise_if_late(self, error: BaseException) -> None:
-        """Whatever goes wrong with a capture when its time is over goes wrong because of that; but an end is an end.
-
-        Raises:
-            OverBudgetError: the time is over.
-        """
-        if isinstance(error, CaptureError) and not isinstance(error, ProcessGoneError) and self._budget.is_over:
-            raise OverBudgetError(str(error)) from error
+        return Frozen(first, others, self._standstill.note(began, ended), seen, self._standstill.departing, segments)
 
     def _segments(self, others: SeenOthers | None) -> dict[int, Segment]:
-        """The System V shared memory of this machine, where any of them has some: whoever runs may attach it, and be born."""
+        """The System V shared memory of this machine, where any of them has some: others may attach it, and be born."""
         looked_at = (self._first, *(process for process, _ in others.looks())) if others else (self._first,)
         return system_v_ipc.segments() if any(process.memory.has_segments for process in looked_at) else {}
-
-    def _note_freeze(self, began: int, ended: int) -> int:
-        """Note how long it stood still; the longest time of this capture, in µs."""
-        self._longest_us = max(self._longest_us, (ended - began) // NS_PER_US)
-        return self._longest_us
 
     def _require_whole(self, first: Look, others: SeenOthers | None) -> None:
         """Nothing was left out that must be asked while it stands still; the first thing to be done when it runs again.
@@ -502,177 +415,3 @@ class PtraceSession:
                 raise MovedError(
                     f"{held.name} of pid {process.pid} was given an owner of its signals (F_SETOWN); capture it again"
                 )
-
-    @staticmethod
-    def _opened(first: Look, others: SeenOthers | None) -> list[OpenFile]:
-        """What any of them has open."""
-        looks = [first, *(look for _, look in others.looks())] if others else [first]
-        return [held for look in looks for held in look.standing.opened]
-
-    @staticmethod
-    def _shared_inodes(first: Look, others: SeenOthers | None) -> set[int]:
-        """Of the files that any of them has mapped to be shared."""
-        return {line.inode for line in _lines_of_all(first, others) if line.shared}
-
-    def _freeze(self) -> int:
-        """Stop it, nothing of ours half done inside; answers when it was first asked to, in ns: until then it runs."""
-        if self._held:
-            return time.perf_counter_ns()
-        self._collects = gc.isenabled()
-        gc.disable()
-        self._reports.keep()
-        self._precedence.take()
-        self._first.threads.patience_ns = self._budget.left_ns()
-        try:
-            self._first.threads.freeze()
-        except BaseException as error:
-            self._be_ordinary()
-            self._raise_if_late(error)
-            raise
-        return self._first.threads.asked_ns
-
-    def _hold(self) -> int:
-        """Leave it standing; answers when that was."""
-        self._precedence.give_back()
-        self._reports.give_back()
-        self._held = True
-        self._first.threads.hold()
-        self._tree.hold()
-        return time.perf_counter_ns()
-
-    def _thaw(self) -> int:
-        """Let it go; answers when the last of it was, in ns."""
-        self._departing.stay(self._first.pid)
-        self._departing = tcp_handover.NOBODY
-        self._held = False
-        try:
-            self._first.threads.thaw()
-        finally:
-            try:
-                self._tree.thaw()
-                ended = time.perf_counter_ns()
-            finally:
-                self._be_ordinary()
-        return ended
-
-    def _be_ordinary(self) -> None:
-        """As before the freeze: what this thread makes may be collected, and it has no precedence."""
-        self._precedence.give_back()
-        self._reports.give_back()
-        if self._collects:
-            gc.enable()
-
-    # Describing, while the program runs
-
-    def _described(self, order: CaptureOrder, parent: Position | None, frozen: Frozen) -> Snapshot | UnreadBase:
-        """The snapshot of what a freeze brought home."""
-        first, others = frozen.first, frozen.others
-        totals = first.standing.totals
-        held = look(first.standing.opened, self._surroundings)
-        of_files = self._carried.reasons(frozen.seen) if self._carried else ()
-        of_others = others.reasons(first) if others else ()
-        family = others.pids if others else ()
-        every = (*held.resources, *(others.resources() if others else ()))
-        findings = registry.findings_of_all(every, self._surroundings, standing=True)
-        of_all = tuple(found.text for found in findings if found.verdict == REFUSED)
-        detaches = self._surroundings.detached is not None
-        of_segments = system_v_memory.refuse(_lines_of_all(first, others), frozen.segments, detaches=detaches)
-        self._require_detached(first, others)
-        self._refuse((*held.reasons, *of_all, *self._first.reasons(first, family), *of_others, *of_segments, *of_files))
-        parcel = self._carried.parcel(frozen.seen, parent) if self._carried else NO_PARCEL
-        lasting = (note for note in self.notes if note not in self._changing)
-        outline = replace(
-            self._outline(order, parent, frozen, parcel),
-            notes=(
-                *lasting,
-                *(found.text for found in findings if found.verdict == NOTED),
-                *shared_memory.detached(self._detached),
-            ),
-            resources=(
-                *self._first.known(held.resources),
-                *self._first.unopened(first),
-                *self._first.stopped(),
-                *shared_memory.describe(self._names_detached.items()),
-                *parcel.resources,
-            ),
-            output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
-        )
-        outline = frozen.departing.added_to(outline)
-        pids = (self.pid, *(others.in_order() if others else ()))
-        outline = control_groups.added_to(outline, pids, is_guarded=self._first.order.is_guarded)
-        if self._owner is not None and (beyond := credentials.refusal(credentials.beyond(outline, self._owner), self._owner)):
-            self._refuse((beyond,))
-        if first.taken.unread is not None:
-            self.totals = totals
-            return self._unread(outline, first.taken.unread)
-        looks = [(self._first, first), *(others.looks() if others else ())]
-        taken = joined(looks, is_base=parent is None)
-        self.frozen_size = taken.frozen_size
-        self._budget.note(frozen.freeze_us * NS_PER_US, sum(look.taken.copy_ns for _, look in looks), taken.frozen_size)
-        snapshot = self._with_pages(outline, with_parcel(taken, parcel, is_base=parent is None))
-        snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
-        for process, _ in looks:
-            process.settle(snapshot.position)
-        if self._carried:
-            self._carried.settle(snapshot.position)
-        self._totals_at[snapshot.position] = self.totals = totals
-        self._forget_totals()
-        return snapshot
-
-    def _unread(self, outline: Snapshot, unread: Words) -> UnreadBase:
-        """The base whose pages are where they were; those that are zero are carried, for to look for them is to read all."""
-        self.frozen_size = page_set.total_size(unread)
-        pid = self._first.pid
-        return UnreadBase(
-            replace(outline, runs=page_set.page_runs(unread), page_sum=page_set.EMPTY_SUM),
-            lambda piece, buffer: Memory(pid).read_pages_into(piece, buffer),
-        )
-
-    def _output_since(self, parent: Position | None) -> Totals:
-        """Where a snapshot's output begins: a base may go to a robot that has nothing yet."""
-        return self._totals_at.get(parent, (0, 0)) if parent else (0, 0)
-
-    def _outline(self, order: CaptureOrder, parent: Position | None, frozen: Frozen, parcel: Parcel) -> Snapshot:
-        """A snapshot without pages, descriptors and output."""
-        first, others = frozen.first, frozen.others
-        masks = first.xstate_mask | (others.xstate_mask if others else 0)
-        return Snapshot(
-            component=self.component,
-            engine=PTRACE,
-            position=Position(order.generation, order.sequence, bytes(16)),
-            parent=parent,
-            machine=replace(
-                describe.this_machine(),
-                robot=order.robot,
-                xstate_mask=masks,
-                features=cpu_baseline.features_used(describe.this_machine().features, self._level),
-            ),
-            clocks=first.standing.told.clocks,
-            process=self._first.process(first),
-            threads=self._first.thread_states(first),
-            vmas=(*self._first.mappings(first, others.pids if others else frozenset()), *parcel.vmas),
-            epoch=order.epoch,
-            freeze_us=frozen.freeze_us,
-            members=others.members(first) if others else (),
-            zombies=others.zombies(first) if others else (),
-        )
-
-    def _with_pages(self, outline: Snapshot, taken: Pages) -> Snapshot:
-        """Add the pages: zero pages of anonymous memory are told, not carried."""
-        before = PageTable.empty(abi.PAGE_SIZE) if outline.parent is None else self._table
-        self._table = before.apply(taken.forgotten, taken.runs, taken.contents, process_tree.every_mapping(outline), taken.copies)
-        return replace(
-            outline,
-            cleared=taken.forgotten,
-            runs=taken.runs,
-            contents=taken.contents,
-            copies=taken.copies,
-            page_sum=self._table.page_sum,
-        )
-
-
-def _lines_of_all(first: Look, others: SeenOthers | None) -> Iterator[MapsLine]:
-    """The mappings of all processes."""
-    yield from first.taken.lines
-    for _, other in others.looks() if others else ():
-        yield from other.taken.lines

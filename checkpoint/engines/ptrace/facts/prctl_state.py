@@ -12,7 +12,7 @@ from typing import Final
 from checkpoint.errors import RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.trace.call_table import CallTable
-from checkpoint.linux.trace.remote_syscalls import Answers, Batch
+from checkpoint.linux.trace.syscall_batch import Answers, Batch
 
 PR_GET_TSC: Final = 25
 PR_SET_TSC: Final = 26

@@ -27,7 +27,7 @@ from checkpoint.linux.trace.entry import leftovers
 from checkpoint.program import cpu_baseline
 from checkpoint.resources import refusals, registry, shared_descriptions
 from checkpoint.resources.events import aio
-from checkpoint.resources.ipc import pseudo_terminals, shared_memory, standard_streams, system_v_memory
+from checkpoint.resources.ipc import boards, pseudo_terminals, shared_memory, standard_streams, system_v_memory
 from checkpoint.resources.open_file import Held, Kin, Opened, OpenFile, Surroundings
 from checkpoint.resources.process import refused_threads
 from checkpoint.resources.survey import gather, glance, look, pipes_of
@@ -329,6 +329,7 @@ def _memory_findings(pid: int, opened: Sequence[OpenFile]) -> Iterator[Finding]:
         yield Finding("memory", "written pages", NOTED, "failover follows them already: the program is protected")
     for line, reason in mapped.refused():
         yield Finding("memory", f"VMA {line.start:x}-{line.end:x}", REFUSED, reason)
+    yield from boards.findings(pid, lines)
     if any(map(aio.is_ring, lines)):
         yield Finding("memory", "asynchronous I/O", NOTED, aio.NOTE)
         for reason in aio.refuse(opened):

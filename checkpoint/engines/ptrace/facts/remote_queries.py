@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from checkpoint.engines.ptrace.facts.prctl_state import Questions, Switch
 from checkpoint.linux import abi
 from checkpoint.linux.procfs.timers import TimerLine
-from checkpoint.linux.trace.remote_syscalls import Answers, Batch
+from checkpoint.linux.trace.syscall_batch import Answers, Batch
 from checkpoint.model import Clocks, IntervalTimer, PosixTimer, SignalAction
 
 SIGCHLD: Final = 17

@@ -25,8 +25,9 @@ from checkpoint.engines.ptrace.facts.describe import this_machine
 from checkpoint.engines.ptrace.facts.file_identity import build_id
 from checkpoint.engines.ptrace.restore import mapping_kinds, memory, vdso
 from checkpoint.engines.ptrace.restore.memory import is_file_mapping, kernel_pages, makes_shared_memory
-from checkpoint.engines.ptrace.restore.process_state import CAP_SYS_CHROOT, may_not_enter
+from checkpoint.engines.ptrace.restore.process_state import may_not_enter
 from checkpoint.engines.ptrace.restore.vdso import ContentAt
+from checkpoint.engines.ptrace.restore.vessel import CAP_SYS_CHROOT
 from checkpoint.errors import MismatchError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import descendants, procfs
@@ -296,7 +297,7 @@ def _of_threads(state: Snapshot) -> Iterator[str]:
 
 
 def xstate_layouts(state: Snapshot) -> tuple[extended.Layout, extended.Layout]:
-    """Where the components of the threads' extended states lie there, and here; the same where nobody has told."""
+    """Where the components of the threads' extended states lie there, and here; the same where it is not told."""
     ours = cpuid.xstate_layout()
     told = state.threads[0].registers.get("xstate_layout", b"") if state.threads else b""
     theirs = extended.decode_layout(told)

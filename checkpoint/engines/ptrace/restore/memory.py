@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.engine import Terms
@@ -102,14 +103,29 @@ Object = tuple[int, int]
 """Device and inode number of a file without a name, or of shared memory."""
 
 
+class Present(Struct, frozen=True):
+    """Memory that is there already, where a program is mapped.
+
+    Attributes:
+        objects: files without a name, and shared memory: a descriptor of each, which is left as it is.
+        anonymous: shared memory without a file: where it is mapped whole.
+        legacy: private memory.
+    """
+
+    objects: Mapping[Object, int] = MappingProxyType({})
+    anonymous: Mapping[Object, int] = MappingProxyType({})
+    legacy: Legacy = NOTHING
+
+
+NOTHING_PRESENT: Final = Present()
+
+
 def map_program(
     table: CallTable,
     vmas: Iterable[Vma],
     runs: Sequence[PageRun] | Words,
     brought: Mapping[str, int],
-    inherited: Mapping[Object, int] = MappingProxyType({}),
-    anonymous: Mapping[Object, int] = MappingProxyType({}),
-    legacy: Legacy = NOTHING,
+    present: Present = NOTHING_PRESENT,
     untouched: Words = NONE,
 ) -> dict[Object, int]:
     """Map everything that the program had, but for attached segments and rings; what will be filled is writable for now.
@@ -118,12 +134,10 @@ def map_program(
 
     Args:
         brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
-        inherited: those that are there already: a descriptor of each, which is left as it is.
-        anonymous: shared memory that is there already: where it is mapped whole.
-        legacy: private memory that is there already.
+        present: what needs no mapping of its own.
         untouched: pages of objects without a name that private mappings show as they are.
     """
-    carried = Carried(runs)
+    carried, inherited, anonymous = Carried(runs), present.objects, present.anonymous
     vmas = tuple(vmas)
     made_elsewhere = (system_v_memory.is_segment, aio.is_ring)
     mapped = [vma for vma in vmas if vma.kind not in KERNEL_KINDS and not any(is_one(vma) for is_one in made_elsewhere)]
@@ -139,7 +153,7 @@ def map_program(
         else:
             descriptor = table.open(path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC)
         for vma in pieces:
-            for start, end in legacy.without_kept(vma):
+            for start, end in present.legacy.without_kept(vma):
                 piece = replace(vma, start=start, end=end, offset=vma.offset + start - vma.start)
                 _map(table, piece, first_protection(vma, carried), descriptor)
         table.close(descriptor)
@@ -158,7 +172,7 @@ def map_program(
     there = {vma.start for vma in objects}
     others = (vma for vma in mapped if not is_file_mapping(vma) and vma.start not in there)
     for piece in joined_shared(vma for vma in others if not (is_anonymous_object(vma) and object_of(vma) in anonymous)):
-        for start, end in legacy.without_kept(piece):
+        for start, end in present.legacy.without_kept(piece):
             _map(table, replace(piece, start=start, end=end), first_protection(piece, carried), -1)
     return made
 
@@ -255,7 +269,7 @@ def is_file_mapping(vma: Vma) -> bool:
 
 
 def is_only_read(vma: Vma) -> bool:
-    """Whether it is a mapping of a file with a name that nobody can write through: the C library has such ones."""
+    """Whether it is a mapping of a file with a name that cannot be written through: the C library has such ones."""
     return is_file_mapping(vma) and not vma.protection & abi.PROT_WRITE and vm_flags.MAY_WRITE not in vma.flags
 
 

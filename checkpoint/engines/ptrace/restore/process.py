@@ -29,14 +29,24 @@ from msgspec.structs import replace
 from checkpoint.arch import extended, stubs
 from checkpoint.engine import RestoreOptions
 from checkpoint.engines.ptrace.facts import prctl_state
-from checkpoint.engines.ptrace.restore import checks, mapping_kinds, process_state, stopped_children, vdso_syscalls
+from checkpoint.engines.ptrace.restore import (
+    checks,
+    mapping_kinds,
+    process_state,
+    rights,
+    signals,
+    stopped_children,
+    timers,
+    vdso_syscalls,
+)
 from checkpoint.engines.ptrace.restore import memory as restored_memory
 from checkpoint.engines.ptrace.restore import threads as restored_threads
 from checkpoint.engines.ptrace.restore import vdso as restored_vdso
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
-from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel, pending_traps
+from checkpoint.engines.ptrace.restore.signals import pending_traps
 from checkpoint.engines.ptrace.restore.vdso_syscalls import VdsoCalls
+from checkpoint.engines.ptrace.restore.vessel import Vessel, look_at_vessel
 from checkpoint.errors import MismatchError, RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
@@ -91,7 +101,7 @@ class Estate(Struct, frozen=True):
         descriptions: open files by their number in the snapshot: a descriptor of each.
         objects: files without a name, by (device, inode): a descriptor of each.
         anonymous: shared memory without a file, by the same: its address.
-        segments: System V shared memory, which whoever comes first makes.
+        segments: System V shared memory, which the first process makes.
     """
 
     base: int
@@ -103,7 +113,7 @@ class Estate(Struct, frozen=True):
 
 
 def options_for(state: Snapshot) -> int:
-    """Those with which a vessel is traced; whoever is born of it is traced with the same."""
+    """Those with which a vessel is traced; its children are traced with the same."""
     confined = any(seccomp.is_confined(one.resources) for one in state.processes)
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
@@ -267,7 +277,7 @@ class ProcessRestore:
         return self._state.runs
 
     def _choose_place(self, mappings: tuple[procfs.MapsLine, ...]) -> int:
-        """Where the stub and its tables may lie; what the program shares with nobody by name is made."""
+        """Where the stub and its tables may lie; what the program shares by no name is made."""
         state = self._state
         taken = [(line.start, line.end) for line in mappings] + [(vma.start, vma.end) for vma in state.vmas]
         self._segments.make(state.resources)
@@ -344,7 +354,7 @@ class ProcessRestore:
         return {0, 1, 2} | shared
 
     def _leave_old_vdso(self) -> None:
-        """Lead whatever thread stands in the middle of another kernel's vdso out of it."""
+        """Lead each thread that stands in the middle of another kernel's vdso out of it."""
         if not self._foreign:
             return
         threads = restored_vdso.led_out(self._tracee, self._calls_of_vdso(), self._foreign, self._state.threads)
@@ -356,7 +366,7 @@ class ProcessRestore:
         process_state.raise_limits(table, vessel)
         brought = self._open_brought(table)  # with our rights, from a place of ours
         if self._options.own_eyes:
-            process_state.own_eyes(table, self._state.process, vessel)
+            rights.own_eyes(table, self._state.process, vessel)
         self._make_directories(table)
         if self._estate is not None:
             process_state.begin_member(table)
@@ -370,9 +380,10 @@ class ProcessRestore:
         system_v_memory.attach(table, attached, self._segments.ids, system_v_memory.sizes_of(self._state.resources))
         sizes = {} if self._estate else restored_memory.anonymous_sizes(vmas)
         ours_alone = restored_memory.map_anonymous(table, sizes, refuge + REFUGE_SIZE)
-        inherited = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
-        self._objects |= restored_memory.map_program(table, vmas, runs, brought, *inherited, self._legacy, self._untouched)
-        self._objects |= inherited[0]
+        objects, anonymous = (self._estate.objects, self._estate.anonymous) if self._estate else ({}, ours_alone)
+        present = restored_memory.Present(objects, anonymous, self._legacy)
+        self._objects |= restored_memory.map_program(table, vmas, runs, brought, present, self._untouched)
+        self._objects |= objects
         for key, place in ours_alone.items():
             table.call("unmap shared memory, which is mapped elsewhere now", "munmap", place, sizes[key])
         self._executable = brought.pop(self._state.process.executable.path, None)
@@ -403,14 +414,14 @@ class ProcessRestore:
         process_state.memory_layout(
             table, process, with_executable=vessel.may_choose_executable, brought=self._executable
         )  # before the program's own descriptors take their numbers
-        ours = process_state.our_eyes(table, process, vessel, self._options)  # its own file of /proc is root's by now
+        ours = rights.our_eyes(table, process, vessel, self._options)  # its own file of /proc is root's by now
         self.notes += audit_login.rebuild(table, self._state.resources, vessel.pid, ours)
         if self.has_table_of_parent:
             for number in set(self._objects.values()) - self._inherited():
                 table.close(number)
         else:
             self._rebuild_descriptors(table, vessel)
-        process_state.signal_actions(table, process.signal_actions)
+        signals.signal_actions(table, process.signal_actions)
         process_state.thread_marks(table, thread)
         process_state.enter_directory(table, process.working_directory, deleted_directory(self._state))
         process_state.surroundings(table, process)
@@ -435,11 +446,11 @@ class ProcessRestore:
         self.notes += process_state.limits(table, process, vessel)
         process_state.enter_root(table, process, vessel)
         self._confine(table, thread, process.credentials)
-        self.notes += process_state.rights(table, process, vessel, ordinary=self._options.own_eyes)
-        process_state.pending_signals(table, process, vessel.inner_pid)
-        process_state.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
-        process_state.posix_timers(table, process, state.threads, vessel, elapsed_ns)
-        process_state.interval_timers(table, process.interval_timers, elapsed_ns)
+        self.notes += rights.adopt(table, process, vessel, ordinary=self._options.own_eyes)
+        signals.pending_signals(table, process, vessel.inner_pid)
+        signals.pending_of_thread(table, process, thread, vessel.inner_pid, vessel.inner_pid)
+        timers.posix_timers(table, process, state.threads, vessel, elapsed_ns)
+        timers.interval_timers(table, process.interval_timers, elapsed_ns)
         process_state.last_marks(table, process)
         rebuild_last(table, self._state, vessel.inner_pid)
         prctl_state.set_again(table, process.switches)
@@ -455,14 +466,14 @@ class ProcessRestore:
         unshared_threads.enter(table, self._state.resources, thread.tid)
         unshared_threads.part(table, self._state.resources, thread.tid, open_here(self._state))
         self._confine(table, thread, credentials)
-        process_state.rights(table, replace(process, credentials=credentials), vessel, ordinary=self._options.own_eyes)
+        rights.adopt(table, replace(process, credentials=credentials), vessel, ordinary=self._options.own_eyes)
         parent_death_signals.rebuild(table, self._state.resources, thread.tid)
-        process_state.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
+        signals.pending_of_thread(table, process, thread, vessel.inner_pid, thread.tid)
         prctl_state.set_again(table, [switch for switch in process.switches if switch[0] in prctl_state.OF_THREADS])
         return table
 
     def _confine(self, table: CallTable, thread: ThreadState, credentials: Credentials) -> None:
-        """Before it gives up its rights; suspended until it is let go."""
+        """Before it gives up its rights; suspended until it runs."""
         found = seccomp.of_thread(self._state.resources, thread.tid)
         seccomp.confine(table, found, len(self._filters_of_all), credentials)
 
@@ -481,8 +492,8 @@ class ProcessRestore:
     def become_program(self) -> None:
         """SIGTRAP's action, our area gone, then the program's own registers and masks."""
         tracee, calls, place = self._tracee, self._calls_of_vdso(), self._stub.base + abi.PAGE_SIZE
-        action = process_state.trap_action(self._state.process.signal_actions)
-        tracee.memory.write(place, process_state.packed_action(action))
+        action = signals.trap_action(self._state.process.signal_actions)
+        tracee.memory.write(place, signals.packed_action(action))
         calls.make("rt_sigaction", signal.SIGTRAP, place, 0, abi.SIGSET_SIZE)
         self._queue_traps(calls, place)
         for start, end in self._ours().tolist():

@@ -37,6 +37,7 @@ from checkpoint.engines.ptrace.restore import (
     forked_memory,
     memory,
     process_state,
+    rights,
     shared_files,
     stopped_children,
     threads,
@@ -45,7 +46,7 @@ from checkpoint.engines.ptrace.restore import (
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
 from checkpoint.engines.ptrace.restore.process import REFUGE_SIZE, Estate, ProcessRestore, options_for
-from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel
+from checkpoint.engines.ptrace.restore.vessel import Vessel, look_at_vessel
 from checkpoint.errors import CheckpointError, MismatchError, ProcessGoneError, RestoreError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import descendants, procfs
@@ -70,10 +71,10 @@ STOPPED_BY: Final = 0x7F
 
 
 class TreeRestore:
-    """One restore, from the seizing of the vessel to everybody's own registers."""
+    """One restore, from the seizing of the vessel to all processes' own registers."""
 
     _born_with = 0
-    """Flags of clone(2) for everybody."""
+    """Flags of clone(2) for all processes."""
 
     def __init__(self, vessel_pid: int, state: Snapshot, options: RestoreOptions, brought: tuple[Brought, ...]) -> None:
         self._state = state
@@ -91,7 +92,7 @@ class TreeRestore:
         self._terminals: dict[int, pseudo_terminals.Controlling] = {}
 
     def end(self) -> None:
-        """Kill everybody; who was born here is reaped for its parent, who may have ended before."""
+        """Kill all processes; one that was born here is reaped for its parent, who may have ended before."""
         for restoring in self._restoring[1:]:
             restoring.end()
         for tracee in reversed(self._born.values()):
@@ -116,7 +117,7 @@ class TreeRestore:
         return tuple(dict.fromkeys(note for notes in (self._notes, *(one.notes for one in self._restoring)) for note in notes))
 
     def run(self) -> None:
-        """All of it, up to the registers; everybody stands still."""
+        """All of it, up to the registers; all processes stand still."""
         vessel = self._begin()
         estate = self._make_estate(vessel, first_told(self._views))
         self._bear_all(estate.base)
@@ -141,7 +142,7 @@ class TreeRestore:
         return vessel
 
     def _bear_all(self, base: int) -> None:
-        """Have everybody born, and those end, or be stopped, that had."""
+        """Have all processes born, and those end, or be stopped, that had."""
         self._instruction = base + stubs.CALL_LOOP.index(cpu.SYSCALL)
         self._come_to_session()
         self._take_terminal(self._state.process.pid)
@@ -215,7 +216,7 @@ class TreeRestore:
         process_state.raise_limits(table, vessel)
         made = self._open_brought(table, resources) | left  # with our rights, from a place of ours
         if self._options.own_eyes:
-            process_state.own_eyes(table, self._state.process, vessel)
+            rights.own_eyes(table, self._state.process, vessel)
         for key, size in sizes.items():
             what, place = f"map {size >> 10} KiB of shared memory", estate.anonymous[key]
             flags = abi.MAP_SHARED | abi.MAP_ANONYMOUS | abi.MAP_FIXED_NOREPLACE
@@ -329,7 +330,7 @@ class TreeRestore:
 
     @contextlib.contextmanager
     def _opened(self, pid: int, found: pseudo_terminals.Controlling) -> Iterator[int]:
-        """A descriptor of a terminal, in a process; nobody may have it open any more."""
+        """A descriptor of a terminal, in a process; it may be open nowhere any more."""
         if found.slave is not None:
             yield found.slave
             return

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -23,18 +22,26 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from checkpoint.engines.ptrace.restore import memory as restored_memory
-from checkpoint.engines.ptrace.restore.memory import KERNEL_KINDS, Carried, Object, first_protection, is_file_mapping
+from checkpoint.engines.ptrace.restore.memory import (
+    KERNEL_KINDS,
+    NOTHING_PRESENT,
+    Carried,
+    Object,
+    Present,
+    first_protection,
+    is_file_mapping,
+)
 from checkpoint.errors import RestoreError
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Snapshot, Vma
 from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Words
+from checkpoint.sentences import copy_outdated
 
 MADV_DONTNEED: Final = 4
 MADV_REMOVE: Final = 9
 NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
-NO_OBJECTS: Final[Mapping[Object, int]] = MappingProxyType({})
 
 Backing = tuple[object, ...]
 """What a mapping is of, and how it lies there."""
@@ -106,18 +113,17 @@ class Change(Struct, frozen=True):
         self,
         table: CallTable,
         brought: Mapping[str, int],
-        objects: Mapping[Object, int] = NO_OBJECTS,
-        anonymous: Mapping[Object, int] = NO_OBJECTS,
+        present: Present = NOTHING_PRESENT,
     ) -> None:
         """Add everything but the writing of pages.
 
         Args:
             brought: descriptors of what is mapped in place of this machine's files, by path.
-            objects, anonymous: memory that several processes share, as `map_program` takes it.
+            present: memory that several processes share.
         """
         for start, end in self.gone.tolist():
             table.call(f"unmap {start:#x} of the copy", "munmap", start, end - start)
-        restored_memory.map_program(table, self.fresh, self.carried, brought, objects, anonymous)
+        restored_memory.map_program(table, self.fresh, self.carried, brought, present)
         for advice, extents in ((MADV_DONTNEED, self.dropped), (MADV_REMOVE, self.removed)):
             for start, end in extents.tolist():
                 table.call(f"empty {(end - start) >> 10} KiB at {start:#x}", "madvise", start, end - start, advice)
@@ -180,7 +186,7 @@ def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
         same = page_set.intersection(before[key], extents)
         is_of_one = key[0] is True and key[2] is None
         if is_of_one and len(same) and len(page_set.difference(extents, before[key])):
-            raise RestoreError("the ready copy must be built again: its shared memory has grown in its place")
+            raise RestoreError(copy_outdated("its shared memory has grown in its place"))
         kept = page_set.union(kept, same)
     return page_set.difference(_extents(old), kept), page_set.difference(_extents(new), kept)
 

@@ -28,12 +28,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.engine import Copy, RestoreOptions, pid_taken
-from checkpoint.engines.ptrace.restore import checks, memory, process_state, vdso
+from checkpoint.engines.ptrace.restore import checks, memory, rights, vdso
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
+from checkpoint.engines.ptrace.restore.memory import NOTHING_PRESENT, Present
 from checkpoint.engines.ptrace.restore.process import RSEQ_SECTION_OFFSET, Estate, LaterTables, ProcessRestore, options_for
-from checkpoint.engines.ptrace.restore.process_state import Vessel, look_at_vessel
 from checkpoint.engines.ptrace.restore.restore import RestoredProgram
+from checkpoint.engines.ptrace.restore.vessel import Vessel, look_at_vessel
 from checkpoint.engines.ptrace.standby_copy.eligibility import require_covered
 from checkpoint.engines.ptrace.standby_copy.mappings import Change
 from checkpoint.errors import ChainError, CheckpointError, MismatchError, RestoreError, UnsupportedError
@@ -49,6 +50,7 @@ from checkpoint.pages.xor_delta import Rows
 from checkpoint.resources.process import seccomp
 from checkpoint.resources.restore_context import number_of
 from checkpoint.resources.sockets import tcp_handover
+from checkpoint.sentences import copy_outdated
 from checkpoint.store import chain
 
 ROOM: Final = 16 << 20
@@ -191,7 +193,7 @@ class ReadyCopy(ProcessRestore):
         self._require_whole()
         chain.check_continues(self.position, delta)
         if delta.is_tree:
-            raise RestoreError(f"the ready copy of {delta.component} must be built again: it has several processes by now")
+            raise RestoreError(copy_outdated("it has several processes by now", delta.component))
         require_covered(delta)
         plan = self.planned(xor_delta.resolved(delta, self.rows_at))
         self.torn = True
@@ -214,8 +216,8 @@ class ReadyCopy(ProcessRestore):
         brought = self._checked(replace(delta, vmas=tuple(change.fresh_files()))) if change.fresh_files() else Brought()
         table = CallTable(self._stub.base, descriptors=set(self._descriptors))
         run = self._open_with_our_rights(table, brought)
-        shared = (self._estate.objects, self._estate.anonymous) if self._estate else ()
-        change.add_calls(table, run, *shared)
+        present = Present(self._estate.objects, self._estate.anonymous) if self._estate else NOTHING_PRESENT
+        change.add_calls(table, run, present)
         for descriptor in run.values():
             table.close(descriptor)
         self._check_room(table)
@@ -282,7 +284,7 @@ class ReadyCopy(ProcessRestore):
     def _make_directories(self, table: CallTable) -> None:
         """Not before the takeover: they are seen."""
 
-    def _state_table(self, table: CallTable, vessel: process_state.Vessel) -> CallTable:
+    def _state_table(self, table: CallTable, vessel: Vessel) -> CallTable:
         lacking = {path: content for path, content in self._brought.opened.items() if not self._is_open(path)}
         self._open_with_our_rights(table, Brought(opened=lacking))
         super()._make_directories(table)
@@ -310,7 +312,7 @@ class ReadyCopy(ProcessRestore):
             ("the address of failover's stub", not self._overlaps_stub(theirs)),
         )
         if changed := ", ".join(what for what, is_same in fixed if not is_same):
-            raise RestoreError(f"the ready copy of {ours.component} must be built again: these have changed: {changed}")
+            raise RestoreError(copy_outdated(f"these have changed: {changed}", ours.component))
 
     def _overlaps_stub(self, state: Snapshot) -> bool:
         start, end = self._stub.base, self._stub.base + self._area_size
@@ -328,7 +330,7 @@ class ReadyCopy(ProcessRestore):
         off_ns = self._clocks_ahead_ns(elapsed_ns)
         if off_ns is not None and (off_ns + elapsed_ns < 0 or off_ns > AHEAD_NS):
             where = f"{off_ns / 1e9:.1f} s ahead" if off_ns > 0 else f"{-off_ns / 1e9:.1f} s behind"
-            raise RestoreError(f"the ready copy of {self._state.component} must be built again: its clocks are {where}")
+            raise RestoreError(copy_outdated(f"its clocks are {where}", self._state.component))
 
     def _clocks_ahead_ns(self, elapsed_ns: int) -> int | None:
         """How far its monotonic time is ahead of the program's; None where it has this machine's, for nothing can be set then."""
@@ -371,7 +373,7 @@ class ReadyCopy(ProcessRestore):
         if not brought.run and not brought.opened:
             return {}
         self._brought = brought
-        with process_state.our_eyes(table, self._state.process, self._vessel, self._options):
+        with rights.our_eyes(table, self._state.process, self._vessel, self._options):
             return self._open_brought(table)
 
     def _is_open(self, path: str) -> bool:

@@ -29,14 +29,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines.ptrace.restore import checks, memory, process_state, shared_files
+from checkpoint.engines.ptrace.restore import checks, memory, rights, shared_files
 from checkpoint.engines.ptrace.restore.checks import Brought
 from checkpoint.engines.ptrace.restore.forked_memory import Legacy
 from checkpoint.engines.ptrace.restore.memory import Object
 from checkpoint.engines.ptrace.restore.process import Estate
-from checkpoint.engines.ptrace.restore.process_state import look_at_vessel
 from checkpoint.engines.ptrace.restore.restore import RestoredProgram
 from checkpoint.engines.ptrace.restore.tree import TreeRestore, first_told
+from checkpoint.engines.ptrace.restore.vessel import look_at_vessel
 from checkpoint.engines.ptrace.standby_copy.eligibility import require_covered
 from checkpoint.engines.ptrace.standby_copy.mappings import MADV_REMOVE, held_of_objects
 from checkpoint.engines.ptrace.standby_copy.single import ReadyCopy, ended_on_error, paths_open_in
@@ -51,6 +51,7 @@ from checkpoint.pages.source import PageSource
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.resources.process import shared_with_parent
 from checkpoint.resources.sockets import tcp_handover
+from checkpoint.sentences import copy_outdated
 from checkpoint.snapshot import process_tree
 from checkpoint.store import chain
 
@@ -162,7 +163,7 @@ class FamilyCopy(TreeRestore):
     # --- The three steps ---
 
     def lay(self) -> None:
-        """Seize the vessel, have everybody born, map and fill everything.
+        """Seize the vessel, have all processes born, map and fill everything.
 
         Raises:
             MismatchError: this machine lacks a file that is mapped, or their pids cannot be had.
@@ -250,7 +251,7 @@ class FamilyCopy(TreeRestore):
         )
         vessel = self._copies[0].vessel
         table = CallTable(estate.base, descriptors=set(self._descriptors))
-        with process_state.our_eyes(table, self._state.process, vessel, self._options):
+        with rights.our_eyes(table, self._state.process, vessel, self._options):
             brought = self._open_brought(table, resources)
         self._make_nameless(table, vessel, estate, brought | dict(self._estate.objects), resources)
         if table.end - table.base > AREA_SIZE:
@@ -266,15 +267,14 @@ class FamilyCopy(TreeRestore):
 
     def _require_same_shape(self, delta: Snapshot) -> None:
         if _shape_of(delta) != _shape_of(self._state):
-            raise RestoreError(f"the ready copy of {self._state.component} must be built again: its processes have changed")
+            raise RestoreError(copy_outdated("its processes have changed", self._state.component))
 
     def _require_same_objects(self, views: Sequence[Snapshot]) -> None:
         ours, theirs = self._objects, _objects_of(views)
         is_same = theirs.keys() <= ours.keys() and all(_fits(ours[key], theirs.get(key)) for key in ours)
         if not is_same:
-            raise RestoreError(
-                f"the ready copy of {self._state.component} must be built again: shared memory has come, gone, or changed in size"
-            )
+            changed = "shared memory has come, gone, or changed in size"
+            raise RestoreError(copy_outdated(changed, self._state.component))
 
     def _brought_for(self, view: Snapshot) -> Brought:
         reasons, run = checks.of_mapped_files(view, self._options)
@@ -336,7 +336,7 @@ def _shape_of(state: Snapshot) -> tuple[object, ...]:
 
 
 def _objects_of(views: Iterable[Snapshot]) -> dict[Object, tuple[int, int]]:
-    """How long shared memory is, by object, and the mode of its file (0 where there is none, or nobody told)."""
+    """How long shared memory is, by object, and the mode of its file (0 where there is none, or it is not told)."""
     found: dict[Object, tuple[int, int]] = {}
     for vma in (vma for view in views for vma in view.vmas):
         if memory.is_anonymous_object(vma) or memory.is_object_mapping(vma):

@@ -20,9 +20,9 @@ from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard.output_logs import OutputLogs
 from agent.worker.components import launch, process_pool
 from agent.worker.components.component import Captured, Component
-from agent.worker.components.launch import Program
+from agent.worker.components.launch import Program, RestoreOptions
 from agent.worker.components.paths import Places, guard_sockets
-from agent.worker.components.process_pool import Nursery
+from agent.worker.components.process_pool import ProcessPool
 from checkpoint.engine import NO_TERMS
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError
 from checkpoint.model import OutputPiece
@@ -59,13 +59,13 @@ def live(directory: Path, story: Story) -> None:
     """Run a story in a loop of its own; every guard and keeper that waits is ended after it."""
 
     async def whole() -> None:
-        cradle = Nursery(directory / "guards", "")
+        pool = ProcessPool(directory / "guards", "")
         (directory / "guards").mkdir()
-        places = Places(directory / "guards", directory / "logs", cradle, robot="robot1")
+        places = Places(directory / "guards", directory / "logs", pool, robot="robot1")
         try:
             await asyncio.wait_for(story(places), 2 * PATIENCE_S)
         finally:
-            await cradle.close()
+            await pool.close()
 
     asyncio.run(whole())
 
@@ -208,7 +208,7 @@ def test_a_restored_program_goes_on_exactly_after_what_its_snapshot_carries(tmp_
                 await captures.take()
             await more(first)  # a takeover takes this back
             await first.stop(signal.SIGKILL)
-        second = await launch.restore(NAME, captures.chain, places, outage_ns=0)
+        second = await launch.restore(NAME, captures.chain, places, RestoreOptions())
         try:
             assert (await second.describe()).state == "vessel"
             await second.resume()
@@ -336,7 +336,7 @@ def test_a_restore_that_nobody_resumes_leaves_nothing(tmp_path: Path) -> None:
         async with started(places, COUNT) as first:
             captures = Captures(first)
             await captures.take()
-        second = await launch.restore(NAME, captures.chain, places, outage_ns=0)
+        second = await launch.restore(NAME, captures.chain, places, RestoreOptions())
         pid, path = second.pid, guard_socket(second, places)
         second.close()
         await until(lambda: not lives(pid) and not path.exists(), "vessel and guard to end")
@@ -358,7 +358,7 @@ def test_a_restore_from_something_damaged_is_refused_and_leaves_nothing(tmp_path
         damaged = tmp_path / "damaged"
         damaged.write_bytes(content)
         with damaged.open("rb") as file, pytest.raises(FormatError):
-            await launch.restore(NAME, [file.fileno()], places, outage_ns=0)
+            await launch.restore(NAME, [file.fileno()], places, RestoreOptions())
         captures.close()
 
     live(tmp_path, story)

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from agent.errors import GuardError
 from agent.worker.components import launch, process_pool
 from agent.worker.components.component import Captured, Component
-from agent.worker.components.launch import Program
+from agent.worker.components.launch import Program, RestoreOptions
 from agent.worker.components.paths import Places, guard_sockets
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import CaptureError, MismatchError, NothingCommittedError
@@ -104,7 +104,9 @@ async def started(places: Places, script: str) -> Component:
 
 
 async def again(places: Places, captures: Captures, script: str) -> Component:
-    return await launch.begin_again(NAME, program(script), captures.chain, places, outage_ns=5, owner=0, epoch=4, why=TAKEN_OVER)
+    return await launch.begin_again(
+        NAME, program(script), captures.chain, places, RestoreOptions(5, owner=0, epoch=4), TAKEN_OVER
+    )
 
 
 async def held(component: Component) -> Captured:
@@ -330,7 +332,7 @@ def test_a_program_that_is_not_here_is_refused_and_leaves_nothing(tmp_path: Path
     async def story(places: Places) -> None:
         captures = await left_behind(places)
         missing = replace(program(STEPS), argv=(b"/nowhere/mapper",))
-        second = await launch.begin_again(NAME, missing, captures.chain, places, outage_ns=0, owner=0, epoch=4, why=TAKEN_OVER)
+        second = await launch.begin_again(NAME, missing, captures.chain, places, RestoreOptions(owner=0, epoch=4), TAKEN_OVER)
         with pytest.raises(GuardError, match="cannot start /nowhere/mapper: No such file or directory"):
             await second.resume()
         await until(lambda: not guard_sockets(places), "the guard to end")
@@ -344,7 +346,7 @@ def test_a_chain_is_not_started_as_somebody_who_does_not_own_it(tmp_path: Path) 
         captures = await left_behind(places)
         with pytest.raises(MismatchError, match="not its owner, uid 12345"):
             await launch.begin_again(
-                NAME, program(STEPS), captures.chain, places, outage_ns=0, owner=12345, epoch=4, why=TAKEN_OVER
+                NAME, program(STEPS), captures.chain, places, RestoreOptions(owner=12345, epoch=4), TAKEN_OVER
             )
         captures.close()
 
@@ -359,7 +361,7 @@ def test_a_chain_with_more_rights_than_its_owners_lays_nothing_down_and_starts_n
         captures = await left_behind(places)
         theirs = replace(program(STEPS), inheritance=Inheritance(12345, 12345))
         with pytest.raises(MismatchError, match="other rights than those of its owner, uid 12345"):
-            await launch.begin_again(NAME, theirs, captures.chain, places, outage_ns=0, owner=12345, epoch=4, why=TAKEN_OVER)
+            await launch.begin_again(NAME, theirs, captures.chain, places, RestoreOptions(owner=12345, epoch=4), TAKEN_OVER)
         assert not guard_sockets(places)
         captures.close()
 

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from agent.worker.components import ready_copy
-from agent.worker.components.process_pool import Nursery
+from agent.worker.components.process_pool import ProcessPool
 from agent.worker.components.ready_copy import Ready, ReadyCopy
 from agent.worker.components.statistics import Figures
 from checkpoint.errors import RestoreError
@@ -31,7 +31,7 @@ class Slow:
 
 def test_a_copy_that_is_being_ended_is_ended_whole_when_none_is_wanted_any_more(tmp_path: Path) -> None:
     async def story() -> None:
-        around = SimpleNamespace(places=SimpleNamespace(nursery=Nursery(tmp_path, "")))
+        around = SimpleNamespace(places=SimpleNamespace(process_pool=ProcessPool(tmp_path, "")))
         copy, component = ReadyCopy("/test/one", cast(Any, around), Figures()), Slow()
         copy._ready = Ready(cast(Any, component), cast(Any, None))
         copy._work = copy._task(copy._end("its chain has begun anew"))
@@ -72,7 +72,7 @@ def test_a_copy_that_is_laid_in_vain_is_laid_more_and_more_seldom_unless_it_has_
             raise asyncio.CancelledError
 
     async def story() -> None:
-        around = SimpleNamespace(places=SimpleNamespace(nursery=Nursery(tmp_path, "")))
+        around = SimpleNamespace(places=SimpleNamespace(process_pool=ProcessPool(tmp_path, "")))
         copy = Fickle("/test/one", cast(Any, around), Figures())
         with pytest.raises(asyncio.CancelledError):
             await copy._follow(cast(Any, None), lambda ready, why: None)

@@ -19,7 +19,7 @@ from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings
 from agent.worker.components.keeper_client import Following
 from agent.worker.components.run_records import Records
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.components.warm_program import Standby
 from agent.worker.control.verbs import Verbs
 from checkpoint.model import Position
@@ -60,22 +60,22 @@ class Told:
         self.runs = True
 
 
-def carried_out(orders: Callable[[Charge, Told], Any], directory: Path) -> Told:
+def carried_out(orders: Callable[[Supervisor, Told], Any], directory: Path) -> Told:
     """What the guard was told in the end."""
     guard = Told()
 
     async def run() -> None:
         none = cast(Any, None)
         around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
-        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
-        orders(charge, guard)
-        charge.begin()
+        supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
+        orders(supervisor, guard)
+        supervisor.begin()
         await settled()
         guard.now_ns = LATE_NS + 1
         if guard.refused:
-            charge.order(acts.SetLease(NAME, 3, NEWER_NS))
+            supervisor.order(acts.SetLease(NAME, 3, NEWER_NS))
             await settled()
-        for task in tuple(charge._tasks):
+        for task in tuple(supervisor._tasks):
             task.cancel()
 
     asyncio.run(run())
@@ -89,37 +89,37 @@ async def settled() -> None:
 
 
 def test_a_thaw_that_waited_does_not_bring_its_older_lease_back(tmp_path: Path) -> None:
-    def orders(charge: Charge, guard: Told) -> None:
+    def orders(supervisor: Supervisor, guard: Told) -> None:
         guard.now_ns = LATE_NS + 1
-        charge.order(acts.Thaw(NAME, 3, LATE_NS))
-        charge.order(acts.SetLease(NAME, 3, NEWER_NS))
+        supervisor.order(acts.Thaw(NAME, 3, LATE_NS))
+        supervisor.order(acts.SetLease(NAME, 3, NEWER_NS))
 
     guard = carried_out(orders, tmp_path)
     assert (guard.runs, guard.lease_ns, guard.refused) == (True, NEWER_NS, 0)
 
 
 def test_a_thaw_that_came_too_late_for_its_lease_comes_with_the_next(tmp_path: Path) -> None:
-    def orders(charge: Charge, guard: Told) -> None:
+    def orders(supervisor: Supervisor, guard: Told) -> None:
         guard.now_ns = LATE_NS + 1
-        charge.order(acts.Thaw(NAME, 3, LATE_NS))
+        supervisor.order(acts.Thaw(NAME, 3, LATE_NS))
 
     guard = carried_out(orders, tmp_path)
     assert (guard.runs, guard.lease_ns, guard.refused) == (True, NEWER_NS, 1)
 
 
 def test_a_thaw_that_waited_does_not_undo_a_later_freeze(tmp_path: Path) -> None:
-    def orders(charge: Charge, _: Told) -> None:
-        charge.order(acts.Thaw(NAME, 3, LATE_NS))
-        charge.order(acts.Freeze(NAME, 3))
+    def orders(supervisor: Supervisor, _: Told) -> None:
+        supervisor.order(acts.Thaw(NAME, 3, LATE_NS))
+        supervisor.order(acts.Freeze(NAME, 3))
 
     assert not carried_out(orders, tmp_path).runs
 
 
 def test_a_lease_lets_nothing_run_whose_last_snapshot_before_a_handover_was_ordered(tmp_path: Path) -> None:
-    def orders(charge: Charge, guard: Told) -> None:
+    def orders(supervisor: Supervisor, guard: Told) -> None:
         guard.now_ns = LATE_NS + 1
-        charge.order(acts.Thaw(NAME, 3, LATE_NS))
-        charge.order(acts.Capture(NAME, 3, False, 1, 1, hold=True))
+        supervisor.order(acts.Thaw(NAME, 3, LATE_NS))
+        supervisor.order(acts.Capture(NAME, 3, False, 1, 1, hold=True))
 
     guard = carried_out(orders, tmp_path)
     assert (guard.runs, guard.lease_ns, guard.refused) == (False, NEWER_NS, 1)
@@ -147,19 +147,19 @@ def test_nobody_waits_until_a_chain_is_folded_but_who_forgets_of_it(tmp_path: Pa
 
     async def run() -> None:
         around = Surroundings(none, cast(Any, store), Records(tmp_path), lambda _: None, none, none, lambda _: ComponentConfig())
-        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
-        charge.begin()
-        charge.order(acts.Prune(NAME, 3, Position(1, 1, b"")))
+        supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
+        supervisor.begin()
+        supervisor.order(acts.Prune(NAME, 3, Position(1, 1, b"")))
         await asyncio.to_thread(store.begun.acquire)
         for sequence in (2, 3):
-            charge.order(acts.Prune(NAME, 3, Position(1, sequence, b"")))
-        charge.order(acts.Thaw(NAME, 3, LATE_NS))
-        charge.order(acts.Forget(NAME, 3, (2,)))
+            supervisor.order(acts.Prune(NAME, 3, Position(1, sequence, b"")))
+        supervisor.order(acts.Thaw(NAME, 3, LATE_NS))
+        supervisor.order(acts.Forget(NAME, 3, (2,)))
         await settled()
         assert guard.runs and store.calls == [1]
         store.may_go_on.set()
         await forgotten(store)
-        for task in tuple(charge._tasks):
+        for task in tuple(supervisor._tasks):
             task.cancel()
 
     asyncio.run(run())
@@ -184,18 +184,22 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
         tried.append(waits)
         return waits or anew
 
-    async def let_it_run(self: Charge, component: Component, epoch: int, outage_ns: int, laps: object) -> tuple[Component, int]:
+    async def let_it_run(
+        self: Supervisor, component: Component, epoch: int, outage_ns: int, laps: object
+    ) -> tuple[Component, int]:
         if component is waiting:
             raise GuardError("the program has ended")
         return component, outage_ns
 
     monkeypatch.setattr(resume, "brought_back", brought_back)
-    monkeypatch.setattr(Charge, "_let_it_run", let_it_run)
+    monkeypatch.setattr(Supervisor, "_let_it_run", let_it_run)
     monkeypatch.setattr(Standby, "take", lambda _: waiting)
 
     async def run() -> None:
-        charge = Charge(NAME, Surroundings(nothing, nothing, Records(tmp_path), lambda _: None, nothing, nothing, nothing))
-        assert await charge._resumed(acts.Restore(NAME, 3, Position(1, 1, b"d"), None), [], 7, Laps()) == (anew, 7)
+        supervisor = Supervisor(
+            NAME, Surroundings(nothing, nothing, Records(tmp_path), lambda _: None, nothing, nothing, nothing)
+        )
+        assert await supervisor._resumed(acts.Restore(NAME, 3, Position(1, 1, b"d"), None), [], 7, Laps()) == (anew, 7)
         assert tried == [waiting, None]
 
     asyncio.run(run())
@@ -223,24 +227,24 @@ def released(directory: Path, trouble: GuardError | None = None) -> Exception | 
         none = cast(Any, None)
         around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
         guard = Guarded(trouble)
-        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
-        charge.begin()
+        supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
+        supervisor.begin()
 
         async def command(*_: object) -> acts.Answer:
-            charge.order(acts.LetGo(NAME, 3))
+            supervisor.order(acts.LetGo(NAME, 3))
             return acts.Answer(1, True, "it is protected no longer")
 
         async def known(name: str) -> str:
             return name
 
         verbs = Verbs.__new__(Verbs)
-        verbs.__dict__.update(_lanes=SimpleNamespace(charge=lambda _: charge), _command=command, _known=known)
+        verbs.__dict__.update(_worker=SimpleNamespace(supervisor=lambda _: supervisor), _command=command, _known=known)
         answer = asyncio.create_task(verbs.release({"name": NAME}, 0))
         await settled()
         assert not answer.done()
         guard.answers.set()
         (outcome,) = await asyncio.gather(answer, return_exceptions=True)
-        for task in tuple(charge._tasks):
+        for task in tuple(supervisor._tasks):
             task.cancel()
         return outcome if isinstance(outcome, Exception) else None
 
@@ -288,18 +292,18 @@ def test_what_is_lacking_is_looked_at_once_the_copy_that_was_here_has_ended(
             return SimpleNamespace(end=lambda: None)
 
         monkeypatch.setattr(prerequisites, "_compared", compared)
-        nursery = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
-        places = cast(Any, SimpleNamespace(nursery=nursery))
+        process_pool = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
+        places = cast(Any, SimpleNamespace(process_pool=process_pool))
         around = Surroundings(places, nothing, Records(tmp_path), lambda _: None, nothing, nothing, lambda _: ComponentConfig())
-        charge = Charge(NAME, around, cast(Component, guard), epoch=3)
-        charge.begin()
-        charge.order(acts.Stop(NAME, 4))
+        supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
+        supervisor.begin()
+        supervisor.order(acts.Stop(NAME, 4))
         await settled()
-        found = asyncio.create_task(prerequisites.look(around, [charge]))
+        found = asyncio.create_task(prerequisites.look(around, [supervisor]))
         await settled()
         guard.answers.set()
         assert await found == {NAME: ()}
-        for task in tuple(charge._tasks):
+        for task in tuple(supervisor._tasks):
             task.cancel()
 
     asyncio.run(run())

@@ -14,11 +14,11 @@ from msgspec.structs import replace
 
 from agent.errors import GuardError
 from agent.guard.messages import BeginTask
-from agent.guard.program import Ward
+from agent.guard.program import GuardedProgram
 from agent.system import clock
 from agent.worker.components import launch, process_pool, warm_program
 from agent.worker.components.component import Component
-from agent.worker.components.launch import Program
+from agent.worker.components.launch import Program, RestoreOptions
 from agent.worker.components.paths import Places, guard_sockets
 from agent.worker.components.warm_program import Standby
 from checkpoint.linux.spawn.vessel import Born
@@ -78,7 +78,7 @@ async def left_by(places: Places, script: str) -> tuple[Captures, int]:
 async def prepared(places: Places, captures: Captures, waiting: Component) -> Component:
     elsewhere = replace(places, robot="robot2")
     return await launch.begin_again(
-        NAME, program(STEPS), captures.chain, elsewhere, outage_ns=5, owner=0, epoch=4, why=TAKEN_OVER, waiting=waiting
+        NAME, program(STEPS), captures.chain, elsewhere, RestoreOptions(5, owner=0, epoch=4), TAKEN_OVER, waiting
     )
 
 
@@ -172,9 +172,9 @@ def test_a_program_whose_lease_is_over_is_frozen_before_it_hears_anything(tmp_pa
             return lambda *_: done.append(name)
 
     nothing = cast(Any, Noting())
-    ward = Ward(NAME, Born(1, 1), nothing, str(tmp_path), nothing, committed=False, warm=True, task=nothing)
-    ward.set_lease(1)
-    ward.begin_task(BeginTask(4, None, (0, 0)), ())
+    program = GuardedProgram(NAME, Born(1, 1), nothing, str(tmp_path), nothing, committed=False, warm=True, task=nothing)
+    program.set_lease(1)
+    program.begin_task(BeginTask(4, None, (0, 0)), ())
     assert done == ["open", "freeze", "begin", "begin"]
 
 

@@ -72,7 +72,7 @@ def test_a_bulk_message_of_hostile_form_is_none(body: bytes) -> None:
     assert codec.decode_bulk(body) is None
 
 
-# --- Local sockets: keeper, guard, lanes ---
+# --- Local sockets: keeper, guard, worker ---
 
 
 KINDS = [keeper_messages.Request, keeper_messages.Reply, guard_messages.Request, guard_messages.Reply]

@@ -12,7 +12,7 @@ import pytest
 from agent.errors import RefusedError
 from agent.guard.output_logs import OutputLogs
 from agent.worker.components.paths import Places, log_directory
-from agent.worker.control.output_relay import Outflow
+from agent.worker.control.output_relay import OutputRelay
 from failover.core.types import State
 
 NAME = "/lab/r1/mapper"
@@ -31,14 +31,14 @@ class Listener:
         self.heard += content
 
 
-class Lanes:
-    """A robot whose core says that the component is in a state, while its charge has not heard of an end."""
+class Worker:
+    """A robot whose core says that the component is in a state, while its supervisor has not heard of an end."""
 
     def __init__(self, places: Places, state: State) -> None:
         self.settings: Any = None
         self.errands: Any = None
         self.places = places
-        self.charges: Any = {NAME: SimpleNamespace(ended=None, component=SimpleNamespace())}
+        self.supervisors: Any = {NAME: SimpleNamespace(ended=None, component=SimpleNamespace())}
         self._view = SimpleNamespace(name=NAME, state=state, primary="r1", positions=())
 
     async def ask(self, _what: object, _component: str = "") -> Any:
@@ -47,8 +47,8 @@ class Lanes:
 
 @pytest.fixture
 def places(tmp_path: Path) -> Places:
-    nursery: Any = None
-    found = Places(tmp_path / "state", tmp_path / "run", nursery)
+    process_pool: Any = None
+    found = Places(tmp_path / "state", tmp_path / "run", process_pool)
     logs = OutputLogs(log_directory(NAME, found))
     logs.write(1, 0, WRITTEN)
     logs.commit((COMMITTED, 0))
@@ -62,8 +62,8 @@ def places(tmp_path: Path) -> Places:
 )
 def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Places, state: State, heard: bytes) -> None:
     listener: Any = Listener()
-    outflow = Outflow(Lanes(places, state))
-    asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    relay = OutputRelay(Worker(places, state))
+    asyncio.run(relay.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
     assert listener.heard == heard
 
 
@@ -74,10 +74,10 @@ def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wro
     logs.close()
     listener: Any = Listener()
     listener.caller = SimpleNamespace(uid=7001)
-    outflow = Outflow(Lanes(places, State.PRIMARY))
+    relay = OutputRelay(Worker(places, State.PRIMARY))
     with pytest.raises(RefusedError, match="belongs to uid 7002"):
-        asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+        asyncio.run(relay.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
     assert listener.heard == b""
     listener.caller = SimpleNamespace(uid=7002)
-    asyncio.run(outflow.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    asyncio.run(relay.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
     assert listener.heard == WRITTEN[:COMMITTED]

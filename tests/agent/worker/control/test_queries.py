@@ -30,7 +30,7 @@ class Errands:
 
 
 class Team:
-    """What the questions need of the rest: peers in all states, one of which has no bulk lane."""
+    """What the questions need of the rest: peers in all states, one of which has no replication link."""
 
     errands = Errands()
 

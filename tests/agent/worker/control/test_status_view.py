@@ -11,7 +11,7 @@ import pytest
 from agent.config import ComponentConfig, HooksConfig
 from agent.worker.components.context import Surroundings
 from agent.worker.components.run_records import Records
-from agent.worker.components.supervisor import Charge
+from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.status_view import told_lacks
 from failover.cli.output.team_tree import is_healthy, rows
 from failover.core.types import ComponentView, Protection, State
@@ -35,9 +35,9 @@ def test_what_a_hook_perhaps_brings_is_lacking_now_and_no_refusal(hooks: HooksCo
     async def told() -> list[str]:
         none = cast(Any, None)
         around = Surroundings(none, none, Records(tmp_path), none, none, none, lambda _: ComponentConfig(hooks=hooks))
-        charge = Charge(NAME, around)
-        charge.figures.lacks = (LACK,)
-        return told_lacks(VIEW, charge, "robot2")
+        supervisor = Supervisor(NAME, around)
+        supervisor.figures.lacks = (LACK,)
+        return told_lacks(VIEW, supervisor, "robot2")
 
     assert asyncio.run(told()) == [sentence]
 

@@ -12,7 +12,7 @@ import pytest
 
 from agent.errors import LaneError
 from agent.system import connection_quota
-from agent.worker.network.replication_link import MEND, BulkLane, Keys, LinkState, new_keys, shown
+from agent.worker.network.replication_link import MEND, Callbacks, Keys, LinkState, ReplicationLink, new_keys, shown
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
 
 PATIENCE_S = 20.0
@@ -37,9 +37,9 @@ class Pair:
         self.ports = {"robot1": free_port(), "robot2": free_port()}
         self.heard: dict[str, list[tuple[str, Bulk]]] = {"robot1": [], "robot2": []}
         self.unread: dict[str, list[tuple[str, str]]] = {"robot1": [], "robot2": []}
-        self.lanes = {name: self.lane(name, keys) for name, keys in (("robot1", keys1), ("robot2", keys2))}
+        self.links = {name: self.link(name, keys) for name, keys in (("robot1", keys1), ("robot2", keys2))}
 
-    def lane(self, name: str, keys: Keys) -> BulkLane:
+    def link(self, name: str, keys: Keys) -> ReplicationLink:
         def receive(peer: str, message: Bulk) -> None:
             self.heard[name].append((peer, message))
 
@@ -49,11 +49,11 @@ class Pair:
             self.unread[name].append((sign[0], sign[1]))
 
         where = f"127.0.0.1:{self.ports[name]}"
-        return BulkLane(name, where, peers, keys, receive, lambda *_: None, unread=unread)
+        return ReplicationLink(name, where, peers, keys, Callbacks(receive, lambda *_: None, unread))
 
     def state(self, name: str) -> LinkState:
         other = next(peer for peer in self.ports if peer != name)
-        return self.lanes[name].links[other].state
+        return self.links[name].links[other].state
 
     def connected(self) -> bool:
         return all(self.state(name) is LinkState.CONNECTED for name in self.ports)
@@ -62,13 +62,13 @@ class Pair:
 def run(keys1: Keys, keys2: Keys, body: Callable[[Pair], Awaitable[None]]) -> None:
     async def main() -> None:
         pair = Pair(keys1, keys2)
-        for lane in pair.lanes.values():
-            lane.open()
+        for link in pair.links.values():
+            link.open()
         try:
             await body(pair)
         finally:
-            for lane in pair.lanes.values():
-                await lane.close()
+            for link in pair.links.values():
+                await link.close()
 
     coroutine: Coroutine[Any, Any, None] = main()
     asyncio.run(coroutine)
@@ -88,8 +88,8 @@ def test_words_and_chunks_arrive_whole_and_in_order(keyed: bool) -> None:
         await until(pair.connected)
         pieces = [os.urandom(CHUNK_SIZE_MAX) for _ in range(20)]
         for index, piece in enumerate(pieces):
-            await pair.lanes["robot1"].ship("robot2", Chunk(1, index, piece))
-        pair.lanes["robot2"].say("robot1", Cancel(7))
+            await pair.links["robot1"].ship("robot2", Chunk(1, index, piece))
+        pair.links["robot2"].say("robot1", Cancel(7))
         await until(lambda: len(pair.heard["robot2"]) == len(pieces) and bool(pair.heard["robot1"]))
         assert [message for _, message in pair.heard["robot2"]] == [Chunk(1, i, piece) for i, piece in enumerate(pieces)]
         assert pair.heard["robot1"] == [("robot2", Cancel(7))]
@@ -104,14 +104,14 @@ def test_a_stranger_with_a_key_of_its_own_is_refused_and_both_sides_say_so() -> 
 
     async def body(pair: Pair) -> None:
         await until(lambda: pair.state("robot2") is LinkState.REFUSED)
-        assert "team.toml" in pair.lanes["robot2"].links["robot1"].reason
-        assert pair.lanes["robot1"].strangers > 0
-        pair.lanes["robot2"].say("robot1", Cancel(1))
+        assert "team.toml" in pair.links["robot2"].links["robot1"].reason
+        assert pair.links["robot1"].strangers > 0
+        pair.links["robot2"].say("robot1", Cancel(1))
         with pytest.raises(LaneError, match="down"):
-            await pair.lanes["robot2"].ship("robot1", Chunk(1, 0, b"let me in"))
+            await pair.links["robot2"].ship("robot1", Chunk(1, 0, b"let me in"))
         assert pair.heard["robot1"] == []
         await until(lambda: len(pair.unread["robot1"]) > 1 and len(pair.unread["robot2"]) > 1)  # each is told again and again
-        assert ("robot2", mismatch) in pair.unread["robot1"] and mismatch in pair.lanes["robot1"].troubles()
+        assert ("robot2", mismatch) in pair.unread["robot1"] and mismatch in pair.links["robot1"].troubles()
         assert any(peer == "robot1" and shown(public) in why for peer, why in pair.unread["robot2"])
 
     mismatch = f"robot2 presents the key {shown(public)}, and team.toml here has {shown(keys1.peers['robot2'])} for it: {MEND}"
@@ -125,9 +125,9 @@ def test_a_member_cannot_speak_under_another_members_name() -> None:
 
     async def body(pair: Pair) -> None:
         await until(lambda: pair.state("robot2") is LinkState.CONNECTED)
-        before = pair.lanes["robot1"].strangers
-        pair.lanes["robot2"].say("robot1", Cancel(1))
-        await until(lambda: pair.lanes["robot1"].strangers > before)
+        before = pair.links["robot1"].strangers
+        pair.links["robot2"].say("robot1", Cancel(1))
+        await until(lambda: pair.links["robot1"].strangers > before)
         assert pair.heard["robot1"] == []
 
     run(Keys(keys1.public, keys1.secret, everybody), Keys(public3, secret3, everybody), body)
@@ -138,14 +138,14 @@ def test_a_link_that_is_lost_says_so_and_comes_back() -> None:
 
     async def body(pair: Pair) -> None:
         await until(pair.connected)
-        await pair.lanes["robot2"].close()
+        await pair.links["robot2"].close()
         await until(lambda: pair.state("robot1") is not LinkState.CONNECTED)
         with pytest.raises(LaneError):
-            await pair.lanes["robot1"].ship("robot2", Chunk(1, 0, b""))
-        pair.lanes["robot2"] = pair.lane("robot2", keys2)
-        pair.lanes["robot2"].open()
+            await pair.links["robot1"].ship("robot2", Chunk(1, 0, b""))
+        pair.links["robot2"] = pair.link("robot2", keys2)
+        pair.links["robot2"].open()
         await until(pair.connected)
-        pair.lanes["robot1"].say("robot2", Cancel(2))
+        pair.links["robot1"].say("robot2", Cancel(2))
         await until(lambda: ("robot1", Cancel(2)) in pair.heard["robot2"])
 
     run(keys1, keys2, body)
@@ -170,7 +170,7 @@ def test_connections_of_strangers_are_limited_and_a_member_comes_in_beside_them(
     async def body(pair: Pair) -> None:
         port, strangers = pair.ports["robot1"], []
         await until(pair.connected)
-        await pair.lanes["robot2"].close()
+        await pair.links["robot2"].close()
         try:
             for number in range(many):
                 stranger = socket.create_connection(("127.0.0.1", port), source_address=(f"127.0.1.{number % 60 + 1}", 0))
@@ -178,10 +178,10 @@ def test_connections_of_strangers_are_limited_and_a_member_comes_in_beside_them(
                 strangers.append(stranger)
                 await asyncio.sleep(0)
             await until(lambda: sum(map(hangs_up, strangers)) >= many - connection_quota.OTHERS_MAX)
-            pair.lanes["robot2"] = pair.lane("robot2", keys2)
-            pair.lanes["robot2"].open()
+            pair.links["robot2"] = pair.link("robot2", keys2)
+            pair.links["robot2"].open()
             await until(pair.connected)
-            (told,) = pair.lanes["robot1"].troubles()
+            (told,) = pair.links["robot1"].troubles()
             assert "connections to port" in told
             assert "were turned away, last from 127.0.1." in told
         finally:
@@ -201,7 +201,7 @@ def test_one_address_holds_no_more_than_its_share() -> None:
             one.setblocking(False)
         await until(lambda: sum(map(hangs_up, crowd)) >= 2 * connection_quota.ADDRESS_MAX)
         assert pair.connected()
-        assert any("were turned away" in told for told in pair.lanes["robot1"].troubles())
+        assert any("were turned away" in told for told in pair.links["robot1"].troubles())
         for one in crowd:
             one.close()
 

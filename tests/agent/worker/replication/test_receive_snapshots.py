@@ -26,7 +26,7 @@ from tests.checkpoint.snapshots import COMPONENT, history
 NAME = "/lab/mapper"
 
 
-class Nursery:
+class ProcessPool:
     """Starts nothing."""
 
     def expect(self, count: int) -> None:
@@ -38,7 +38,7 @@ class Storing(Deposit):
 
     def __init__(self, directory: Path) -> None:
         none = cast(Any, None)
-        super().__init__(none, Places(directory, directory, cast(Any, Nursery())), lambda _: None, none)
+        super().__init__(none, Places(directory, directory, cast(Any, ProcessPool())), lambda _: None, none)
         self.begun, self.may_end, self.stored = threading.Event(), threading.Event(), 0
 
     def _put(self, offer: Offer, descriptor: int) -> Any:
@@ -79,7 +79,7 @@ def test_whose_snapshots_they_were_is_known_after_the_claim_that_ends_their_admi
 
 
 def test_a_snapshot_whose_facts_are_no_facts_is_refused_by_name(tmp_path: Path) -> None:
-    """From a peer that may send it; the lanes go on."""
+    """From a peer that may send it; the worker goes on."""
     told: list[Any] = []
 
     class Reading(Deposit):
@@ -88,7 +88,7 @@ def test_a_snapshot_whose_facts_are_no_facts_is_refused_by_name(tmp_path: Path) 
 
     async def run() -> None:
         none = cast(Any, None)
-        deposit = Reading(none, Places(tmp_path, tmp_path, cast(Any, Nursery())), told.append, none)
+        deposit = Reading(none, Places(tmp_path, tmp_path, cast(Any, ProcessPool())), told.append, none)
         deposit.admit(Admit(NAME, 1, "robot1"))
         await deposit.take("robot1", Offer(1, NAME, 1, Position(64, 1, b"d"), None, 1, b"", ComponentSpec(NAME)), -1)
 
@@ -107,7 +107,7 @@ class Standing:
         self.accepted: list[int] = []
         self.store = open_store(directory / "store")
         self._directory = directory
-        self._places = Places(directory, directory / "logs", cast(Any, Nursery()))
+        self._places = Places(directory, directory / "logs", cast(Any, ProcessPool()))
         self.deposit = Deposit(self.store, self._places, self.told.append, self._accept)
         self.deposit.admit(Admit(COMPONENT, 1, "robot1"))
 

@@ -26,8 +26,8 @@ BOUND_S = 20.0
 ELSEWHERE = "/nowhere/on/this/machine"
 
 
-class Lane:
-    """A lane whose other end is the test's function; words overtake nothing."""
+class Link:
+    """A link whose other end is the test's function; words overtake nothing."""
 
     def __init__(self, deliver: Callable[[Bulk], None]) -> None:
         self.deliver = deliver
@@ -56,7 +56,7 @@ class Two:
         spoil: Callable[[Bulk], Bulk] = lambda message: message,
         admits: Callable[[str, str], str] = lambda component, peer: "",
     ) -> None:
-        self.out, self.back = Lane(self._arrive), Lane(self._answer)
+        self.out, self.back = Link(self._arrive), Link(self._answer)
         self.stock = Stock(store, limits, "robot2", admits)
         self.receiver = Receiver(self.back, directory, self.stock)
         self.shipper = Shipper(self.out)
@@ -363,7 +363,7 @@ def test_a_file_that_was_changed_in_place_is_named(store: Store, tmp_path: Path)
     run(body())
 
 
-def test_a_lane_that_goes_down_ends_the_asking_and_what_was_sure(store: Store, tmp_path: Path) -> None:
+def test_a_link_that_goes_down_ends_the_asking_and_what_was_sure(store: Store, tmp_path: Path) -> None:
     async def body() -> None:
         two = Two(store, tmp_path)
         need = two.file(b"content")

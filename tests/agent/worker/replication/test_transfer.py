@@ -23,8 +23,8 @@ SIZE = 5 * CHUNK_SIZE_MAX + 17
 BOUND_S = 20.0
 
 
-class Lane:
-    """A lane whose other end is the test's function."""
+class Link:
+    """A link whose other end is the test's function."""
 
     def __init__(self, deliver: Callable[[str, Bulk], None]) -> None:
         self.deliver = deliver
@@ -64,12 +64,12 @@ class Desk:
 
 
 class Two:
-    """A shipper and a receiver, joined by two lanes; ``spoil`` changes, or drops, what the shipper says."""
+    """A shipper and a receiver, joined by two links; ``spoil`` changes, or drops, what the shipper says."""
 
     def __init__(self, directory: Path, desk: Desk, spoil: Callable[[Bulk], Bulk | None] = lambda message: message) -> None:
         self.desk = desk
-        self.out = Lane(self._arrive)
-        self.back = Lane(self._answer)
+        self.out = Link(self._arrive)
+        self.back = Link(self._answer)
         self.shipper = Shipper(self.out)
         self.receiver = Receiver(self.back, directory, desk)
         self._spoil = spoil
@@ -176,7 +176,7 @@ def test_a_receiver_that_shows_nothing_is_not_waited_for(tmp_path: Path, content
 def test_never_more_chunks_are_under_way_than_there_is_credit_for(tmp_path: Path, content: Path) -> None:
     async def body() -> None:
         two = Two(tmp_path, Desk())
-        two.shipper = Shipper(Lane(lambda *_: None))
+        two.shipper = Shipper(Link(lambda *_: None))
         task = asyncio.create_task(ship(two, content))
         with pytest.raises(LaneError, match="took nothing"):
             await task

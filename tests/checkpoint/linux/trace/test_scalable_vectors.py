@@ -17,7 +17,7 @@ from checkpoint.engine import CaptureOrder, ProtectOrder
 from checkpoint.errors import CaptureError
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.trace import entry, remote_syscalls
-from checkpoint.linux.trace.remote_syscalls import Desk
+from checkpoint.linux.trace.syscall_desk import Desk
 from tests.checkpoint.round_trip import (
     ENGINE,
     Program,

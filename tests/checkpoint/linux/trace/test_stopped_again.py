@@ -17,7 +17,8 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.engines.ptrace.capture.test_trees import three_lives
-from tests.checkpoint.engines.ptrace.restore.test_tree_states import PREAMBLE, goes_through_three_lives, state_of
+from tests.checkpoint.engines.ptrace.restore.families import PREAMBLE, goes_through_three_lives
+from tests.checkpoint.engines.ptrace.restore.test_tree_states import state_of
 from tests.checkpoint.round_trip import Program, ended, expect_ok, start
 
 pytestmark = pytest.mark.root

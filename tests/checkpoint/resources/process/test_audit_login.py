@@ -15,7 +15,7 @@ from checkpoint.linux.trace.call_table import CallTable
 from checkpoint.model import Resource
 from checkpoint.resources.process import audit_login
 from checkpoint.resources.process.audit_login import NOBODY
-from tests.checkpoint.engines.ptrace.restore.test_tree_states import goes_through_three_lives
+from tests.checkpoint.engines.ptrace.restore.families import goes_through_three_lives
 from tests.checkpoint.round_trip import NOBODY as NOBODY_ELSE
 from tests.checkpoint.round_trip import captured_and_killed, ended, expect_ok, restored, start_tracee
 

@@ -12,7 +12,7 @@ from failover.core.election.consent import STATES
 from failover.core.election.pair import placing
 from failover.core.events import Captured, Handover, Received, Run, Started, Stored, Tick
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, WhenAlone
+from failover.core.types import MS, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, VoteRecord, WhenAlone
 from failover.core.wire.messages import FREE, SAFE, Beat, Echo, Entry
 from failover.errors import RulesError
 
@@ -31,8 +31,8 @@ def entry(state: State, epoch: int, primary: str, position: Position | None = No
 class Talk:
     """A node, and what its peers say to it. Time goes on in small steps, so that the node is never late."""
 
-    def __init__(self, config: Config, ballot: Ballot | None = None, held: tuple[Held, ...] = ()) -> None:
-        self.node = Node(config, 1, ballot or Ballot(), 0, held)
+    def __init__(self, config: Config, vote_record: VoteRecord | None = None, held: tuple[Held, ...] = ()) -> None:
+        self.node = Node(config, 1, vote_record or VoteRecord(), 0, held)
         self.now_ns = 0
         self.readies: list[acts.Ready] = []
         self._counters: dict[str, int] = {}
@@ -54,9 +54,9 @@ class Talk:
         return ready
 
     def vote(self) -> tuple[int, str]:
-        """Epoch and primary on the newest ballot."""
-        ballots = [ready.persist for ready in self.readies if ready.persist is not None]
-        return next(((record.epoch, record.primary) for record in ballots[-1].records), (0, "")) if ballots else (0, "")
+        """Epoch and primary on the newest vote record."""
+        vote_records = [ready.persist for ready in self.readies if ready.persist is not None]
+        return next(((record.epoch, record.primary) for record in vote_records[-1].records), (0, "")) if vote_records else (0, "")
 
     def said(self) -> list[Entry]:
         """What the node told of the component, oldest first."""
@@ -96,7 +96,7 @@ def test_a_member_whose_primary_is_silent_votes_once_an_epoch() -> None:
 
 def test_a_vote_survives_a_restart() -> None:
     record = Record(NAME, 2, "robot2", State.STANDBY)
-    talk = Talk(WITNESS, Ballot((record,)))
+    talk = Talk(WITNESS, VoteRecord((record,)))
     talk.tick(400)
     talk.hear("robot1", entry(State.CLAIMING, 2, "robot1", NEWEST))
     assert talk.vote() == (0, "")  # nothing new to persist
@@ -218,7 +218,7 @@ def test_a_primary_that_nobody_hears_stands_still() -> None:
 def test_a_robot_claims_when_the_others_would_vote_for_it_by_what_they_have_noted() -> None:
     """It gave its copy up to robot2's claim of epoch 3; robot2 is back with a new disk; nobody else has heard of that claim."""
     record = Record(NAME, 3, "robot2", State.STANDBY, spec=SPEC)
-    talk = Talk(ROBOT, Ballot((record,)), (Held(NAME, (NEWEST,)),))
+    talk = Talk(ROBOT, VoteRecord((record,)), (Held(NAME, (NEWEST,)),))
     talk.tick(400)
     for _ in range(3):
         talk.hear("robot2", entry(State.STANDBY, 2, "robot1", None, "robot2", FREE))
@@ -288,7 +288,7 @@ def test_a_claim_without_consent_gives_no_right_to_act_alone_after_a_restart() -
     held = (Held(NAME, (NEWEST,)),)
     for claimed in (True, False):
         record = Record(NAME, 2, "robot1", State.PRIMARY, spec=spec, claimed=claimed)
-        talk = Talk(pair, Ballot((record,)), held)
+        talk = Talk(pair, VoteRecord((record,)), held)
         talk.tick(1_000)
         assert bool(talk.orders(acts.Restore)) is not claimed
 

@@ -13,7 +13,7 @@ from failover.core.event_log.decisions import Decision, Facts, Line, Sighting
 from failover.core.event_log.merge import Timed, merged, precedes
 from failover.core.events import Captured, Noticed, Received, Run, Started, Tick
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, Record, State
+from failover.core.types import MS, ComponentSpec, Config, Held, Launch, Record, State, VoteRecord
 from failover.core.wire.messages import Beat, Entry
 
 SPEC = ComponentSpec("/lab/x", launch=Launch(("x",)))
@@ -28,7 +28,7 @@ def told(node: Node, event: object, at_ms: int) -> list[Decision]:
 def standing_by() -> Node:
     """robot1, standby of robot2's component, with a checkpoint from an earlier life; it hears robot2 over two links."""
     record = Record("/lab/x", 3, "robot2", State.STANDBY, trusted=True, spec=SPEC)
-    node = Node(PAIR, 2, Ballot((record,)), 0, (Held("/lab/x", (Position(193, 5, b"d"),)),))
+    node = Node(PAIR, 2, VoteRecord((record,)), 0, (Held("/lab/x", (Position(193, 5, b"d"),)),))
     held = Entry("/lab/x", tuple(State).index(State.PRIMARY), 3, "robot2", standby="robot1")
     for counter, link in enumerate(("wire", "air"), start=1):
         node.step(Received(Beat("robot2", 7, counter, total=1, entries=(held,)), link), counter * 10 * MS)
@@ -83,7 +83,7 @@ def test_an_own_stall_is_told_and_stands_beside_the_decisions_after_it() -> None
 
 
 def test_a_primary_tells_what_its_loss_would_cost() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+    node = Node(ALONE, 1, VoteRecord(), 0)
     (_, claim) = told(node, Run(1, SPEC), 0)
     assert claim.facts.checkpoint == 0 and claim.facts.checkpoint_age_ns == -1 and claim.facts.lease_left_ns is None
     (capture,) = (one for one in node.step(Started("/lab/x", 1), 1 * MS).act if isinstance(one, acts.Capture))
@@ -94,8 +94,8 @@ def test_a_primary_tells_what_its_loss_would_cost() -> None:
     assert noticed.facts.output_pending == 77
 
 
-def test_what_is_noticed_about_an_unknown_component_is_nobodys_story() -> None:
-    node = Node(ALONE, 1, Ballot(), 0)
+def test_what_is_noticed_about_an_unknown_component_leaves_no_line() -> None:
+    node = Node(ALONE, 1, VoteRecord(), 0)
     told(node, Tick(), 0)
     assert told(node, Noticed("/lab/strange", "something"), 1) == []
     assert [one.component for one in told(node, Noticed("", "the cable is out"), 1)] == [""]
@@ -112,10 +112,10 @@ def line(robot: str, number: int, *, counter: int = 0, life: int = 1, epoch: int
 
 def order(*lines: tuple[Line, int]) -> list[str]:
     """The sentences in the order told; every line with its instant in ms by the common clock."""
-    stories: dict[str, list[Timed]] = {}
+    logs: dict[str, list[Timed]] = {}
     for one, at_ms in lines:
-        stories.setdefault(one.robot, []).append(Timed(one, at_ms * MS))
-    return [timed.line.decision.sentence for timed in merged(stories)]
+        logs.setdefault(one.robot, []).append(Timed(one, at_ms * MS))
+    return [timed.line.decision.sentence for timed in merged(logs)]
 
 
 def test_whoever_heard_of_a_decision_decided_later_whatever_the_clocks_say() -> None:
@@ -158,24 +158,24 @@ def test_no_wrong_clock_turns_cause_and_consequence_round(seed: int) -> None:
     heard: dict[str, dict[str, tuple[int, int]]] = {robot: {} for robot in wrong_ms}
     beats = dict.fromkeys(wrong_ms, 0)
     numbers = {robot: itertools.count(1) for robot in wrong_ms}
-    stories: dict[str, list[Timed]] = {robot: [] for robot in wrong_ms}
+    logs: dict[str, list[Timed]] = {robot: [] for robot in wrong_ms}
     for now_ms in range(1_000):
         robot = dice.choice(list(wrong_ms))
         if dice.random() < 0.1:
             one = line(robot, next(numbers[robot]), counter=beats[robot] + 1, **heard[robot])
-            stories[robot].append(Timed(one, (now_ms + wrong_ms[robot]) * MS))
+            logs[robot].append(Timed(one, (now_ms + wrong_ms[robot]) * MS))
         else:
             beats[robot] += 1
             listener = dice.choice([other for other in wrong_ms if other != robot])
             heard[listener][robot] = (1, beats[robot])
-    place = {(timed.line.robot, timed.line.number): at for at, timed in enumerate(merged(stories))}
-    assert len(place) == sum(map(len, stories.values())), seed
-    for effect in (timed.line for story in stories.values() for timed in story):
+    place = {(timed.line.robot, timed.line.number): at for at, timed in enumerate(merged(logs))}
+    assert len(place) == sum(map(len, logs.values())), seed
+    for effect in (timed.line for log in logs.values() for timed in log):
         heard_of = {one.robot: one.counter for one in effect.decision.facts.seen} | {effect.robot: beats[effect.robot] + 1}
         causes = [
             timed.line
             for robot, beat in heard_of.items()
-            for timed in stories[robot]
+            for timed in logs[robot]
             if timed.line.decision.facts.counter <= beat and (robot != effect.robot or timed.line.number < effect.number)
         ]
         assert all(place[cause.robot, cause.number] < place[effect.robot, effect.number] for cause in causes), seed

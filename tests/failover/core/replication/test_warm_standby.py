@@ -12,7 +12,7 @@ from failover.core import acts
 from failover.core.election.consent import STATES
 from failover.core.events import Event, Received, Stored, Tick, Warmed
 from failover.core.node import Node
-from failover.core.types import MS, Ballot, ComponentSpec, Config, Held, Launch, OnLoss, Record, Rules, State
+from failover.core.types import MS, ComponentSpec, Config, Held, Launch, OnLoss, Record, Rules, State, VoteRecord
 from failover.core.wire.messages import WARM, Beat, Entry
 
 NAME = "/lab/x"
@@ -23,7 +23,7 @@ class Standby:
     """robot1, which hears from robot2, and remembers what it was ordered."""
 
     def __init__(self) -> None:
-        self.node = Node(Config("robot1", ("robot2",), grace_ms=300), 1, Ballot(), 0)
+        self.node = Node(Config("robot1", ("robot2",), grace_ms=300), 1, VoteRecord(), 0)
         self._beats, self._sequences, self.now_ns = count(1), count(1), 0
 
     def step(self, event: Event) -> list[acts.Act]:
@@ -109,7 +109,7 @@ def test_a_takeover_uses_what_waits(standby: Standby) -> None:
 def test_a_standby_that_was_restarted_has_it_wait_without_another_snapshot() -> None:
     record = Record(NAME, 1, "robot2", State.STANDBY, trusted=True, spec=SPEC)
     held = Held(NAME, (Position(65, 1, b"d"),), keeps_state=True)
-    node = Node(Config("robot1", ("robot2",), grace_ms=300), 2, Ballot((record,)), 0, (held,))
+    node = Node(Config("robot1", ("robot2",), grace_ms=300), 2, VoteRecord((record,)), 0, (held,))
     assert acts.Warm(NAME, 1, SPEC) in node.step(Tick(), 1 * MS).act
 
 

@@ -140,7 +140,7 @@ def test_scans_that_nobody_acknowledges_are_joined_and_none_is_forgotten(
             chain = _chain(session, dice, lost=0.85)
             assert isinstance(session, PtraceSession)
             assert len(session._first.memory._unacknowledged) <= 3
-            assert len(session._totals_at) <= 4
+            assert len(session._builder._totals_at) <= 4
             tracee.kill()
     _expect_the_same_story(program, tmp_path, chain, ["mutator", ways, 8])
 

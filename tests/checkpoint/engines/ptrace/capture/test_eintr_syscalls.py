@@ -24,8 +24,9 @@ from checkpoint.engines.ptrace.capture.eintr_syscalls import Wait, decide
 from checkpoint.errors import CaptureError, ProcessGoneError
 from checkpoint.linux import abi
 from checkpoint.linux.memory.remote_memory import Memory
-from checkpoint.linux.trace import remote_syscalls
-from checkpoint.linux.trace.remote_syscalls import Batch, Desk, Guest
+from checkpoint.linux.trace import remote_syscalls, syscall_batch
+from checkpoint.linux.trace.syscall_batch import Batch
+from checkpoint.linux.trace.syscall_desk import Desk, Guest
 from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.round_trip import (
     PATIENCE_S,
@@ -309,9 +310,9 @@ def test_a_wait_that_has_timed_out_at_a_stop_can_be_left_alone_with_its_result()
     """Any thread: should we die, the code at its desk gives it back what the call returns, a negative number."""
     memory, room = Memory(os.getpid()), mmap.mmap(-1, abi.PAGE_SIZE)
     address = ctypes.addressof(ctypes.c_char.from_buffer(room))
-    desk = Desk(memory, address, address + remote_syscalls.SMALL_DESK, remote_syscalls.SMALL)
+    desk = Desk(memory, address, address + syscall_batch.SMALL_DESK, syscall_batch.SMALL)
     registers = arch.encode_registers({**stopped(), arch.RESULT: -errno.EAGAIN, arch.CALL_NUMBER: arch.NO_CALL})
-    head = desk.armed(Batch(desk.table, remote_syscalls.SMALL), Guest(Tracee(os.getpid(), memory), registers, 0))
+    head = desk.armed(Batch(desk.table, syscall_batch.SMALL), Guest(Tracee(os.getpid(), memory), registers, 0))
     assert (-errno.EAGAIN).to_bytes(8, "little", signed=True) in head
 
 

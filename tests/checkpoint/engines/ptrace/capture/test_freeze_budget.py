@@ -16,6 +16,7 @@ from checkpoint.engines.ptrace.capture.freeze_budget import FIRST_PAGE_NS, FIRST
 from checkpoint.engines.ptrace.capture.memory import MemoryCapture, RunningCopy
 from checkpoint.engines.ptrace.capture.process import CapturedProcess
 from checkpoint.engines.ptrace.capture.session import PtraceSession
+from checkpoint.engines.ptrace.capture.standstill import Standstill
 from checkpoint.errors import CaptureError
 from tests.checkpoint.engines.ptrace.capture.test_deltas import OBEDIENT
 from tests.checkpoint.round_trip import ENGINE, Program, at_last, ended, protected, start
@@ -127,21 +128,38 @@ def test_a_freeze_that_would_take_too_long_is_given_up_and_the_next_ones_copy_le
     """Where no budget is set: the program writes after the last pass, until it is let go a second time."""
     monkeypatch.setattr(freeze_budget, "LONG_COPY_NS", 2_000 * FIRST_PAGE_NS)
     given_up: list[int] = []
-    freeze = PtraceSession._freeze
+    freeze = Standstill.freeze
 
-    def freezing(self: PtraceSession) -> int:
+    def freezing(self: Standstill) -> int:
         given_up.append(len(given_up))
         if len(given_up) <= 2:
             one.write(8_000)
         return freeze(self)
 
     with obedient(tmp_path, 0) as one:
-        monkeypatch.setattr(PtraceSession, "_freeze", freezing)
+        monkeypatch.setattr(Standstill, "freeze", freezing)
         snapshot = one.session.capture(CaptureOrder(base=False, sequence=2))
         one.program.kill()
     assert len(given_up) == 3
     assert len(snapshot.contents) >= 8_000 * PAGE
     assert one.session.frozen_size < 2_000 * PAGE
+
+
+@pytest.mark.root
+def test_a_capture_that_takes_long_makes_no_pass_in_vain_and_ends_with_its_next_freeze(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On an overloaded robot: else a program that writes fast has no checkpoint for minutes."""
+    monkeypatch.setattr(freeze_budget, "LONG_CAPTURE_NS", 0)
+    monkeypatch.setattr(freeze_budget, "LONG_COPY_NS", 2_000 * FIRST_PAGE_NS)
+    with obedient(tmp_path, 0) as one:
+        one.write(8_000)
+        passes = _followed_by_writes(monkeypatch, one, lambda _: 8_000)
+        snapshot = one.session.capture(CaptureOrder(base=False, sequence=2))
+        one.program.kill()
+    assert len(passes) == 2, "the second one copied as much as the first"
+    assert len(snapshot.contents) >= 8_000 * PAGE
+    assert one.session.frozen_size >= 8_000 * PAGE
 
 
 @pytest.mark.root
@@ -152,7 +170,7 @@ def test_no_capture_takes_longer_than_its_budget_but_by_the_rule_and_what_it_cop
     hour_ns = 3_600_000_000_000
     with obedient(tmp_path, 10 * MS, hour_ns) as one:
         looks: list[int] = []
-        monkeypatch.setattr(PtraceSession, "_freeze", _writing_first(PtraceSession._freeze, one, looks))
+        monkeypatch.setattr(Standstill, "freeze", _writing_first(Standstill.freeze, one, looks))
         with pytest.raises(CaptureError, match=r"gave 4 freezes up .* freeze_budget_ms of 10; in 3\d{3} s one may take longer"):
             one.session.capture(CaptureOrder(base=False, sequence=2))
         assert len(looks) == 4
@@ -163,10 +181,10 @@ def test_no_capture_takes_longer_than_its_budget_but_by_the_rule_and_what_it_cop
     assert len(snapshot.contents) >= 8_192 * PAGE, "nothing is forgotten of what failed captures named"
 
 
-def _writing_first(freeze: Callable[[PtraceSession], int], one: Obedient, looks: list[int]) -> Callable[[PtraceSession], int]:
+def _writing_first(freeze: Callable[[Standstill], int], one: Obedient, looks: list[int]) -> Callable[[Standstill], int]:
     """Between the last pass and the freeze all 32 MB are written."""
 
-    def freezing(self: PtraceSession) -> int:
+    def freezing(self: Standstill) -> int:
         looks.append(len(looks))
         one.write(8_192)
         return freeze(self)

@@ -10,7 +10,7 @@ from checkpoint.engines.ptrace.facts import birth_parents
 from checkpoint.engines.ptrace.facts.birth_order import Person
 from checkpoint.engines.ptrace.facts.birth_parents import Wanted
 from tests.checkpoint.engines.ptrace.facts.test_birth_order import FIRST, played
-from tests.checkpoint.engines.ptrace.restore.test_tree_states import goes_through_three_lives
+from tests.checkpoint.engines.ptrace.restore.families import goes_through_three_lives
 
 
 @pytest.mark.parametrize(

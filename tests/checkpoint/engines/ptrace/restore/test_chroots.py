@@ -10,7 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from checkpoint.engine import RestoreOptions
-from checkpoint.engines.ptrace.restore.process_state import Vessel, enter_root
+from checkpoint.engines.ptrace.restore.process_state import enter_root
+from checkpoint.engines.ptrace.restore.vessel import Vessel
 from checkpoint.errors import CheckpointError, MismatchError, UnsupportedError
 from checkpoint.linux.trace.call_table import CallTable
 from tests.checkpoint.round_trip import (

@@ -35,8 +35,12 @@ from checkpoint.store import chain
 from checkpoint.store.member_pages import MemberPages
 from checkpoint.store.xor_cache import Sender
 from tests.checkpoint.engines.ptrace.capture.test_trees import FAMILY, POOL
+from tests.checkpoint.engines.ptrace.restore import test_tree_orphans as orphans
+from tests.checkpoint.engines.ptrace.restore import test_tree_shared as shared
 from tests.checkpoint.engines.ptrace.restore import test_tree_states as states
-from tests.checkpoint.engines.ptrace.restore.test_tree_states import BORN_LATE, PREAMBLE, STOPPED, shared_out
+from tests.checkpoint.engines.ptrace.restore.families import PREAMBLE
+from tests.checkpoint.engines.ptrace.restore.test_tree_memory import BORN_LATE, SHARED, shared_out
+from tests.checkpoint.engines.ptrace.restore.test_tree_states import STOPPED
 from tests.checkpoint.engines.ptrace.standby_copy.test_single import (
     age_ns,
     base_of,
@@ -267,10 +271,18 @@ def test_memory_that_a_family_has_in_common_since_a_fork_is_there_once_in_its_co
             assert standby.copy.size >= shared_out(standby.copy.pids()) * 0.9
 
 
-OF_EACH_OTHER = (
-    *("SHARED", "MAPPED_ALONE", "NAMELESS", "NAMED_PIPES", "OWNERS", "RIGHTS", "KILLED", "LEFT_BEHIND", "SERVERS"),
-    "CONNECTED_AS_NOBODY",
-)
+OF_EACH_OTHER = {
+    "SHARED": SHARED,
+    "MAPPED_ALONE": shared.MAPPED_ALONE,
+    "NAMELESS": shared.NAMELESS,
+    "NAMED_PIPES": shared.NAMED_PIPES,
+    "OWNERS": shared.OWNERS,
+    "RIGHTS": states.RIGHTS,
+    "KILLED": states.KILLED,
+    "LEFT_BEHIND": orphans.LEFT_BEHIND,
+    "SERVERS": shared.SERVERS,
+    "CONNECTED_AS_NOBODY": shared.CONNECTED_AS_NOBODY,
+}
 
 
 @pytest.mark.parametrize("program", OF_EACH_OTHER)
@@ -278,7 +290,7 @@ def test_what_processes_are_to_each_other_comes_back_from_their_copy_over_two_li
     """Each of these programs says what differs."""
     tmp_path.chmod(0o755)
     arguments = ["asks"] if program == "LEFT_BEHIND" else []
-    life = start([sys.executable, "-c", PREAMBLE + getattr(states, program), *arguments], tmp_path, isolate=True)
+    life = start([sys.executable, "-c", PREAMBLE + OF_EACH_OTHER[program], *arguments], tmp_path, isolate=True)
     goes_through_copies(life, tmp_path, 2)
 
 

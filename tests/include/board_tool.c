@@ -1,0 +1,158 @@
+/* A program with a board that does what its standard input says, a line at a time, and answers each with one line. */
+#include "failover_board.h"
+#include "failover_rtdb.h"
+
+#include <inttypes.h>
+#include <sys/wait.h>
+
+enum { ITEMS = 16 };
+
+static fb_board *board;
+static struct {
+    char name[64];
+    fb_item *item;
+} found[ITEMS];
+
+static fb_item *item_of(const char *name)
+{
+    for (int index = 0; index < ITEMS; index++)
+        if (strcmp(found[index].name, name) == 0)
+            return found[index].item;
+    return NULL;
+}
+
+static void answer(int64_t outcome)
+{
+    if (outcome < 0)
+        printf("%s: %s\n", strerror((int)-outcome), fb_error());
+    else
+        printf("ok\n");
+}
+
+static const char *robot_of(const char *word) { return strcmp(word, "-") == 0 ? FB_OWN : FB_ROBOT(word); }
+
+static void get(const char *name, const char *robot)
+{
+    static char value[65536];
+    fb_reading reading;
+    int outcome = fb_get_reading(item_of(name), robot_of(robot), value, &reading);
+    if (outcome != 0)
+        answer(outcome);
+    else
+        printf("%.*s age %" PRId64 " max %" PRId64 " number %" PRIu64 " stale %d\n", (int)reading.size, value, reading.age_ns,
+               reading.age_max_ns, reading.number, reading.stale);
+}
+
+static void wait_for(const char *name, const char *robot, const char *after, const char *ms)
+{
+    long long milliseconds = atoll(ms);
+    struct timespec limit = {(time_t)(milliseconds / 1000), (long)(milliseconds % 1000) * 1000000};
+    answer(fb_wait(item_of(name), robot_of(robot), strtoull(after, NULL, 10), &limit));
+}
+
+static void add(const char *name, const char *size, const char *area, const char *type)
+{
+    fb_declaration wanted = {0};
+    wanted.name = name;
+    wanted.size = (uint32_t)atoi(size);
+    wanted.is_private = strcmp(area, "private") == 0;
+    wanted.kind = *type != '\0' ? FB_STRUCT : FB_BYTES;
+    wanted.type = *type != '\0' ? type : NULL;
+    answer(fb_add(board, &wanted));
+}
+
+static void find(const char *name, const char *size, const char *digest)
+{
+    fb_item *item = fb_find(board, name, (size_t)atoi(size), strtoull(digest, NULL, 16));
+    if (item == NULL) {
+        answer(-errno);
+        return;
+    }
+    for (int index = 0; index < ITEMS; index++)
+        if (found[index].item == NULL) {
+            snprintf(found[index].name, sizeof found[index].name, "%s", name);
+            found[index].item = item;
+            break;
+        }
+    printf("ok\n");
+}
+
+static void put_in_child(const char *name, const char *value)
+{
+    fflush(stdout);
+    pid_t child = fork();
+    if (child == 0) {
+        answer(fb_put_sized(item_of(name), value, strlen(value), FB_NOW));
+        fflush(stdout);
+        _exit(0);
+    }
+    waitpid(child, NULL, 0);
+}
+
+static void database(char **words)
+{
+    char value[65536];
+    memset(value, 0, sizeof value);
+    if (strcmp(words[1], "init") == 0)
+        printf("%d\n", DB_init());
+    else if (strcmp(words[1], "free") == 0)
+        DB_free(), printf("0\n");
+    else if (strcmp(words[1], "who") == 0)
+        printf("%d\n", Whoami());
+    else if (strcmp(words[1], "put") == 0)
+        snprintf(value, sizeof value, "%s", words[3]), printf("%d\n", DB_put(atoi(words[2]), value));
+    else {
+        int life = DB_get(strcmp(words[2], "-") == 0 ? SELF : atoi(words[2]), atoi(words[3]), value);
+        printf("%d %s\n", life, value);
+    }
+}
+
+static void digest(const char *size)
+{
+    static unsigned char bytes[70000];
+    for (size_t index = 0; index < sizeof bytes; index++)
+        bytes[index] = (unsigned char)(index * 131 + (index >> 8));
+    printf("%016" PRIx64 "\n", fb_digest_(bytes, strtoull(size, NULL, 10)));
+}
+
+int main(void)
+{
+    char line[70000], *words[6], nothing[] = "";
+    setvbuf(stdout, NULL, _IOLBF, 0);
+    while (fgets(line, sizeof line, stdin) != NULL) {
+        char *kept = NULL;
+        int count = 0;
+        line[strcspn(line, "\n")] = '\0';
+        for (int index = 0; index < 6; index++)
+            words[index] = nothing;
+        for (char *word = strtok_r(line, " ", &kept); word != NULL && count < 6; word = strtok_r(NULL, " ", &kept))
+            words[count++] = word;
+        if (strcmp(words[0], "open") == 0)
+            board = fb_open(*words[1] == '\0' ? NULL : words[1]), answer(board == NULL ? -errno : 0);
+        else if (strcmp(words[0], "close") == 0)
+            fb_close(board), board = NULL, memset(found, 0, sizeof found), printf("ok\n");
+        else if (strcmp(words[0], "add") == 0)
+            add(words[1], words[2], words[3], words[4]);
+        else if (strcmp(words[0], "find") == 0)
+            find(words[1], words[2], words[3]);
+        else if (strcmp(words[0], "put") == 0)
+            answer(fb_put_sized(item_of(words[1]), words[2], strlen(words[2]), *words[3] == '\0' ? FB_NOW : atoll(words[3])));
+        else if (strcmp(words[0], "get") == 0)
+            get(words[1], words[2]);
+        else if (strcmp(words[0], "wait") == 0)
+            wait_for(words[1], words[2], words[3], words[4]);
+        else if (strcmp(words[0], "child") == 0)
+            put_in_child(words[1], words[2]);
+        else if (strcmp(words[0], "db") == 0)
+            database(words);
+        else if (strcmp(words[0], "digest") == 0)
+            digest(words[1]);
+        else if (strcmp(words[0], "robot") == 0) {
+            char name[65] = "";
+            int outcome = fb_robot(board, name, sizeof name);
+            outcome != 0 ? answer(outcome) : (void)printf("%s\n", name);
+        } else
+            printf("what?\n");
+    }
+    return 0;
+}
