@@ -51,7 +51,6 @@ from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
 from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
-from failover.core.frames.roster import roster
 from failover.core.node import URGENT_GAP_NS, Node
 from failover.core.wire.messages import Beat
 from failover.errors import FailoverError
@@ -113,11 +112,9 @@ class MainLoop:
         self._record_file = record_file
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
-        terms = settings.team.items().terms if settings.team.board.items else b""
-        everybody = roster(settings.team.robots, terms)
         round_us = settings.config.beat_ms * 1_000
-        self._frames = FrameLane(self._me, settings.team.team, everybody, record_file.record.boot, round_us)
-        self._has_board = bool(terms) and settings.me.role == "robot"
+        self._frames = FrameLane(self._me, settings.team.team, settings.team.roster(), record_file.record.boot, round_us)
+        self._has_board = bool(settings.team.board.items) and settings.me.role == "robot"
         self._board: BoardLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
         self._urgent_ns: int | None = None
