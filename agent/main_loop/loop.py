@@ -113,8 +113,10 @@ class MainLoop:
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
         round_us = settings.config.beat_ms * 1_000
-        self._frames = FrameLane(self._me, settings.team.team, settings.team.roster(), record_file.record.boot, round_us)
-        self._has_board = bool(settings.team.board.items) and settings.me.role == "robot"
+        has_board, members = bool(settings.team.board.items), settings.team.roster()
+        boot = record_file.record.boot
+        self._frames = FrameLane(self._me, settings.team.team, members, boot, round_us, bounds_ways=has_board)
+        self._has_board = has_board and settings.me.role == "robot"
         self._board: BoardLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
         self._urgent_ns: int | None = None

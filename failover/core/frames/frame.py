@@ -72,6 +72,7 @@ SEAL_SIZE: Final = NUMBER_SIZE + CODE_SIZE
 DIGEST_SIZE: Final = 32
 _PERSON: Final = b"failover-frame-1"
 _NO_SEAL: Final = bytes(SEAL_SIZE)
+_FIRST: Final = range(1)
 
 PIECE_HEAD: Final = 1 + 5 + 5 + 9 + 3 + 5 + 5
 """Most bytes of an item in a frame, or of a piece of it, without its value."""
@@ -180,8 +181,8 @@ class Part(Struct, frozen=True):
     left_us: int
 
 
-_encoder = msgspec.msgpack.Encoder()
-_decoder: msgspec.msgpack.Decoder[Body] = msgspec.msgpack.Decoder(Body)
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(Body).decode
 
 
 # --- Sealing ---------------------------------------------------------------------------------------------------------
@@ -211,7 +212,7 @@ def echoes_max(members: int) -> int:
 
 def size_of(value: Any) -> int:
     """Bytes of a part of a body."""
-    return len(_encoder.encode(value))
+    return len(_encode(value))
 
 
 def bodies(said: Said | None, beat: Beat | None, items: Sequence[Portion], left_us: int, room: int) -> tuple[list[bytes], int]:
@@ -219,7 +220,7 @@ def bodies(said: Said | None, beat: Beat | None, items: Sequence[Portion], left_
 
     An item that is longer than a part has room goes in several; they follow each other.
     """
-    whole = _encoder.encode((said, beat, items, left_us))
+    whole = _encode((said, beat, items, left_us))
     if len(whole) <= room:
         return [whole], len(items)
     parts: list[list[Portion]] = [[]]
@@ -241,8 +242,8 @@ def bodies(said: Said | None, beat: Beat | None, items: Sequence[Portion], left_
             break
         placed += 1
     first, *others = parts
-    rest = [_encoder.encode((None, None, part, left_us)) for part in others]
-    return [_encoder.encode((said, beat, first, left_us)), *rest], placed
+    rest = [_encode((None, None, part, left_us)) for part in others]
+    return [_encode((said, beat, first, left_us)), *rest], placed
 
 
 def _pieces(item: Portion, left: int, fresh: int) -> Iterable[Portion]:
@@ -289,14 +290,16 @@ class Sealer:
             keys: those of the receivers: of all of them by rank, without this robot; or of the one. b"": not known yet.
             again: the same frame as before, for another receiver: it has the same counters.
         """
-        counter = self.counter - len(bodies) if again else self.counter
-        self.counter = counter + len(bodies)
+        rank, tag, roster, name, boot = self._rank, self._tag, self._roster, self._name, self._boot
+        count, places, round_ = len(bodies), len(keys), round_ & 0xFFFFFFFF
+        counter = self.counter - count if again else self.counter
+        self.counter = counter + count
         sealed = []
         for part, body in enumerate(bodies):
             counter += 1
+            last = flags | LAST if part == count - 1 else flags
             header = HEADER.pack(
-                *(MAGIC, VERSION, flags | LAST * (part == len(bodies) - 1), self._rank, medium, self._tag, self._roster),
-                *(self._name, self._boot, counter, round_ & 0xFFFFFFFF, part, len(bodies), len(keys)),
+                MAGIC, VERSION, last, rank, medium, tag, roster, name, boot, counter, round_, part, count, places
             )
             digest = _digest(header, body)
             sealed.append(b"".join((header, *[_authenticator(digest, key) if key else _NO_SEAL for key in keys], body)))
@@ -354,6 +357,20 @@ class _Window(Struct):
         return None
 
 
+class _Sender(Struct):
+    """Who may send to us, with the present key and the one before it.
+
+    Attributes:
+        rank: in our roster, or `NO_RANK`; ``places``: where its parts have our authenticator, if its roster is ours.
+    """
+
+    name: str
+    rank: int
+    places: range
+    window: _Window
+    keys: tuple[bytes, ...] = ()
+
+
 class Receiver:
     """Opens the parts that reach one robot: right key, right sender, and each only once.
 
@@ -362,11 +379,9 @@ class Receiver:
 
     def __init__(self, me: str, team: str, roster: Roster) -> None:
         self._me = roster.ranks[me]
-        self._tag = team_tag(team)
+        self._tag, self._digest = team_tag(team), roster.short_digest
         self._roster = roster
-        self._keys: dict[str, tuple[bytes, ...]] = {}
-        self._windows: dict[str, _Window] = {}
-        self._senders: dict[int, str] = {}
+        self._senders: dict[int, _Sender] = {}
 
     def accept(self, sender: str, key: bytes) -> None:
         """From now on believe ``sender`` when it uses ``key``; its last but one key is forgotten.
@@ -376,12 +391,15 @@ class Receiver:
         """
         if len(key) < KEY_SIZE_MIN:
             raise ValueError(f"a beat key of {len(key)} bytes for {sender}: use at least {KEY_SIZE_MIN} random bytes")
-        if sender not in self._windows and len(self._windows) > PEERS_MAX:
+        tag = name_tag(sender)
+        if tag not in self._senders and len(self._senders) > PEERS_MAX:
             raise ValueError(f"no room for the frames of {sender}: at most {PEERS_MAX} robots share a team")
-        before = tuple(one for one in self._keys.get(sender, ()) if one != key)
-        self._keys[sender] = (key, *before)[:KEYS_PER_SENDER]
-        self._senders[name_tag(sender)] = sender
-        self._windows.setdefault(sender, _Window())
+        known = self._senders.get(tag)
+        if known is None or known.name != sender:
+            rank = self._roster.ranks.get(sender, NO_RANK)
+            place = self._me - (self._me > rank)
+            known = self._senders[tag] = _Sender(sender, rank, range(place, place + 1), _Window())
+        known.keys = (key, *[one for one in known.keys if one != key])[:KEYS_PER_SENDER]
 
     def open(self, datagram: bytes) -> Part | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes."""
@@ -401,64 +419,66 @@ class Receiver:
             return Refused(Reason.NOT_OURS)
         if not part < parts <= PARTS_MAX:
             return Refused(Reason.PART)
-        alike = roster == self._roster.short_digest
-        sender = self._senders.get(name, "")
-        if not sender:
+        alike = roster == self._digest
+        sender = self._senders.get(name)
+        if sender is None:
             return Refused(Reason.UNKNOWN_KEY)
         places = self._places(rank, count, alike, sender)
         if not places:
             return Refused(Reason.ROSTER)
-        refusal = self._check(datagram, start, places, sender)
+        body = datagram[start:]
+        refusal = _check(datagram, body, places, sender.keys)
         if refusal is not None:
             return Refused(refusal)
         try:
-            body = _decoder.decode(datagram[start:])
+            said = _decode(body)
         except UNDECODABLE:
-            return Refused(Reason.MALFORMED, sender)
-        ours = self._roster.ranks.get(sender, NO_RANK)
-        if (body.beat is not None and body.beat.sender != sender) or (alike and rank != ours):
-            return Refused(Reason.SENDER, sender)
-        if not _is_sound(body, boot, counter):
-            return Refused(Reason.MALFORMED, sender)
-        refusal = self._windows[sender].take(boot, counter)
+            return Refused(Reason.MALFORMED, sender.name)
+        beat, items = said.beat, said.items
+        if (beat is not None and beat.sender != sender.name) or (alike and rank != sender.rank):
+            return Refused(Reason.SENDER, sender.name)
+        if not _is_sound(beat, items, boot, counter):
+            return Refused(Reason.MALFORMED, sender.name)
+        refusal = sender.window.take(boot, counter)
         if refusal is not None:
-            return Refused(refusal, sender, counter)
-        if not alike and body.beat is None:
-            return Refused(Reason.ROSTER, sender)
-        said, items = (body.slots, body.items) if alike else (None, ())
-        return Part(sender, alike, ours, medium, flags, boot, counter, round_, part, parts, said, body.beat, items, body.left_us)
+            return Refused(refusal, sender.name, counter)
+        slots = said.slots
+        if not alike:
+            if beat is None:
+                return Refused(Reason.ROSTER, sender.name)
+            slots, items = None, ()
+        return Part(
+            sender.name, alike, sender.rank, medium, flags, boot, counter, round_, part, parts, slots, beat, items, said.left_us
+        )
 
-    def _places(self, rank: int, count: int, alike: bool, sender: str) -> range:
+    def _places(self, rank: int, count: int, alike: bool, sender: _Sender) -> range:
         """Which of the authenticators may be ours; none where the rank is not the sender's."""
         if count == 1:
-            return range(1)
+            return _FIRST
         if not alike:
             return range(min(count, CODES_MAX))
-        if self._roster.ranks.get(sender) != rank or count != len(self._roster) - 1:
-            return range(0)
-        place = self._me - (self._me > rank)
-        return range(place, place + 1)
-
-    def _check(self, datagram: bytes, start: int, places: range, sender: str) -> Reason | None:
-        """Whether one of the authenticators is ours and right."""
-        digest = b""
-        for key in self._keys[sender]:
-            number = _prepared(key)[0]
-            for place in places:
-                at = HEADER.size + SEAL_SIZE * place
-                if datagram.startswith(number, at):
-                    digest = digest or _digest(datagram[: HEADER.size], datagram[start:])
-                    if hmac.compare_digest(datagram[at : at + SEAL_SIZE], _authenticator(digest, key)):
-                        return None
-        return Reason.FORGED if digest else Reason.UNKNOWN_KEY
+        return sender.places if rank == sender.rank and count == len(self._roster) - 1 else range(0)
 
 
-def _is_sound(body: Body, boot: int, counter: int) -> bool:
+def _check(datagram: bytes, body: bytes, places: range, keys: Sequence[bytes]) -> Reason | None:
+    """Whether one of the authenticators is ours and right."""
+    digest = b""
+    for key in keys:
+        number = _prepared(key)[0]
+        for place in places:
+            at = HEADER.size + SEAL_SIZE * place
+            if datagram.startswith(number, at):
+                digest = digest or _digest(datagram[: HEADER.size], body)
+                if hmac.compare_digest(datagram[at : at + SEAL_SIZE], _authenticator(digest, key)):
+                    return None
+    return Reason.FORGED if digest else Reason.UNKNOWN_KEY
+
+
+def _is_sound(beat: Beat | None, items: Sequence[Portion], boot: int, counter: int) -> bool:
     """Whether the numbers lie in the ranges that ``FRAME.md`` gives."""
-    beat = body.beat
     return (
         0 < boot < NUMBER_MAX
         and 0 < counter < NUMBER_MAX
         and (beat is None or (beat.boot == boot and is_sound(beat)))
-        and all(item.is_sound for item in body.items if item.total or item.offset)
+        and all(item.is_sound for item in items if item.total or item.offset)
     )

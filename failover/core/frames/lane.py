@@ -77,11 +77,14 @@ class FrameLane:
     Args:
         round_us: between two of its frames.
         medium: its number; 0: all links.
+        bounds_ways: bound how long frames are on their way. Only ages of items need it: a team without a board does without.
     """
 
-    def __init__(self, me: str, team: str, roster: Roster, boot: int, round_us: int, medium: int = 0) -> None:
+    def __init__(
+        self, me: str, team: str, roster: Roster, boot: int, round_us: int, medium: int = 0, *, bounds_ways: bool = True
+    ) -> None:
         self._me, self._rank, self._boot, self._medium = me, roster.ranks[me], boot, medium
-        self._round_us = round_us
+        self._round_us, self._bounds_ways = round_us, bounds_ways
         self._others = tuple(name for name in roster.names if name != me)
         self._sealer = Sealer(me, team, roster, boot)
         self._receiver = Receiver(me, team, roster)
@@ -89,6 +92,7 @@ class FrameLane:
         self._peers = {rank: _Peer(ClockOffset()) for name, rank in roster.ranks.items() if name != me}
         self._left: OrderedDict[int, int] = OrderedDict()
         self._room, self._codes, self._echoes = body_size_max(len(roster)), codes(len(roster)), echoes_max(len(roster))
+        self._shares = self._shared()
         self._echo_from = 0
         self.assembly = Assembly()
 
@@ -101,6 +105,13 @@ class FrameLane:
         """The peer knows now that we seal with this key."""
         if peer in self._others:
             self._keys[peer] = key
+            self._shares = self._shared()
+
+    def _shared(self) -> list[tuple[tuple[str, ...], list[bytes]]]:
+        """Who gets a datagram with which keys' authenticators."""
+        to = tuple(peer for peer in self._others if peer in self._keys)
+        keys = [self._keys.get(peer, b"") for peer in self._others]
+        return [(to, keys)] if len(keys) == self._codes else [((peer,), [self._keys[peer]]) for peer in to]
 
     def hear(self, peer: str, key: bytes) -> None:
         """The peer seals with this key from now on.
@@ -124,22 +135,24 @@ class FrameLane:
 
         Args:
             items: with their ages at ``now_ns``, the instant right before the frame leaves.
-            said: of our slots; None: there are none, and only the echoes are told.
+            said: of our slots; None: there are none, and only the echoes are told, if ways are bounded.
         """
-        said = said or Said(self._round_us, 0, 0, (), self._echo(now_ns))
+        if said is None and self._bounds_ways:
+            said = Said(self._round_us, 0, 0, (), self._echo(now_ns))
         parts, placed = bodies(said, beat, items, now_ns // US, self._room)
-        to = tuple(peer for peer in self._others if peer in self._keys)
-        keys = [self._keys.get(peer, b"") for peer in self._others]
-        shares = [(to, keys)] if len(keys) == self._codes else [((peer,), [self._keys[peer]]) for peer in to]
         made = [
             Sealed(to, self._sealer.seal(parts, keys, medium=self._medium, flags=flags, round_=round_, again=number > 0))
-            for number, (to, keys) in enumerate(shares)
+            for number, (to, keys) in enumerate(self._shares)
         ]
-        for counter in range(self._sealer.counter - len(parts) + 1, self._sealer.counter + 1):
+        if self._bounds_ways and made:
+            self._note_left(len(parts), now_ns)
+        return made, placed
+
+    def _note_left(self, count: int, now_ns: int) -> None:
+        for counter in range(self._sealer.counter - count + 1, self._sealer.counter + 1):
             self._left[counter] = now_ns
         while len(self._left) > LEFT_MAX:
             self._left.popitem(last=False)
-        return made, placed
 
     def open(self, datagram: bytes, came_ns: int) -> Heard | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes.
@@ -152,6 +165,8 @@ class FrameLane:
             return part
         peer = self._peers.get(part.rank)
         if peer is None or not part.alike:
+            return Heard(part, (), None)
+        if not self._bounds_ways and not part.items:
             return Heard(part, (), None)
         if part.boot > peer.boot:
             peer = self._peers[part.rank] = _Peer(ClockOffset(), part.boot)

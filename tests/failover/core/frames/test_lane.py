@@ -17,8 +17,8 @@ def key(sender: str, receiver: str) -> bytes:
     return f"the key of {sender} to {receiver}".encode()
 
 
-def lane(me: str, boot: int = 1, team: Roster = TEAM) -> FrameLane:
-    made = FrameLane(me, "team", team, boot, 20_000)
+def lane(me: str, boot: int = 1, team: Roster = TEAM, *, bounds_ways: bool = True) -> FrameLane:
+    made = FrameLane(me, "team", team, boot, 20_000, bounds_ways=bounds_ways)
     for other in team.names:
         if other != me:
             made.speak(other, key(me, other))
@@ -76,6 +76,15 @@ def test_the_first_frame_that_echoes_ours_bounds_its_way_by_the_round_trip() -> 
     way_ns = talk.back(way_ns=3 * MS).way_ns
     assert way_ns is not None
     assert 4 * MS <= way_ns <= 4 * MS + 100_000  # one there, three back
+
+
+def test_without_a_board_frames_say_nothing_of_ways() -> None:
+    talk = Talk()
+    with_ways = talk.there().part.slots
+    talk.first, talk.second = (lane(name, bounds_ways=False) for name in ("robot1", "robot2"))
+    for _ in range(3):
+        assert (talk.there().part.slots, talk.back().way_ns) == (None, None)
+    assert with_ways is not None
 
 
 def test_a_frame_that_waits_is_told_to_have_waited() -> None:
