@@ -19,7 +19,7 @@ from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.boards.received import ReceivedItems
 from failover.core.board import layout
-from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
+from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
 from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
@@ -142,12 +142,8 @@ class BoardLink:
             peer.items.begin_life()
         came_ns -= self._skew_ns
         self._note_frame(peer, heard.way_ns, came_ns)
-        put, round_, way_us = peer.items.put, part.round, way_bound_us(heard.way_ns)
-        for portion in heard.items:
-            age_us = portion.age_us
-            stamp_ns = max(came_ns - age_us * NS_PER_US, 0)
-            error_us = way_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
-            put(portion.number, portion.put, portion.value, stamp_ns, error_us, round=round_)
+        if heard.items:
+            peer.items.take(heard.items, came_ns, way_bound_us(heard.way_ns), part.round)
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
         """Tell when it came; from time to time the bounds that follow from the longest ways."""

@@ -36,6 +36,7 @@ class OwnItems:
         self._descriptor = file.descriptor
         self.records: dict[int, Record] = {}
         self.urgent: tuple[Record, ...] = ()
+        self._known: dict[int, Found] = {}
         self._generation = -1
         self._looked_ns: int | None = None
         self._table_size = 0
@@ -56,6 +57,7 @@ class OwnItems:
         self._generation = generation if generation % 2 == 0 else -1
         self._table_size = header.count * layout.RECORD_SIZE
         self.records = {record.id: record for record in found}
+        self._known = {}
         self.urgent = tuple(record for record in found if record.flags & URGENT)
         return True
 
@@ -71,7 +73,7 @@ class OwnItems:
         return table
 
     def get(self, record: Record, table: bytes) -> Found | None:
-        """The newest put of an item, whole; None before the first.
+        """The newest put of an item, whole; None before the first. A put that was read before is not read again.
 
         Args:
             table: from `newest`, a moment ago.
@@ -80,6 +82,9 @@ class OwnItems:
             OvertakenError, BoardError: see `failover.core.board.banks.get_carefully`.
         """
         number = number_in(table, record)
+        known = self._known.get(record.id)
+        if known is not None and known.number == number:
+            return known
         for _ in range(RETRIES):
             if number == 0:
                 return None
@@ -93,7 +98,8 @@ class OwnItems:
                 if len(value) != size:
                     raise BoardError(f"{self._file.path}: item {record.name!r}: damaged: a value of {size} bytes")
                 if total in (0, sum_of(value, stamp_ns, number)):
-                    return Found(value, stamp_ns, error_us, number)
+                    found = self._known[record.id] = Found(value, stamp_ns, error_us, number)
+                    return found
             number = self._word(record.at + layout.NEWEST_FIELD)
         raise OvertakenError(f"item {record.name!r} was written {RETRIES} times while it was read")
 

@@ -9,7 +9,7 @@ puts that no frame carried; one that is greater by a multiple of the banks would
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
@@ -17,11 +17,16 @@ from failover.boards import futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
+from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
 from failover.core.board.banks import put_carefully
 from failover.core.board.layout import Record
+from failover.core.frames.frame import Portion
 
 UNKNOWN: Final = "items with numbers that are not known here"
 MISFIT: Final = "values of another size than declared"
+
+_GENERATION: Final = layout.GENERATION_AT // 8
+_CHANGED: Final = layout.CHANGED_AT // 8
 
 Take = Callable[[int, bytes, int, int, int], bool | None]
 """``(number, value, stamp_ns, error_us, round)`` → whether it was put; None: it does not fit."""
@@ -39,6 +44,7 @@ class ReceivedItems:
         self.file = file
         self.dropped: Counter[str] = Counter()
         self._items: dict[int, Take] = {}
+        self._wake = futex.waker(file.address(layout.CHANGED_AT))
         self._generation = -1
 
     @classmethod
@@ -62,25 +68,39 @@ class ReceivedItems:
         """Whether the robot is there: `layout.NOT` … `layout.REMOVE`."""
         self.file.set_word32(layout.STATE_AT, state)
 
-    def put(self, item: int, number: int, value: bytes, stamp_ns: int, error_us: int, *, round: int = 0) -> bool:
-        """Take an item out of a frame.
+    def take(self, items: Iterable[Portion], came_ns: int, error_us: int, round_: int) -> int:
+        """Put what a frame brought.
 
         Args:
-            item, number: of the item, and of the put by its writer.
-            stamp_ns, error_us: as `failover.core.board.ages.received` says.
-            round: of the sender; frames with the item that were missed since the last one are counted by it.
+            items: whole values, with their ages when the frame left.
+            came_ns: when the frame came; BOOTTIME.
+            error_us: how much older the values may be than these two say; `NO_ERROR_BOUND`: not known.
+            round_: of the sender; frames with an item that were missed since the last one are counted by it.
 
         Returns:
-            Whether it was put: False for an item that is not known, a value that does not fit, and a put that is not newer.
+            How many were put. The others are not known here, do not fit, or are not newer than what is there.
         """
-        if self.file.words[layout.GENERATION_AT // 8] != self._generation:
+        if self.file.words[_GENERATION] != self._generation:
             self._generation = self.file.generation
             self._items = {record.id: _taker(self.file, record) for record in self.file.records()}
-        take = self._items.get(item)
-        is_put = take(number, value, stamp_ns, error_us, round) if take is not None else None
-        if is_put is None:
-            self.dropped[UNKNOWN if take is None else MISFIT] += 1
-        return bool(is_put)
+        known, puts = self._items.get, 0
+        for item in items:
+            take = known(item.number)
+            if take is None:
+                self.dropped[UNKNOWN] += 1
+                continue
+            age_us = item.age_us
+            stamp_ns = came_ns - age_us * NS_PER_US
+            error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
+            is_put = take(item.put, item.value, stamp_ns if stamp_ns > 0 else 0, error, round_)
+            if is_put:
+                puts += 1
+            elif is_put is None:
+                self.dropped[MISFIT] += 1
+        if puts:
+            self.file.words[_CHANGED] += 1
+            self._wake()  # once for all of them: programs that read this file cannot say that they wait, nor for what
+        return puts
 
     def bound(self, compute: Callable[[int], int]) -> None:
         """Tell how old each item may be while all works, used where none is declared.
@@ -97,8 +117,7 @@ def _taker(file: MappedFile, record: Record) -> Take:
     words, newest, least, limit, base = place.words, place.newest, place.least, place.limit, record.at // 8
     frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
     lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
-    period, wake = record.period, futex.waker(file.address(record.at + layout.NEWEST_FIELD))
-    following, last_number, last_round = words[newest] + 1, 0, -1
+    period, following, last_number, last_round = record.period, words[newest] + 1, 0, -1
 
     def take(number: int, value: bytes, stamp_ns: int, error_us: int, round_: int) -> bool | None:
         nonlocal following, last_number, last_round
@@ -115,7 +134,6 @@ def _taker(file: MappedFile, record: Record) -> Take:
         last_number = number
         put_carefully(place, following, value, stamp_ns, error_us, FENCE)
         following += 1
-        wake()  # who reads cannot say that it waits
         return True
 
     return take
