@@ -270,7 +270,7 @@ ODD_ITEMS = [
 
 @pytest.mark.parametrize("item", ODD_ITEMS)
 def test_items_outside_of_their_ranges_are_refused(item: object) -> None:
-    body = frame._encoder.encode((SAID, BEAT, (item,), LEFT_US))
+    body = frame._encode((SAID, BEAT, (item,), LEFT_US))
     assert receiver().open(resealed(body)) == Refused(Reason.MALFORMED, "robot1")
 
 
