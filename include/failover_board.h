@@ -1515,6 +1515,8 @@ static inline int fb_wait(fb_item *item, const char *robot, uint64_t after, cons
             if (failed != 0)
                 return failed;
         }
+        const unsigned char *changed = place->area->map + FB_CHANGED_AT_;
+        const uint32_t change = __atomic_load_n((const uint32_t *)(const void *)changed, __ATOMIC_ACQUIRE);
         const uint64_t newest = fb_load_(place->newest);
         if (newest != 0 && newest != after && !fb_is_lost_(fb_load_(place->generation)))
             return 0;
@@ -1525,7 +1527,12 @@ static inline int fb_wait(fb_item *item, const char *robot, uint64_t after, cons
             if (__atomic_load_n(place->newest, __ATOMIC_SEQ_CST) != newest)
                 continue;
         }
-        fb_sleep_(place->newest, (uint32_t)newest, left < FB_SLICE_NS_ ? left : (int64_t)FB_SLICE_NS_);
+        if (left > (int64_t)FB_SLICE_NS_)
+            left = (int64_t)FB_SLICE_NS_;
+        if (place->area->is_peer) /* one word for all items that a frame brings */
+            fb_sleep_(changed, change, left);
+        else
+            fb_sleep_(place->newest, (uint32_t)newest, left);
     }
 }
 

@@ -57,7 +57,7 @@ from agent.guard.messages import (
 )
 from agent.guard.program import GuardedProgram, ProgramError
 from agent.guard.task_socket import TaskEnd
-from agent.system import syscalls
+from agent.system import syscalls, timers
 from agent.system.clock import now_ns
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelError, close_all
@@ -93,7 +93,7 @@ class Guard:
         self._is_unfinished = False
         self._started_at = time.monotonic()
         self._signals = _wake_on_signals()
-        self._alarm = syscalls.Alarm()
+        self._alarm = timers.Alarm()
         self._answers: dict[type, Callable[[Any, tuple[int, ...]], None]] = {
             Start: self._start,
             BeginTask: self._begin_task,

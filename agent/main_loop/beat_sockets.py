@@ -1,8 +1,8 @@
-"""Sends and receives heartbeats: plain UDP datagrams, one socket per link, never queued behind other traffic.
+"""Sends and receives team frames: plain UDP datagrams, one socket per link, never queued behind other traffic.
 
 Nothing here blocks, and no state of the network raises an error: a datagram that cannot leave is a heartbeat that a peer misses,
-and heartbeats exist to show exactly that. `failover.core.wire.codec` authenticates them. The kernel drops a datagram that does
-not begin as a heartbeat before it takes room in a socket's buffer or wakes this process.
+and heartbeats exist to show exactly that. `failover.core.frames.frame` authenticates them. The kernel drops a datagram that does
+not begin as a frame before it takes room in a socket's buffer or wakes this process.
 Source: Documentation/networking/filter.rst.
 """
 
@@ -20,7 +20,7 @@ from typing import Final
 from agent.errors import LaneError
 from agent.system.rtnetlink import ANCILLARY_SIZE, allow_absent, interface_index, tell_interfaces
 from failover.config.team import Robot, for_lookup, split_address
-from failover.core.wire.codec import FRAME_SIZE_MAX, MAGIC
+from failover.core.frames.frame import FRAME_SIZE_MAX, MAGIC, MAGIC_BEFORE
 
 FRAME_LIMIT: Final = 1_472
 """Bytes of one datagram: an Ethernet frame's worth, so that no beat is lost with half a fragment."""
@@ -131,7 +131,7 @@ def _bound(address: str) -> socket.socket:
         tell_interfaces(link)
         link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         with contextlib.suppress(OSError):  # an emulated kernel has no filters; the receiver refuses the same, more dearly
-            _let_only_beats_in(link)
+            _let_only_frames_in(link)
         link.bind(where)
     except OSError as error:
         raise LaneError(
@@ -140,15 +140,19 @@ def _bound(address: str) -> socket.socket:
     return link
 
 
-def _let_only_beats_in(link: socket.socket) -> None:
-    """Have the kernel drop what is longer than a beat, or does not begin like one."""
+def _let_only_frames_in(link: socket.socket) -> None:
+    """Have the kernel drop what is longer than a part of a frame, or does not begin like one.
+
+    The beats of older releases are let in, so that a robot that sends them counts as one that is not understood.
+    """
     program = b"".join(
         _INSTRUCTION.pack(*instruction)
         for instruction in (
             (_LOAD_LENGTH, 0, 0, 0),
-            (_IS_ABOVE, 3, 0, UDP_HEADER_SIZE + FRAME_SIZE_MAX),
+            (_IS_ABOVE, 4, 0, UDP_HEADER_SIZE + FRAME_SIZE_MAX),
             (_LOAD_HALF, 0, 0, UDP_HEADER_SIZE),  # of a datagram that has none: dropped
-            (_IS_EQUAL, 0, 1, int.from_bytes(MAGIC, "big")),
+            (_IS_EQUAL, 1, 0, int.from_bytes(MAGIC, "big")),
+            (_IS_EQUAL, 0, 1, int.from_bytes(MAGIC_BEFORE, "big")),
             (_RETURN, 0, 0, 0xFFFF_FFFF),
             (_RETURN, 0, 0, 0),
         )

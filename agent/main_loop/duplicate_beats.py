@@ -1,4 +1,4 @@
-"""Drops duplicate heartbeats: each travels over every link of its sender; the first counts, later ones prove their links.
+"""Drops duplicate frames: each travels over every link of its sender; the first counts, later ones prove their links.
 
 A copy says nothing about whether its sender lives: it proves a link, and only once. A copy that comes a second time over one link
 is a replay.
@@ -9,33 +9,32 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Final
 
-from failover.core.wire.codec import Reason, Refused
-from failover.core.wire.messages import Beat
+from failover.core.frames.frame import WINDOW, Part, Reason, Refused
 
-RECENT_BEATS: Final = 16
-"""A beat that was heard on one link may come over a slower one by so many beats later; an older copy is somebody's replay."""
+RECENT_PARTS: Final = WINDOW
+"""A part of a frame that was heard on one link may come over a slower one by so many parts later; an older copy is a replay."""
 
 
 class Copies:
-    """Which links brought the newest beats of each sender."""
+    """Which links brought the newest parts of each sender's frames."""
 
     def __init__(self) -> None:
         self._lives: dict[str, int] = {}
         self._brought: dict[str, OrderedDict[int, set[str]]] = {}
         self._carried: dict[str, dict[str, int]] = {}
 
-    def heard(self, beat: Beat, link: str) -> None:
-        """Note the first of a beat."""
-        if self._lives.get(beat.sender) != beat.boot:
-            self._lives[beat.sender] = beat.boot
-            self._brought[beat.sender] = OrderedDict()
-        brought = self._brought[beat.sender]
-        brought[beat.counter] = {link}
-        if len(brought) > RECENT_BEATS:
+    def heard(self, part: Part, link: str) -> None:
+        """Note the first of a part."""
+        if self._lives.get(part.sender) != part.boot:
+            self._lives[part.sender] = part.boot
+            self._brought[part.sender] = OrderedDict()
+        brought = self._brought[part.sender]
+        brought[part.counter] = {link}
+        if len(brought) > RECENT_PARTS:
             brought.popitem(last=False)
 
     def admit(self, refused: Refused, link: str, now_ns: int) -> bool:
-        """Whether what was refused as seen before is a copy of a recent beat over a link that had not brought it yet.
+        """Whether what was refused as seen before is a copy of a recent part over a link that had not brought it yet.
 
         Args:
             link: the interface that it came over; one without a name is no proof of any.

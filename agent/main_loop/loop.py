@@ -15,8 +15,9 @@ import select
 import signal
 import socket
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from agent.config import Settings
 from agent.core_config import node_config
@@ -42,15 +43,20 @@ from agent.main_loop.outbox import Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
 from agent.main_loop.vote_record_writer import VoteRecordWriter
 from agent.main_loop.worker_process import WorkerProcess
-from agent.system import clock, syscalls
+from agent.system import clock, syscalls, timers
 from agent.system.sd_notify import Notifier, watchdog_period_ns
 from checkpoint.keeper.messages import ChannelClosedError, ChannelError
 from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
-from failover.core.node import Node
-from failover.core.wire import codec
+from failover.core.frames.frame import Part, Portion, Reason, Refused
+from failover.core.frames.lane import FrameLane
+from failover.core.node import URGENT_GAP_NS, Node
 from failover.core.wire.messages import Beat
+from failover.errors import FailoverError
+
+if TYPE_CHECKING:
+    from agent.main_loop.board_link import BoardLink
 
 NANOSECONDS_A_SECOND: Final = 1_000_000_000
 SLEEP_LIMIT_S: Final = 0.5
@@ -79,6 +85,11 @@ WORKER_TRIES: Final = 5
 
 STARTED: Final = "protecting this robot and its neighbours"
 
+UNLIKE: Final = (
+    "{} has another team.toml: its heartbeats are read, and items of its board are not; copy the same file to both, and start "
+    "their agents again"
+)
+
 OUTLIVED: Final = (
     "%s remembers life %d of %s, and %s counts %d: its state directory is new, or an old copy. Its votes and checkpoints since "
     "then are lost; it begins again as life %d"
@@ -101,9 +112,15 @@ class MainLoop:
         self._record_file = record_file
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers)
-        self._hearing = codec.Receiver(settings.team.team)
+        round_us = settings.config.beat_ms * 1_000
+        has_board, members = bool(settings.team.board.items), settings.team.roster()
+        boot = record_file.record.boot
+        self._frames = FrameLane(self._me, settings.team.team, members, boot, round_us, bounds_ways=has_board)
+        self._has_board = has_board and settings.me.role == "robot"
+        self._board: BoardLink | None = None
+        self._round = self._round_ns = self._sent_ns = 0
+        self._urgent_ns: int | None = None
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
-        self._keys: dict[str, bytes] = {}
         self._worker = WorkerProcess(settings)
         self._node: Node | None = None
         durable = core_vote_record.decode(record_file.record.core)
@@ -111,6 +128,7 @@ class MainLoop:
         self._persister = VoteRecordWriter(lambda wanted: record_file.keep(core_vote_record.encode(wanted)))
         self._event_log = EventLogWriter(Path(settings.config.state_directory), self._me, record_file.record.boot)
         self._poll = select.epoll()
+        self._alarm = timers.Alarm()
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
@@ -127,7 +145,8 @@ class MainLoop:
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
         self._copies = Copies()
-        self._newest_beat: dict[str, tuple[int, int]] = {}
+        self._newest_part: dict[str, tuple[int, int]] = {}
+        self._unlike: set[str] = set()
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
         self._remembered = 0
@@ -159,7 +178,7 @@ class MainLoop:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
-        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno()):
+        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno(), self._alarm.fileno()):
             self._poll.register(descriptor, select.EPOLLIN)
         gc.collect()
         syscalls.give_back()  # before memory is locked: then it would stay
@@ -168,6 +187,27 @@ class MainLoop:
         self._start_worker()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
+
+    def _open_board(self) -> None:
+        """Map the board that the worker has made; a robot without its board still protects its programs."""
+        self._close_board()
+        if not self._has_board:
+            return
+        from agent.main_loop.board_link import BoardLink  # here: a team without a board does not load it
+        from failover.boards.directory import agents_place
+
+        try:
+            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._outbox.beat_ns)
+        except (FailoverError, OSError) as error:
+            log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
+            return
+        self._poll.register(self._board.wakes.fileno(), select.EPOLLIN)
+
+    def _close_board(self) -> None:
+        if self._board is not None:
+            self._poll.unregister(self._board.wakes.fileno())
+            self._board.close()
+        self._board = None
 
     def _start_worker(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
@@ -183,7 +223,8 @@ class MainLoop:
         """Sleep, then one round of everything that came, then the core's deadline."""
         self._worker.flush()
         self._rest()
-        came = self._poll.poll(self._pause_s())
+        self._alarm.set(self._wakes_ns())
+        came = self._poll.poll(SLEEP_LIMIT_S)
         if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
             self._hear()
         for descriptor, _ in came:
@@ -195,6 +236,11 @@ class MainLoop:
                 self._note_persisted()
             elif descriptor == self._wake.fileno():
                 self._ending = True
+            elif self._board is not None and descriptor == self._board.wakes.fileno():
+                self._board.wakes.heed()
+                self._urgent_ns = self._sent_ns + URGENT_GAP_NS
+        if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
+            self._send_urgent()
         self._watch_worker()
         if self._node is not None:
             late_ns = clock.now_ns() - self._node.next_deadline_ns()
@@ -208,7 +254,7 @@ class MainLoop:
         In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
-        self._rests = self._node is not None and self._node.rests(now_ns)
+        self._rests = self._node is not None and self._board is None and self._node.rests(now_ns)
         listens = not self._rests and now_ns >= self._deaf_until_ns
         if listens != self._listens:
             self._listens = listens
@@ -236,14 +282,14 @@ class MainLoop:
         self._worker_silent_ns = self._worker_unseen_ns = 0
         self._worker_turns, self._worker_allowed_ns = None, allowed_ns
 
-    def _pause_s(self) -> float:
+    def _wakes_ns(self) -> int | None:
+        """When the next turn is due, whatever comes; None while the node is not born yet."""
         if self._node is None:
-            return SLEEP_LIMIT_S
-        now_ns = clock.now_ns()
-        left_ns = self._node.next_deadline_ns() - now_ns
-        if not self._listens and not self._rests:
-            left_ns = min(left_ns, self._deaf_until_ns - now_ns)
-        return min(max(left_ns / NANOSECONDS_A_SECOND, 0.0), SLEEP_LIMIT_S)
+            return None
+        deadline_ns = self._node.next_deadline_ns()
+        if self._urgent_ns is not None:
+            deadline_ns = min(deadline_ns, self._urgent_ns)
+        return deadline_ns if self._listens or self._rests else min(deadline_ns, self._deaf_until_ns)
 
     # --- events in ---
 
@@ -260,13 +306,13 @@ class MainLoop:
         taken = refused = 0
         for frame, link, wall_ns, sender in self._beats.receive():
             taken += 1
-            opened = self._hearing.open(frame)
-            if isinstance(opened, Beat):
-                came_ns = self._came_ns(wall_ns)
-                self._count(opened, came_ns or clock.now_ns())
-                self._mind_earlier_lives(opened)
-                self._copies.heard(opened, link)
-                self._step(Received(opened, link, self._copies.take(opened.sender), came_ns))
+            came_ns = arrived_ns(wall_ns)
+            opened = self._frames.open(frame, came_ns)
+            if not isinstance(opened, Refused):
+                self._copies.heard(opened.part, link)
+                if self._board is not None:
+                    self._board.take(opened, came_ns)
+                self._take_part(opened.part, link, self._came_ns(wall_ns))
             elif not self._copies.admit(opened, link, clock.now_ns()):
                 self._refused[str(opened.reason)] += 1
                 refused += 1
@@ -274,6 +320,14 @@ class MainLoop:
                     self._step(sign)
         if taken >= TURN_LIMIT and refused > taken // 2:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
+
+    def _take_part(self, part: Part, link: str, came_ns: int) -> None:
+        self._count_part(part)
+        beat = part.beat
+        if beat is not None:
+            self._count_beat(beat, came_ns or clock.now_ns())
+            self._mind_earlier_lives(beat)
+            self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 
     def _came_ns(self, wall_ns: int) -> int:
         """When a beat came that waited because this main loop rests: its sender was not late. 0: now, or a stall of ours."""
@@ -290,14 +344,22 @@ class MainLoop:
             log.warning(OUTLIVED, *told)
             self._remembered, self._ending = life, True
 
-    def _count(self, beat: Beat, now_ns: int) -> None:
-        """Note how long the peer was silent before this beat, and how many were lost in between."""
-        peer = beat.sender
-        boot, counter = self._newest_beat.get(peer, (beat.boot, beat.counter - 1))
-        missing = beat.counter - counter - 1 if beat.boot == boot else 0
+    def _count_part(self, part: Part) -> None:
+        """Note how many parts of the peer's frames were lost before this one, and whether its ranks are ours."""
+        peer = part.sender
+        boot, counter = self._newest_part.get(peer, (part.boot, part.counter - 1))
+        missing = part.counter - counter - 1 if part.boot == boot else 0
         self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
-        if beat.boot != boot or missing >= 0:
-            self._newest_beat[peer] = (beat.boot, beat.counter)
+        if part.boot != boot or missing >= 0:
+            self._newest_part[peer] = (part.boot, part.counter)
+        if not part.alike:
+            self._unlike.add(peer)
+        elif self._unlike:
+            self._unlike.discard(peer)
+
+    def _count_beat(self, beat: Beat, now_ns: int) -> None:
+        """Note how long the peer was silent before this beat."""
+        peer = beat.sender
         gap_us = (now_ns - self._heard_at.get(peer, now_ns)) // 1_000
         self._heard_at[peer] = now_ns
         self._heard += 1
@@ -325,9 +387,9 @@ class MainLoop:
             case Inventory():
                 self._take_inventory(message)
             case SpeakKey(peer, key):
-                self._keys[peer] = key
+                self._frames.speak(peer, key)
             case HearKey(peer, key):
-                self._hearing.accept(peer, key)
+                self._frames.hear(peer, key)
             case Alive():
                 pass
             case _:
@@ -336,6 +398,7 @@ class MainLoop:
     def _take_inventory(self, inventory: Inventory) -> None:
         """The node is born with what was found; a node that lives already is told what the old worker took with it."""
         self._worker_deaths = 0
+        self._open_board()
         if self._node is not None:
             for event in self._worker.lost(inventory):
                 self._step(event)
@@ -369,11 +432,39 @@ class MainLoop:
         if due.persist is not None:
             self._persister.submit(*due.persist)
         for beat in due.beats:
-            for peer, key in self._keys.items():
-                self._beats.send(peer, codec.seal(beat, self._settings.team.team, key))
+            self._send(beat)
             self._sent += 1
         for act in due.acts:
             self._act(act)
+
+    def _send(self, beat: Beat) -> None:
+        """A beat, and the items whose round it is: a beat that leaves earlier, because something changed, begins no round."""
+        now_ns = clock.now_ns()
+        if self._board is None or now_ns - self._round_ns <= self._outbox.beat_ns // 2:
+            self._send_frame(beat, (), now_ns)
+            return
+        self._round, self._round_ns = self._round + 1, now_ns
+        self._board.tell_states(now_ns, self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000)
+        items = self._board.due(self._round, now_ns)
+        self._board.placed(items, self._send_frame(beat, items, now_ns))
+
+    def _send_urgent(self) -> None:
+        """Items that cannot wait for their round, without a beat."""
+        self._urgent_ns = None
+        now_ns = clock.now_ns()
+        items = self._board.urgent(now_ns) if self._board is not None else []
+        if self._board is not None and items:
+            self._board.went(items[: self._send_frame(None, items, now_ns)])
+
+    def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:
+        """One frame, to everybody over every link; how many of the items are in it."""
+        made, placed = self._frames.seal(beat, items, now_ns, round_=self._round)
+        for sealed in made:
+            for peer in sealed.to:
+                for datagram in sealed.datagrams:
+                    self._beats.send(peer, datagram)
+        self._sent_ns = now_ns
+        return placed
 
     def _act(self, act: Act) -> None:
         self._worker.order(act)
@@ -381,7 +472,7 @@ class MainLoop:
     def _told(self, question: messages.Ask) -> ToWorker:
         now_ns = clock.now_ns()
         refused = Counter(self._refused)
-        refused[str(codec.Reason.NOT_OURS)] += self._beats.dropped()
+        refused[str(Reason.NOT_OURS)] += self._beats.dropped()
         counts = BeatCounts(
             self._sent,
             self._heard,
@@ -391,12 +482,23 @@ class MainLoop:
             self._gap_us_max,
             self._gaps,
             dict(self._lost),
+            self._items_left_out(),
         )
-        troubles = tuple(filter(None, (self._persister.trouble, self._event_log.trouble)))
+        troubles = tuple(
+            filter(
+                None,
+                (self._persister.trouble, self._event_log.trouble, *map(UNLIKE.format, sorted(self._unlike))),
+            )
+        )
         if question.what == "why":
             return Told(question.number, now_ns, unwritten=self._event_log.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
         return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
+
+    def _items_left_out(self) -> dict[str, int]:
+        """Values that were not taken, by reason, and those that waited."""
+        left_out = self._board.left_out() if self._board is not None else Counter()
+        return dict(self._frames.assembly.dropped + left_out)
 
     def _end(self) -> None:
         self._worker.send(Farewell())
@@ -405,9 +507,18 @@ class MainLoop:
         self._event_log.close(PERSIST_PATIENCE_S)
         self._worker.wait()
         self._beats.close()
+        self._close_board()
+        self._alarm.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)
         log.info("robot %s ends; its components live on", self._me)
+
+
+def arrived_ns(wall_ns: int) -> int:
+    """When a datagram came that the kernel stamped with this instant of the calendar (0: it did not); now, if in doubt."""
+    now_ns = clock.now_ns()
+    came_ns = clock.of_wall_ns(wall_ns) if wall_ns else now_ns
+    return came_ns if 0 <= now_ns - came_ns <= NANOSECONDS_A_SECOND else now_ns
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:

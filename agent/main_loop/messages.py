@@ -117,7 +117,8 @@ class BeatCounts(msgspec.Struct, frozen=True):
         late_us_max: the longest that a turn of the loop came after its deadline.
         gap_us_max: the longest between two beats of one peer.
         gaps: how many were longer than `agent.main_loop.loop.GAP_BEATS` periods.
-        lost: beats of each peer that did not arrive, in this life of ours.
+        lost: parts of each peer's frames that did not arrive, in this life of ours.
+        items: values of the board that were not taken, by reason; those that waited for room in a frame.
     """
 
     sent: int = 0
@@ -128,6 +129,7 @@ class BeatCounts(msgspec.Struct, frozen=True):
     gap_us_max: int = 0
     gaps: int = 0
     lost: dict[str, int] = {}
+    items: dict[str, int] = {}
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):

@@ -13,12 +13,12 @@ from typing import Final
 from agent.system.connection_quota import plain
 from failover.config.team import split_address
 from failover.core.events import Unread
-from failover.core.wire.codec import Reason, Refused
+from failover.core.frames.frame import Reason, Refused
 
 TOLD_EVERY_NS: Final = 1_000_000_000
 """Between two signs of one robot: a flood of them costs the rules nothing."""
 
-OF_OUR_TEAM: Final = frozenset({Reason.UNKNOWN_KEY, Reason.FORGED, Reason.MALFORMED, Reason.SENDER})
+OF_OUR_TEAM: Final = frozenset({Reason.UNKNOWN_KEY, Reason.FORGED, Reason.MALFORMED, Reason.SENDER, Reason.PART, Reason.ROSTER})
 """Refusals of frames that name our team: also from an address that is no member's they may be those of one."""
 
 OF_A_MEMBER: Final = {
@@ -27,6 +27,8 @@ OF_A_MEMBER: Final = {
     Reason.MALFORMED: "its beats are not understood; install the same release on both",
     Reason.SENDER: "its beats say that another robot sent them; see robot in agent.toml there",
     Reason.UNKNOWN_KEY: "",
+    Reason.PART: "",
+    Reason.ROSTER: "its team.toml is another; copy the same file to both, and start their agents again",
     Reason.FORGED: "",
 }
 """What a refusal says of the member from whose address the frame came; others prove that it was authentic once."""

@@ -48,8 +48,12 @@ def wall_ns(instant_ns: int) -> int:
 
 
 def of_wall_ns(wall_ns: int) -> int:
-    """An instant of this machine's calendar by our clock; only for one so young that the calendar cannot have been set since."""
-    return now_ns() - (time.time_ns() - wall_ns)
+    """An instant of this machine's calendar by our clock; only for one so young that the calendar cannot have been set since.
+
+    It is never told too early, and by at most as much too late as passes between two readings of a clock.
+    """
+    ago_ns = time.time_ns() - wall_ns
+    return now_ns() - ago_ns
 
 
 def kernel_boot() -> str:

@@ -1,6 +1,6 @@
 """The few system calls that a guard needs and that Python does not offer.
 
-Sources: prctl(2), mlock(2), fallocate(2), sigqueue(3), timerfd_create(2).
+Sources: prctl(2), mlock(2), fallocate(2), sigqueue(3).
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import ctypes
 import os
 import resource
 import threading
-import time
 from collections.abc import Iterable
 from typing import Final
 
@@ -20,10 +19,6 @@ MCL_FUTURE: Final = 2
 MCL_ONFAULT: Final = 4
 FALLOC_FL_KEEP_SIZE: Final = 1
 FALLOC_FL_PUNCH_HOLE: Final = 2
-TFD_TIMER_ABSTIME: Final = 1
-TFD_NONBLOCK: Final = os.O_NONBLOCK
-TFD_CLOEXEC: Final = os.O_CLOEXEC
-NS_PER_S: Final = 1_000_000_000
 THREAD_STACK: Final = 256 << 10
 """Bytes; the usual 8 MB are for programs that know nothing of their threads."""
 
@@ -132,35 +127,6 @@ def queue_signal(pid: int, number: int, value: int) -> None:
         OSError: ESRCH, EPERM; EAGAIN where too many wait already.
     """
     _check(_libc.sigqueue(pid, number, ctypes.c_void_p(value)), "sigqueue")
-
-
-class Alarm:
-    """A descriptor that is readable from an instant of CLOCK_BOOTTIME on; a sleep of the machine counts.
-
-    poll(2) counts its patience in the time that the machine was awake: after a sleep it would wait for the rest.
-    """
-
-    def __init__(self) -> None:
-        """
-        Raises:
-            OSError: no descriptor is left.
-        """
-        self._descriptor = _libc.timerfd_create(time.CLOCK_BOOTTIME, TFD_NONBLOCK | TFD_CLOEXEC)
-        _check(self._descriptor, "timerfd_create")
-
-    def fileno(self) -> int:
-        """For poll(2)."""
-        return int(self._descriptor)
-
-    def set(self, at_ns: int | None) -> None:
-        """Ring at this instant, at once if it is over; None: not at all."""
-        seconds, rest_ns = divmod(max(at_ns, 1), NS_PER_S) if at_ns is not None else (0, 0)
-        value = (ctypes.c_long * 4)(0, 0, seconds, rest_ns)  # struct itimerspec: interval, first
-        _check(_libc.timerfd_settime(self._descriptor, TFD_TIMER_ABSTIME, value, None), "timerfd_settime")
-
-    def close(self) -> None:
-        """Give the descriptor back."""
-        os.close(self._descriptor)
 
 
 def _check(result: int, what: str) -> None:

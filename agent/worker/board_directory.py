@@ -20,8 +20,6 @@ from failover.boards import LINK_NAME, boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.items import Item
-from failover.core.wire.codec import team_tag
-from failover.core.wire.names import weight
 from failover.errors import BoardError
 
 DIRECTORY_MODE: Final = 0o755
@@ -31,8 +29,7 @@ PEERS_MODE: Final = 0o640
 
 def place_of(settings: Settings) -> Path:
     """Where this robot's board is."""
-    tag = team_tag(settings.team.team).hex()
-    return directory.SHARED_MEMORY / f"failover-{tag}-{settings.config.robot}"
+    return directory.agents_place(settings.team.team, settings.config.robot)
 
 
 def provide(settings: Settings) -> Path | None:
@@ -48,8 +45,9 @@ def provide(settings: Settings) -> Path | None:
         return None
     place, me = place_of(settings), settings.config.robot
     _make_directory(place)
-    robots = sorted((name for name, robot in settings.team.robots.items() if robot.role == "robot"), key=weight)
-    files = _Files(place, board.digest, _group(board.group), {name: rank for rank, name in enumerate(robots)})
+    ranks = settings.team.roster().ranks
+    robots = [name for name in ranks if settings.team.robots[name].role == "robot"]
+    files = _Files(place, board.digest, _group(board.group), ranks)
     for name in robots:
         if name != me:
             files.have(f"{directory.PEER_PREFIX}{name}", layout.PEER, name, board.shared_by(name))

@@ -39,7 +39,7 @@ from checkpoint.runtime import allocator
 from failover.client.control import SOCKET_NAME
 from failover.core import acts, events
 from failover.core.events import Event
-from failover.core.wire.codec import KEY_SIZE_MIN
+from failover.core.frames.frame import KEY_SIZE_MIN
 from failover.core.wire.messages import VERSION, Bulk, Errand, ErrandDone, Goodbye, Hello
 
 ALIVE_S: Final = 0.5

@@ -35,7 +35,7 @@ class RobotState(Struct, frozen=True):
     Attributes:
         state: "run", "insert" and "remove" are robots that are heard, or were a moment ago; "not": it is not there.
         age_ns: since its newest frame came; None: none has. 0 for this robot.
-        rank: its place in the order of the team's robots.
+        rank: its place among all members of the team, in the order of their names.
     """
 
     state: str

@@ -19,6 +19,7 @@ from failover.client.control import socket_path
 from failover.core.board import layout
 from failover.core.board.items import ITEMS_MAX, Item
 from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
+from failover.core.wire.codec import team_tag
 from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError
 
@@ -42,6 +43,11 @@ def find() -> Path:
     if link.exists():
         return link
     return SHARED_MEMORY / f"failover-u{os.geteuid()}-{this_robot()}"
+
+
+def agents_place(team: str, robot: str) -> Path:
+    """Where the agent of a robot of a team has the board: robots on one machine, and teams, have one each."""
+    return SHARED_MEMORY / f"failover-{team_tag(team).hex()}-{robot}"
 
 
 def this_robot() -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Final
 
@@ -55,6 +56,17 @@ def wait(address: int, value: int, timeout_s: float) -> None:
 def wake(address: int) -> None:
     """Wake all that sleep on the 32 bits at ``address``."""
     _call()(_number(), ctypes.c_void_p(address), _WAKE, _ALL, None, None, 0)
+
+
+def waker(address: int) -> Callable[[], None]:
+    """The same for a place that is woken often; the mapping must outlive it. It never blocks, so it keeps the interpreter."""
+    call = ctypes.PyDLL(None).syscall
+    number, where, what, how_many = ctypes.c_long(_number()), ctypes.c_void_p(address), ctypes.c_int(_WAKE), ctypes.c_int(_ALL)
+
+    def wake() -> None:
+        call(number, where, what, how_many)
+
+    return wake
 
 
 @lru_cache(maxsize=1)

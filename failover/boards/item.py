@@ -23,7 +23,7 @@ from failover.boards import boottime, futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import ages, layout
-from failover.core.board.banks import EPOCH_SHIFT, LOW_HALF, UNKNOWN, Found, Get, Put, Reading, Remember, Writer, get_carefully
+from failover.core.board.banks import EPOCH_SHIFT, UNKNOWN, Found, Get, Put, Reading, Remember, Writer, get_carefully
 from failover.core.board.banks import reader as reader_of
 from failover.core.board.banks import writer as writer_of
 from failover.core.board.item_types import OPAQUE, Opaque, canonical, parse, size_of
@@ -424,16 +424,16 @@ class Item:
     def _sleep(self, robot: str | None, known: int, timeout_s: float) -> bool:
         """Sleep for a while, or until the newest put is another one than ``known``; whether it is."""
         source = self.source(robot)
-        place, at = source.place, source.record.at
-        newest = place.words[place.newest]
-        if newest in (0, known) and timeout_s > 0:
-            if source.file.is_writable:
-                source.file.area[at + layout.WAITERS_FIELD] = 1
-            newest = place.words[place.newest]
-            if newest in (0, known):
-                futex.wait(source.file.address(at + layout.NEWEST_FIELD), newest & LOW_HALF, timeout_s)
-                newest = place.words[place.newest]
-        return newest not in (0, known)
+        file, place, at = source.file, source.place, source.record.at
+        is_peer = bool(file.header.flags & layout.PEER)
+        if place.words[place.newest] in (0, known) and timeout_s > 0:
+            if file.is_writable and not is_peer:
+                file.area[at + layout.WAITERS_FIELD] = 1
+            word = layout.CHANGED_AT if is_peer else at + layout.NEWEST_FIELD
+            before = file.word32(word)
+            if place.words[place.newest] in (0, known):
+                futex.wait(file.address(word), before, timeout_s)
+        return place.words[place.newest] not in (0, known)
 
     async def changes(self, robot: str | None = None) -> AsyncIterator[Reading]:
         """Each new value from now on. A value that is replaced before it is read is not seen: an item is a state."""

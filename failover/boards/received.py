@@ -2,20 +2,34 @@
 
 One thread of one process uses it. Nothing here waits, and no frame can do harm: what does not fit is counted and dropped.
 
-A robot that has started anew counts its puts from 1 again. For it the receiver makes the file anew (`directory.dismiss`, then
-`directory.make_file`): its readers go there by themselves, and no number stands for two values in one file.
+Puts have numbers of this file's own, one after the other. The writer's numbers only tell a new put from a repeated one. They skip
+puts that no frame carried; one that is greater by a multiple of the banks would go into the bank that readers read.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Final
 
 from failover.boards import futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
-from failover.core.board.banks import Place, put_carefully
+from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
+from failover.core.board.banks import put_carefully
 from failover.core.board.layout import Record
+from failover.core.frames.frame import Portion
+
+UNKNOWN: Final = "items with numbers that are not known here"
+MISFIT: Final = "values of another size than declared"
+
+_GENERATION: Final = layout.GENERATION_AT // 8
+_CHANGED: Final = layout.CHANGED_AT // 8
+
+Take = Callable[[int, bytes, int, int, int], bool | None]
+"""``(number, value, stamp_ns, error_us, round)`` → whether it was put; None: it does not fit."""
 
 
 class ReceivedItems:
@@ -23,11 +37,14 @@ class ReceivedItems:
 
     Attributes:
         file: as mapped.
+        dropped: by reason.
     """
 
     def __init__(self, file: MappedFile) -> None:
         self.file = file
-        self._items: dict[int, tuple[Record, Place]] = {}
+        self.dropped: Counter[str] = Counter()
+        self._items: dict[int, Take] = {}
+        self._wake = futex.waker(file.address(layout.CHANGED_AT))
         self._generation = -1
 
     @classmethod
@@ -39,49 +56,84 @@ class ReceivedItems:
         """
         return cls(MappedFile.open(path, writable=True))
 
-    def heard(self, state: int, came_ns: int) -> None:
-        """Note a frame from the robot, whatever it carried; ``state``: `layout.NOT` … `layout.REMOVE`, ``came_ns``: BOOTTIME."""
-        self.file.set_word32(layout.STATE_AT, state)
+    def begin_life(self) -> None:
+        """The robot's agent began anew, and perhaps its board with it: its puts are counted from any number."""
+        self._generation = -1
+
+    def heard(self, came_ns: int) -> None:
+        """Note a frame from the robot, whatever it carried; ``came_ns``: BOOTTIME."""
         self.file.words[layout.HEARD_AT // 8] = came_ns
 
-    def put(self, item: int, number: int, value: bytes, stamp_ns: int, error_us: int, *, lost: int = 0, round: int = 0) -> bool:
-        """Take an item out of a frame.
+    def tell_state(self, state: int) -> None:
+        """Whether the robot is there: `layout.NOT` … `layout.REMOVE`."""
+        self.file.set_word32(layout.STATE_AT, state)
+
+    def take(self, items: Iterable[Portion], came_ns: int, error_us: int, round_: int) -> int:
+        """Put what a frame brought.
 
         Args:
-            item, number: of the item, and of the put by its writer.
-            stamp_ns, error_us: as `failover.core.board.ages.received` says.
-            lost: frames with it that were missed since the last one.
-            round: of the sender.
+            items: whole values, with their ages when the frame left.
+            came_ns: when the frame came; BOOTTIME.
+            error_us: how much older the values may be than these two say; `NO_ERROR_BOUND`: not known.
+            round_: of the sender; frames with an item that were missed since the last one are counted by it.
 
         Returns:
-            Whether it was put: False for an item that is not known, a value that does not fit, and a put that is not newer.
+            How many were put. The others are not known here, do not fit, or are not newer than what is there.
         """
-        found = self._known().get(item)
-        if found is None:
+        if self.file.words[_GENERATION] != self._generation:
+            self._generation = self.file.generation
+            self._items = {record.id: _taker(self.file, record) for record in self.file.records()}
+        known, puts = self._items.get, 0
+        for item in items:
+            take = known(item.number)
+            if take is None:
+                self.dropped[UNKNOWN] += 1
+                continue
+            age_us = item.age_us
+            stamp_ns = came_ns - age_us * NS_PER_US
+            error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
+            is_put = take(item.put, item.value, stamp_ns if stamp_ns > 0 else 0, error, round_)
+            if is_put:
+                puts += 1
+            elif is_put is None:
+                self.dropped[MISFIT] += 1
+        if puts:
+            self.file.words[_CHANGED] += 1
+            self._wake()  # once for all of them: programs that read this file cannot say that they wait, nor for what
+        return puts
+
+    def bound(self, compute: Callable[[int], int]) -> None:
+        """Tell how old each item may be while all works, used where none is declared.
+
+        Args:
+            compute: the bound in ns of an item with this period, by `failover.core.board.ages.bound_ns`.
+        """
+        for record in self.file.records():
+            self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = compute(record.period)
+
+
+def _taker(file: MappedFile, record: Record) -> Take:
+    place = file.place(record)
+    words, newest, least, limit, base = place.words, place.newest, place.least, place.limit, record.at // 8
+    frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
+    lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
+    period, following, last_number, last_round = record.period, words[newest] + 1, 0, -1
+
+    def take(number: int, value: bytes, stamp_ns: int, error_us: int, round_: int) -> bool | None:
+        nonlocal following, last_number, last_round
+        words[frames] += 1
+        words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error_us
+        if 0 <= last_round < round_ - period:
+            words[lost] += (round_ - last_round) // period - 1
+        last_round = round_
+        if not least <= len(value) <= limit:
+            words[refused] += 1
+            return None
+        if number <= last_number:
             return False
-        record, place = found
-        words, base = place.words, record.at // 8
-        words[base + layout.FRAMES_FIELD // 8] += 1
-        words[base + layout.LOST_FIELD // 8] += lost
-        self.file.set_word32(record.at + layout.TRANSIT_FIELD, error_us)
-        self.file.set_word32(record.at + layout.ROUND_FIELD, round & 0xFFFF_FFFF)
-        if not place.least <= len(value) <= place.limit:
-            words[base + layout.REFUSED_FIELD // 8] += 1
-            return False
-        if number <= words[place.newest]:
-            return False
-        put_carefully(place, number, value, stamp_ns, error_us, FENCE)
-        futex.wake(self.file.address(record.at + layout.NEWEST_FIELD))  # who reads cannot say that it waits
+        last_number = number
+        put_carefully(place, following, value, stamp_ns, error_us, FENCE)
+        following += 1
         return True
 
-    def bound(self, item: int, bound_ns: int) -> None:
-        """How old an item may be while all works, by `failover.core.board.ages.bound_ns`; used where none is declared."""
-        found = self._known().get(item)
-        if found is not None:
-            found[1].words[found[1].formula] = bound_ns
-
-    def _known(self) -> dict[int, tuple[Record, Place]]:
-        if self.file.generation != self._generation:
-            self._items = {record.id: (record, self.file.place(record)) for record in self.file.records()}
-            self._generation = self.file.generation
-        return self._items
+    return take

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from failover.config import strict_toml
 from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
+from failover.core.frames.roster import Roster, roster
 from failover.core.wire import names
 from failover.errors import NameFormatError, TeamFileError
 
@@ -73,6 +74,10 @@ class Team:
         Its `Board.terms` are part of the roster's digest: robots with different boards do not read each other's frames.
         """
         return board_of(self.board, lambda keys: f"{TEAM_FILE}: {'.'.join(keys)}")
+
+    def roster(self) -> Roster:
+        """All members by rank: what frames, the files of the board and the C header mean by a member's number."""
+        return roster(self.robots, self.items().terms if self.board.items else b"")  # no board: its modules are not loaded
 
 
 def read(directory: Path) -> Team:

@@ -1,11 +1,12 @@
-"""Builds a robot's heartbeat: chooses its entries so that they fit one datagram and each is sent in turn."""
+"""Builds a robot's heartbeat: chooses its entries so that they fit one part of a frame and each is sent in turn."""
 
 from __future__ import annotations
 
 from failover.core.component import Component
 from failover.core.election.consent import STATES
+from failover.core.frames.frame import beat_size_max
 from failover.core.types import EPOCH_MAX, HOLDING, Rule, State
-from failover.core.wire.codec import BODY_SIZE_MAX, beat_size, entry_size
+from failover.core.wire.codec import beat_size, entry_size
 from failover.core.wire.messages import (
     BEGUN,
     FREE,
@@ -69,12 +70,13 @@ def urgent(entry: Entry, before: Entry | None) -> bool:
 
 
 class Speaker:
-    """Makes the beats of one life of one robot. ``counter`` is that of the last one made."""
+    """Makes the beats of one life of one robot in a team of so many. ``counter`` is that of the last one made."""
 
-    def __init__(self, me: str, boot: int, rule: Rule = Rule.PAIR) -> None:
+    def __init__(self, me: str, boot: int, rule: Rule = Rule.PAIR, members: int = 2) -> None:
         self._me = me
         self._boot = boot
         self._rule = RULES.index(rule)
+        self._size_max = beat_size_max(members)
         self.counter = 0
         self._settled = 0
         self._said: dict[str, tuple[Entry, int]] = {}
@@ -112,7 +114,7 @@ class Speaker:
         )
 
     def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:
-        room = BODY_SIZE_MAX - beat_size(empty) - BEAT_OVERHEAD
+        room = self._size_max - beat_size(empty) - BEAT_OVERHEAD
         chosen: list[Entry] = []
         for entry in entries:
             room -= entry_size(entry)

@@ -14,7 +14,7 @@ class Tick(Struct, frozen=True):
 
 
 class Received(Struct, frozen=True):
-    """A beat that passed ``wire.Receiver``: whole, authentic, of our team and version, not seen before.
+    """A beat that passed ``frames.frame.Receiver``: whole, authentic, of our team and version, not seen before.
 
     Attributes:
         link: name of the link it came over.

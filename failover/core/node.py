@@ -92,7 +92,7 @@ class Node:
         self._last_beat_ns = now_ns - URGENT_GAP_NS
         self._durable = vote_record
         self._team = Membership(config, boot, now_ns)
-        self._speaker = Speaker(config.robot, boot, config.rule)
+        self._speaker = Speaker(config.robot, boot, config.rule, len(config.peers) + 1)
         self._watch = Watch()
         self._testimony = Testimony()
         self._outlivers: set[str] = set()

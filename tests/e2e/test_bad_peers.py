@@ -13,8 +13,8 @@ import pytest
 
 from agent.worker.network.replication_link import new_keys
 from failover.config import team
-from failover.core.wire import codec
-from failover.core.wire.codec import Reason
+from failover.core.frames.frame import HEADER, NUMBER_SIZE, SEAL_SIZE, Body, Reason, Sealer, bodies, body_size_max
+from failover.core.frames.roster import roster
 from failover.core.wire.messages import Beat, Entry
 from tests.e2e import robots, stranger
 from tests.e2e.robots import RobotMachine
@@ -23,10 +23,15 @@ HOLD = '[components."/demo/robot1/count"]\non_loss = "hold"\n'
 """What happens to robot2 here must not make it take over."""
 
 COUNT = "import time\nfor i in range(1000000):\n    print(i, flush=True)\n    time.sleep(0.01)\n"
-HEAD = 32
-"""Bytes of a frame before its body; the last 16 are its authentication code."""
+HEAD = HEADER.size + SEAL_SIZE
+"""Bytes of a frame before its body, in a team of two."""
 
-OTHER_VERSION = "from failover.core.wire import messages\nmessages.VERSION += 1\n"
+OTHER_VERSION = """
+from failover.core.frames import frame
+from failover.core.wire import messages
+messages.VERSION += 1
+frame.VERSION += 1
+"""
 """Run by every Python of an agent before anything else: a release of another protocol version."""
 
 Pair = tuple[RobotMachine, RobotMachine]
@@ -105,19 +110,25 @@ def claim(boot: int) -> Beat:
     return Beat("robot2", boot, 1, 1, 0, 1, (), (Entry("/demo/robot1/count", 3, 1 << 30, "robot2"),))
 
 
+def sealed(beat: Beat, team_name: str, key: bytes) -> bytes:
+    """A frame of robot2's with this beat."""
+    parts, _ = bodies(None, beat, (), 0, body_size_max(2))
+    return Sealer(beat.sender, team_name, roster(("robot1", "robot2")), beat.boot).seal(parts, [key])[0]
+
+
 def test_invented_beats_change_nothing_and_are_counted(pair: Pair) -> None:
     before, stood = refused(pair[0]), standing(pair)
-    own = codec.seal(claim(1 << 20), "demo", bytes(range(32)))
+    own = sealed(claim(1 << 20), "demo", bytes(range(32)))
     invented = {
         Reason.UNKNOWN_KEY: own,
-        Reason.TEAM: codec.seal(claim(1 << 20), "neighbours", bytes(range(32))),
+        Reason.TEAM: sealed(claim(1 << 20), "neighbours", bytes(range(32))),
         Reason.VERSION: own[:2] + b"\x07" + own[3:],
         Reason.NOT_OURS: b"GET / HTTP/1.1\r\n\r\n" * 3,
     }
     stranger.send(pair[0], [frame for frame in invented.values() for _ in range(20)])
     until_refused(pair[0], before, dict.fromkeys(invented, 20))
     assert standing(pair) == stood
-    until_said(pair[0], "beats refused", "beats were refused: ", "another version", "another team", "not a beat")
+    until_said(pair[0], "beats refused", "beats were refused: ", "another version", "another team", "not a frame")
 
 
 @pytest.mark.root
@@ -129,12 +140,13 @@ def test_recorded_beats_altered_or_repeated_change_nothing_and_are_counted(pair:
     until_refused(pair[0], before, {Reason.REPLAYED: 50})
     forged = []
     for frame in recorded:
-        beat = msgspec.msgpack.decode(frame[HEAD:], type=Beat)
-        for boot in (beat.boot, beat.boot + 1):
-            forged.append(frame[:HEAD] + msgspec.msgpack.encode(claim(boot)))
-            higher = msgspec.structs.replace(beat, boot=boot, counter=beat.counter + 1_000)
-            forged.append(frame[:HEAD] + msgspec.msgpack.encode(higher))
-        place = dice.randrange(HEAD - 16, len(frame))
+        body = msgspec.msgpack.decode(frame[HEAD:], type=Body)
+        assert body.beat is not None
+        for boot in (body.beat.boot, body.beat.boot + 1):
+            higher = msgspec.structs.replace(body.beat, boot=boot, counter=body.beat.counter + 1_000)
+            for beat in (claim(boot), higher):
+                forged.append(frame[:HEAD] + msgspec.msgpack.encode(msgspec.structs.replace(body, beat=beat)))
+        place = dice.randrange(HEADER.size + NUMBER_SIZE, len(frame))
         forged.append(frame[:place] + bytes([frame[place] ^ 1 << dice.randrange(8)]) + frame[place + 1 :])
     stranger.send(pair[0], forged)
     until_refused(pair[0], before, {Reason.FORGED: len(forged)})
@@ -190,8 +202,8 @@ def test_a_peer_of_another_version_is_refused_in_words_at_both_robots(pair: Pair
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSION)
     robots.stop_agent(second)
     robots.start_agent(second, PYTHONPATH=str(tmp_path))
-    until_said(first, "robot2 speaks version 2, this robot 1; install the same release on both", "running, unprotected")
-    until_said(second, "robot1 speaks version 1, this robot 2; install the same release on both")
+    until_said(first, "robot2 speaks version 3, this robot 2; install the same release on both", "running, unprotected")
+    until_said(second, "robot1 speaks version 2, this robot 3; install the same release on both")
     robots.until(
         lambda: refused(first).get(Reason.VERSION, 0) > 0 or refused(second).get(Reason.VERSION, 0) > 0, "beats to be refused"
     )

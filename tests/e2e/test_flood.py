@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from failover.core.wire.codec import MAGIC
+from failover.core.frames.frame import MAGIC
 from tests.e2e import robots, stranger
 from tests.e2e.robots import RobotMachine
 

@@ -6,6 +6,7 @@ from random import Random
 from unittest.mock import patch
 
 from failover.core import beat_builder
+from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
@@ -23,9 +24,9 @@ LOOK_NS = 250 * MS
 """Between two looks whether a healed world is well."""
 
 NARROW = 5
-"""Every so many-th seed has frames that hold one entry, so that components are told of in turn."""
+"""Every so many-th seed has beats that hold one entry, so that components are told of in turn."""
 
-NARROW_BODY_SIZE = 130
+NARROW_BEAT_SIZE = 130
 ECHO_SIZE = 14
 
 SELDOM = 7
@@ -83,8 +84,9 @@ def life(
     configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
-    narrow = NARROW_BODY_SIZE + ECHO_SIZE * (len(configs) - 2)
-    with patch.object(beat_builder, "BODY_SIZE_MAX", beat_builder.BODY_SIZE_MAX if seed % NARROW else narrow):
+    narrow = NARROW_BEAT_SIZE + ECHO_SIZE * (len(configs) - 2)
+    size_max = beat_size_max if seed % NARROW else lambda _: narrow
+    with patch.object(beat_builder, "beat_size_max", size_max):
         return _live(seed, random, configs, specs, faults, liars=liars)
 
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Final
 from msgspec.structs import replace
 
 from failover.core.election.consent import STATES
+from failover.core.frames.frame import beat_size_max
 from failover.core.types import COMPONENTS_MAX, EPOCH_MAX, State
-from failover.core.wire.codec import BODY_SIZE_MAX, beat_size
+from failover.core.wire.codec import beat_size
 from failover.core.wire.messages import FREE, OPEN, ORDERED, STARTS, WANTS, Beat, Echo, Entry
 
 if TYPE_CHECKING:
@@ -193,9 +194,9 @@ def others_name(world: World, beat: Beat, to: str) -> Beat:
     return replace(finishes(world, beat, to), sender=_robot(world, beat.sender))
 
 
-def fitting(beat: Beat) -> Beat:
+def fitting(beat: Beat, members: int) -> Beat:
     """As much of it as a frame holds: a longer one nobody reads."""
-    while beat.entries and beat_size(beat) > BODY_SIZE_MAX:
+    while beat.entries and beat_size(beat) > beat_size_max(members):
         beat = replace(beat, entries=beat.entries[:-1])
     return beat
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from checkpoint.model import Position
 from failover.core.event_log.decisions import Decision
 from failover.core.events import Event
+from failover.core.frames.lane import FrameLane
 from failover.core.node import Node
 from failover.core.types import MS, Config, Launch, VoteRecord
 from failover.core.vote_record import decode
-from failover.core.wire import codec
 from tests.simulation.liars import Lie
 
 TEAM = "simulated"
@@ -72,6 +72,7 @@ class Robot:
     Attributes:
         lacks: what it says that it lacks when it is asked; None: something now and then.
         lie: what becomes of its beats on their way, while somebody else has its key.
+        lane: the frames of this life.
         read: robots whose beats it has authenticated in this life; ``unread_ns``: when it last received what it could not.
     """
 
@@ -91,7 +92,7 @@ class Robot:
     unheld: set[str] = field(default_factory=set)
     warm: dict[str, Launch] = field(default_factory=dict)
     inbox: list[Event] = field(default_factory=list)
-    receiver: codec.Receiver = field(default_factory=lambda: codec.Receiver(TEAM))
+    lane: FrameLane | None = None
     read: set[str] = field(default_factory=set)
     unread_ns: dict[str, int] = field(default_factory=dict)
     life: int = 0

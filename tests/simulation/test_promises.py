@@ -156,8 +156,10 @@ def test_except_where_when_alone_is_freeze_there_it_stands_still_here_first() ->
 
 def test_a_robot_whose_beats_are_refused_counts_as_silent_so_it_can_run_twice_as_in_a_cut() -> None:
     two = team()
-    two.world.robots["robot2"].receiver.accept("robot1", b"another key, of another life")
-    two.world.robots["robot2"].receiver.accept("robot1", b"and one more: the old is forgotten")
+    lane = two.world.robots["robot2"].lane
+    assert lane is not None
+    lane.hear("robot1", b"another key, of another life")
+    lane.hear("robot1", b"and one more: the old is forgotten")
     assert set(two.after(500)) == {"robot2"} or set(two.after(0)) == {"robot1", "robot2"}
 
 

@@ -17,10 +17,12 @@ from msgspec.structs import replace
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.events import Event, Exited, Received, Tick, Unread
+from failover.core.frames.lane import FrameLane, Heard
+from failover.core.frames.roster import roster
 from failover.core.node import Node
 from failover.core.types import MS, Config, Found, Held, VoteRecord
 from failover.core.vote_record import decode, encode
-from failover.core.wire import codec
+from failover.core.wire.messages import Beat
 from tests.simulation.deeds import Deeds
 from tests.simulation.liars import fitting
 from tests.simulation.robots import KEEPS_STATE, KEY, TEAM, Clock, Network, NewDisk, Program, Robot
@@ -107,15 +109,17 @@ class World:
             return
         robot.boot += 1
         robot.life += 1
-        robot.inbox, robot.busy, robot.receiver = [], False, codec.Receiver(TEAM)
+        robot.inbox, robot.busy = [], False
         robot.read.clear()
         robot.unread_ns.clear()
         robot.admitted.clear()
         robot.capturing.clear()
         robot.keeper.clear()
+        robot.lane = FrameLane(name, TEAM, roster(self.robots), robot.boot, robot.config.beat_ms * 1_000)
         for other in self.robots:
             if other != name:
-                robot.receiver.accept(other, KEY + other.encode())
+                robot.lane.hear(other, KEY + other.encode())
+                robot.lane.speak(other, KEY + name.encode())
         keep = {
             record.name
             for record in decode(robot.vote_record).records
@@ -276,10 +280,7 @@ class World:
         robot.told += ready.told
         for beat in ready.send:
             self._tell(robot.name, beat)
-            for other in self.robots.values():
-                if other is not robot:
-                    said = fitting(robot.lie(self, beat, other.name)) if robot.lie is not None else beat
-                    self._transmit(robot.name, other, codec.seal(said, TEAM, KEY + robot.name.encode()))
+            self._send(robot, beat)
         for act in ready.act:
             self._tell(robot.name, act)
             self._deeds.carry_out(robot, act)
@@ -287,6 +288,19 @@ class World:
             self.after(0, lambda: self._work(robot))
         elif robot.node is not None:
             self.at(robot.clock.true(robot.node.next_deadline_ns()), lambda: self._work(robot))
+
+    def _send(self, robot: Robot, beat: Beat) -> None:
+        """One frame for all; whoever lies makes one for each."""
+        assert robot.lane is not None
+        others = [other for other in self.robots.values() if other is not robot]
+        for part in others if robot.lie is not None else [None]:
+            said = beat if robot.lie is None or part is None else fitting(robot.lie(self, beat, part.name), len(self.robots))
+            made, _ = robot.lane.seal(said, (), self.local(robot))
+            for sealed in made:
+                for other in others if part is None else [part]:
+                    if other.name in sealed.to:
+                        for datagram in sealed.datagrams:
+                            self._transmit(robot.name, other, datagram)
 
     # The network
 
@@ -317,7 +331,8 @@ class World:
             robot.unread_ns[sender] = self.now_ns
             self.feed(robot, self._unread(sender, robot))
             return
-        beat = robot.receiver.open(frame)
-        if not isinstance(beat, codec.Refused):
+        assert robot.lane is not None
+        heard = robot.lane.open(frame, self.local(robot))
+        if isinstance(heard, Heard) and heard.part.beat is not None:
             robot.read.add(sender)
-            self.feed(robot, Received(beat, "wire"))
+            self.feed(robot, Received(heard.part.beat, "wire"))

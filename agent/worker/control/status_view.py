@@ -110,6 +110,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
             "late_us_max": beats.late_us_max,
             "gap_us_max": beats.gap_us_max,
             "gaps": beats.gaps,
+            "items": dict(beats.items),
         },
         "lanes_pid": os.getpid(),
     }

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -43,7 +44,7 @@ def header(arguments: argparse.Namespace) -> int:
     board = members.items()
     text = c_header(board, members.team)
     if arguments.rtdb:
-        text += _rtdb_names(board, sorted_robots(members))
+        text += _rtdb_names(board, members.roster().names)
     if arguments.json:
         items = [
             {"number": number, "name": item.name, "size": item.size, "type": item.as_words()["type"]}
@@ -56,15 +57,8 @@ def header(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def sorted_robots(members: team.Team) -> list[str]:
-    """The members by rank."""
-    from failover.core.wire.names import weight
-
-    return sorted(members.robots, key=weight)
-
-
-def _rtdb_names(board: Board, robots: list[str]) -> str:
-    """Numbers of items and agents under their own names, as programs written for CAMBADA use them."""
+def _rtdb_names(board: Board, robots: Sequence[str]) -> str:
+    """Numbers of items and agents (their ranks) under their own names, as programs written for CAMBADA use them."""
     from failover.core.board.c_header import macro_of
 
     numbered = [(item.name, number) for number, item in enumerate(board.items)] + list(

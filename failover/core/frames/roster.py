@@ -52,7 +52,7 @@ class Roster(Struct, frozen=True, dict=True):
 
     @functools.cached_property
     def digest(self) -> int:
-        """64 bits over names and terms, each with its length before it; the board's header holds all, a frame the low 32."""
+        """64 bits over names and terms, each with its length before it; a frame holds the low 32."""
         hashed = blake2b(digest_size=8, person=_PERSON)
         for text in (self.terms, *(name.encode() for name in self.names)):
             hashed.update(len(text).to_bytes(4, "little") + text)

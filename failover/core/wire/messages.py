@@ -12,8 +12,8 @@ import msgspec
 from checkpoint.model import Position
 from failover.core.types import ComponentSpec, Rule
 
-VERSION = 1
-"""Of heartbeats and of the replication link; a peer of another version is refused by name."""
+VERSION = 2
+"""Of the replication link; a peer of another version is refused by name."""
 
 
 class Echo(msgspec.Struct, frozen=True, array_like=True):

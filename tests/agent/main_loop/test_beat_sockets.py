@@ -13,7 +13,7 @@ import pytest
 from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
 from agent.system import clock
 from failover.config.team import Robot
-from failover.core.wire.codec import FRAME_SIZE_MAX, MAGIC
+from failover.core.frames.frame import FRAME_SIZE_MAX, MAGIC
 
 PATIENCE_MS = 10_000
 BEAT = MAGIC + b" and so on"

@@ -1,14 +1,13 @@
-"""A heartbeat arrives once over each link of its sender; a second copy over one link is a replay."""
+"""A frame arrives once over each link of its sender; a second copy over one link is a replay."""
 
 from __future__ import annotations
 
-from agent.main_loop.duplicate_beats import RECENT_BEATS, Copies
-from failover.core.wire.codec import Reason, Refused
-from failover.core.wire.messages import Beat
+from agent.main_loop.duplicate_beats import RECENT_PARTS, Copies
+from failover.core.frames.frame import Part, Reason, Refused
 
 
-def beat(counter: int, boot: int = 1) -> Beat:
-    return Beat("robot1", boot, counter)
+def beat(counter: int, boot: int = 1) -> Part:
+    return Part("robot1", True, 0, 0, 0, boot, counter, 0, 0, 1, None, None, (), 0)
 
 
 def again(counter: int, reason: Reason = Reason.REPLAYED) -> Refused:
@@ -33,7 +32,7 @@ def test_what_comes_a_second_time_over_the_link_that_brought_it_is_a_replay() ->
 
 def test_a_copy_of_a_beat_long_past_is_a_replay() -> None:
     copies = Copies()
-    for counter in range(1, RECENT_BEATS + 2):
+    for counter in range(1, RECENT_PARTS + 2):
         copies.heard(beat(counter), "eth0")
     assert not copies.admit(again(1), "wlan0", 100)
     assert copies.admit(again(2), "wlan0", 100)

@@ -6,7 +6,7 @@ import pytest
 
 from agent.main_loop.unauthenticated_beats import TOLD_EVERY_NS, UnreadBeats
 from failover.core.events import Unread
-from failover.core.wire.codec import Reason, Refused
+from failover.core.frames.frame import Reason, Refused
 
 THERE = ("10.0.0.2", 7420)
 BEATS = {"robot2": ("10.0.0.2:7420", "10.0.1.2:7420"), "robot3": ("10.0.0.3:7420",)}

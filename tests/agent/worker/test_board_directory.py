@@ -81,8 +81,8 @@ def test_the_declared_items_lie_in_the_files_of_their_robots(folder: Path) -> No
         board.item("ball").put({"x": 1.0, "y": 2.0})
         board.item("notes").put(["a"])
         assert {name: (robot.state, robot.rank) for name, robot in board.robots().items()} == {
-            "robot1": ("run", 0),
-            "robot2": ("not", 1),
+            "robot1": ("run", 1),  # the witness has rank 0: ranks are those of the roster
+            "robot2": ("not", 2),
         }
         with pytest.raises(failover.NeverWrittenError):
             board.item("ball").get("robot2")

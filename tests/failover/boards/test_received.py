@@ -11,8 +11,9 @@ import pytest
 import failover
 from failover.boards import directory
 from failover.boards.received import ReceivedItems
-from failover.core.board import ages, layout
+from failover.core.board import layout
 from failover.core.board.items import Item
+from failover.core.frames.frame import Portion
 from failover.errors import NeverWrittenError
 
 BALL = Item("ball", {"x": "f8"})
@@ -23,19 +24,24 @@ def now() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
+def put(received: ReceivedItems, item: int, number: int, value: bytes, round_: int = 0) -> bool:
+    """As a frame that comes now brings it."""
+    return bool(received.take([Portion(item, 0, number, value)], now(), 0, round_))
+
+
 def test_a_frame_brings_a_value_with_its_age_and_an_upper_bound(place: Path) -> None:
     with failover.board() as board:
         ball = board.add(BALL)
         received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}, rank=1))
         came = now()
-        received.heard(layout.RUN, came)
-        stamp_ns, error_us = ages.received(20_000, came, transit_max_us=500)
-        assert received.put(7, 1, ONE, stamp_ns, error_us, lost=2, round=9)
+        received.heard(came)
+        received.tell_state(layout.RUN)
+        assert received.take([Portion(7, 20_000, 1, ONE)], came, 501, 9) == 1
         reading = ball.get("robot2")
         assert reading.value == {"x": 1.0} and not reading.stale
         assert 20_000_000 <= reading.age_ns <= now() - came + 20_000_000
         assert reading.age_max_ns == reading.age_ns + 501_000
-        received.bound(7, 20_000_001)
+        received.bound(lambda period: period * 20_000_001)
         assert ball.get("robot2").stale
         state = board.robots()["robot2"]
         assert state.state == "run" and state.age_ns is not None and state.age_ns <= now() - came
@@ -48,8 +54,8 @@ def test_what_does_not_fit_changes_nothing(place: Path, item: int, number: int, 
     with failover.board() as board:
         ball = board.add(BALL)
         received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
-        assert received.put(7, 1, ONE, now(), 0)
-        assert not received.put(item, number, value, now(), 0)
+        assert put(received, 7, 1, ONE)
+        assert not put(received, item, number, value)
         assert (ball.get("robot2").value, ball.get("robot2").number) == ({"x": 1.0}, 1)
 
 
@@ -57,12 +63,12 @@ def test_an_item_that_is_added_to_the_file_is_known_at_once(place: Path) -> None
     with failover.board() as board:
         later = board.add(Item("later", size=4))
         received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
-        assert not received.put(8, 1, b"x", now(), 0)
+        assert not put(received, 8, 1, b"x")
         with pytest.raises(failover.BoardError, match="no item 'later'"):
             later.get("robot2")
         with received.file.changing():
             received.file.add(layout.wanted_of(Item("later", size=4), 8))
-        assert received.put(8, 1, b"x", now(), 0)
+        assert put(received, 8, 1, b"x")
         assert later.get("robot2").value == b"x"
 
 
@@ -70,14 +76,48 @@ def test_a_robot_that_started_anew_has_a_new_file_and_its_readers_go_there(place
     with failover.board() as board:
         ball = board.add(BALL)
         first = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
-        assert first.put(7, 1000, ONE, now(), 0)
-        assert ball.get("robot2").number == 1000
+        assert put(first, 7, 1000, ONE)
+        assert ball.get("robot2").number == 1
         directory.dismiss(board.directory / "peer-robot2")
         again = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
         with pytest.raises(NeverWrittenError):
             ball.get("robot2")
-        assert again.put(7, 1, TWO, now(), 0)
-        assert (ball.get("robot2").number, ball.wait("robot2", after=1000, timeout=60).value) == (1, {"x": 2.0})
+        assert put(again, 7, 1, TWO)
+        assert ball.get("robot2").value == {"x": 2.0}
+
+
+def test_puts_that_no_frame_carried_do_not_overwrite_the_bank_that_is_read(place: Path) -> None:
+    """Every second put comes: with two banks they all have the same place by the writer's number."""
+    with failover.board() as board:
+        ball = board.add(BALL)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        places = set()
+        for number in range(2, 10, 2):
+            assert put(received, 7, number, ONE)
+            places.add(ball.get("robot2").number % 2)
+        assert places == {0, 1}
+
+
+def test_frames_that_were_missed_are_counted_by_the_senders_rounds(place: Path) -> None:
+    with failover.board() as board:
+        item = Item("ball", {"x": "f8"}, period=2)
+        board.add(item)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: item}))
+        for number, round_ in enumerate((2, 4, 10, 12, 11), 1):
+            put(received, 7, number, ONE, round_)
+        (record,) = received.file.records()
+        assert [received.file.words[(record.at + field) // 8] for field in (layout.FRAMES_FIELD, layout.LOST_FIELD)] == [5, 2]
+
+
+def test_a_robot_that_began_another_life_counts_from_any_number(place: Path) -> None:
+    with failover.board() as board:
+        ball = board.add(BALL)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        assert put(received, 7, 1000, ONE)
+        assert not put(received, 7, 1, TWO)
+        received.begin_life()
+        assert put(received, 7, 1, TWO)
+        assert (ball.get("robot2").value, ball.get("robot2").number) == ({"x": 2.0}, 2)
 
 
 def test_a_frame_wakes_who_waits_for_it(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,11 +134,11 @@ def test_a_frame_wakes_who_waits_for_it(place: Path, monkeypatch: pytest.MonkeyP
         asleep = Path(f"/proc/self/task/{thread.native_id}/wchan")
         while "futex" not in asleep.read_text():
             time.sleep(0)
-        assert received.put(7, 1, ONE, now(), 0)
+        assert put(received, 7, 1, ONE)
         thread.join(0.5)
         number = 1
         while thread.is_alive():  # it may have slept in a lock of Python's when we looked
             number += 1
-            received.put(7, number, ONE, now(), 0)
+            put(received, 7, number, ONE)
             thread.join(0.5)
         assert got == [{"x": 1.0}]

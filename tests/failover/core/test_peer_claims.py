@@ -66,7 +66,7 @@ def test_a_record_without_a_later_epoch_spoils_no_beat_and_says_what_to_do() -> 
         talk = Talk(PAIR, VoteRecord((Record(NAME, poisoned, "robot2", State.STANDBY, spec=SPEC), Record("/lab/y", 3, "robot1"))))
         talk.tick(2_000)
         beats = [beat for ready in talk.readies for beat in ready.send]
-        assert beats and all(codec._sound(beat) for beat in beats)
+        assert beats and all(codec.is_sound(beat) for beat in beats)
         ready = talk.node.step(Run(1, SPEC), talk.now_ns)
         assert f"failover-agent mend {NAME} --epoch N" in str(ready.act)
         ready = talk.node.step(Promote(2, NAME), talk.now_ns)

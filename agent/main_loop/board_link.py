@@ -1,0 +1,185 @@
+"""The board in the main loop: takes what is due from this robot's items, puts what came into the files of the other robots.
+
+Nothing here waits: a get that is overtaken, or a value that does not fit, is counted and left out. Programs of a group may write
+anything into `own`; every size is checked before it is believed, and nothing of it raises here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from agent.main_loop.own_items import OwnItems, number_in
+from agent.main_loop.urgent_items import UrgentItems
+from failover.boards import boottime, directory
+from failover.boards.mapping import MappedFile
+from failover.boards.received import ReceivedItems
+from failover.core.board import layout
+from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
+from failover.core.board.due import Bucket, Sent, Turns
+from failover.core.frames.frame import Portion
+from failover.core.frames.lane import Heard
+from failover.errors import BoardError, OvertakenError
+
+UNREADABLE: Final = "own items that could not be read"
+WAITED: Final = "items that waited a round for room in a frame"
+
+REMOVE_ROUNDS: Final = 3
+"""Missed rounds after which a robot may have left."""
+
+BOUNDS_TOLD_NS: Final = 1_000_000_000
+"""Between two computations of the bounds of a peer's items."""
+
+WORST_FALLS: Final = 1000
+"""Frames in which the longest way is forgotten by two thirds: what is longer than it is about one frame of a thousand."""
+
+
+class _Peer(Struct):
+    """A peer's file, and what is known of its frames.
+
+    Attributes:
+        worst_ns: the longest way lately; falls slowly.
+    """
+
+    items: ReceivedItems
+    boot: int = 0
+    heard_ns: int = 0
+    state: int = layout.NOT
+    worst_ns: int = 0
+    told_ns: int = 0
+
+
+class BoardLink:
+    """This robot's board. Instants are those of this process's clock; in the files they are the machine's (`boottime`).
+
+    Attributes:
+        dropped: by reason.
+        wakes: readable when an urgent item was put.
+    """
+
+    def __init__(self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int) -> None:
+        self._file = own
+        self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
+        self.turns = Turns()
+        self.dropped: Counter[str] = Counter()
+        self._own = OwnItems(own)
+        self._gone: dict[int, int] = {}
+        self._buckets: dict[int, Bucket] = {}
+        self.wakes = UrgentItems(own, self._own)
+        self._peers = {name: _Peer(items) for name, items in peers.items()}
+
+    @classmethod
+    def open(cls, place: Path, round_ns: int) -> BoardLink:
+        """The board that the worker process has made.
+
+        Raises:
+            BoardError, FileNotFoundError: there is none.
+        """
+        own = MappedFile.open(place / directory.OWN_NAME, writable=True)
+        prefix = directory.PEER_PREFIX
+        peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
+        return cls(own, peers, round_ns)
+
+    # --- Out ---
+
+    def due(self, round_: int, now_ns: int) -> list[Portion]:
+        """What goes into the frame of this round, with its age at ``now_ns``."""
+        try:
+            if self._own.look(now_ns):
+                self.turns.hold(Sent(one.id, one.period, one.phase) for one in self._own.records.values())
+            numbers = self.turns.due(round_)
+            return self._portions(numbers, self._own.newest(), now_ns) if numbers else []
+        except (BoardError, OSError):
+            self.dropped[UNREADABLE] += 1
+            return []
+
+    def urgent(self, now_ns: int) -> list[Portion]:
+        """Urgent items that were put since they last went, as often as `Bucket` allows it."""
+        try:
+            table = self._own.newest()
+        except (BoardError, OSError):
+            self.dropped[UNREADABLE] += 1
+            return []
+        put = [one.id for one in self._own.urgent if number_in(table, one) > self._gone.get(one.id, 0)]
+        allowed = [number for number in put if self._buckets.setdefault(number, Bucket()).take(now_ns)]
+        return self._portions(allowed, table, now_ns)
+
+    def placed(self, portions: Sequence[Portion], count: int) -> None:
+        """The first ``count`` of what was due found room in the frame."""
+        self.turns.left(portion.number for portion in portions[count:])
+        self.went(portions[:count])
+
+    def went(self, portions: Sequence[Portion]) -> None:
+        """These are on their way: what is urgent of them need not go again."""
+        self._gone.update((portion.number, portion.put) for portion in portions)
+
+    def _portions(self, numbers: Sequence[int], table: bytes, now_ns: int) -> list[Portion]:
+        found = []
+        for number in numbers:
+            try:
+                bank = self._own.get(self._own.records[number], table)
+            except (OvertakenError, BoardError, OSError):
+                self.dropped[UNREADABLE] += 1
+                continue
+            if bank is not None:
+                found.append(Portion(number, sent_age_us(bank.stamp_ns, now_ns - self._skew_ns), bank.number, bank.value))
+        return found
+
+    # --- In ---
+
+    def take(self, heard: Heard, came_ns: int) -> None:
+        """Put what a frame brought into the file of its sender."""
+        part = heard.part
+        peer = self._peers.get(part.sender)
+        if peer is None or not part.alike:
+            return
+        if part.boot != peer.boot:
+            peer.boot = part.boot
+            peer.items.begin_life()
+        came_ns -= self._skew_ns
+        self._note_frame(peer, heard.way_ns, came_ns)
+        if heard.items:
+            peer.items.take(heard.items, came_ns, way_bound_us(heard.way_ns), part.round)
+
+    def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
+        """Tell when it came; from time to time the bounds that follow from the longest ways."""
+        peer.heard_ns = max(came_ns, 1)
+        peer.items.heard(peer.heard_ns)
+        if way_ns is None:
+            return
+        peer.worst_ns = max(way_ns, peer.worst_ns - peer.worst_ns // WORST_FALLS)
+        if came_ns - peer.told_ns > BOUNDS_TOLD_NS:
+            peer.told_ns = came_ns
+            round_ns, worst_ns = self._round_ns, peer.worst_ns
+            peer.items.bound(lambda period: bound_ns(period, period * round_ns, worst_ns, round_ns, 1))
+
+    def tell_states(self, now_ns: int, lease_ns: int) -> None:
+        """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease."""
+        for peer in self._peers.values():
+            silent_ns = now_ns - self._skew_ns - peer.heard_ns
+            state = layout.REMOVE if silent_ns < lease_ns else layout.NOT
+            if silent_ns < REMOVE_ROUNDS * self._round_ns:
+                state = layout.RUN
+            if peer.state != state and peer.heard_ns:
+                peer.state = state
+                peer.items.tell_state(state)
+
+    def close(self) -> None:
+        """Give the locks back; the files stay for the agent that comes after."""
+        self.wakes.close()
+        for file in (self._file, *[peer.items.file for peer in self._peers.values()]):
+            file.close()
+
+    def left_out(self) -> Counter[str]:
+        """Values that were not taken, by reason, and those that waited."""
+        counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped)
+        return counts + Counter({WAITED: sum(self.turns.waited.values())})
+
+
+def way_bound_us(way_ns: int | None) -> int:
+    """By how much a value can be older than told: the longest way, and what it and the age lost when they were rounded."""
+    return NO_ERROR_BOUND if way_ns is None else min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)

@@ -1,0 +1,113 @@
+"""This robot's items as the main loop takes them: by read(2), not from a mapping.
+
+Programs of a group may write the file, and so make it shorter. Whoever touches a page of a mapping that is gone is ended by the
+kernel (SIGBUS); a read only comes back short. The order of loads is that of `failover.core.board.banks.get_carefully`.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import Final
+
+from failover.boards.mapping import MappedFile
+from failover.core.board import layout
+from failover.core.board.banks import LOW_HALF, RETRIES, Found, sum_of
+from failover.core.board.items import BLOCK_SIZE_MAX
+from failover.core.board.layout import NOT_SENT, URGENT, Record
+from failover.errors import BoardError, OvertakenError
+
+LOOK_NS: Final = 100_000_000
+"""Between two looks at a table that changes: a program that changes it all the time costs the loop no more."""
+
+_BANK: Final = struct.Struct("<QQQII")
+"""Number, stamp, sum, size, error."""
+
+
+class OwnItems:
+    """The items that this robot sends.
+
+    Attributes:
+        records: by number, as the table was when it was last read.
+    """
+
+    def __init__(self, file: MappedFile) -> None:
+        self._file = file
+        self._descriptor = file.descriptor
+        self.records: dict[int, Record] = {}
+        self.urgent: tuple[Record, ...] = ()
+        self._known: dict[int, Found] = {}
+        self._generation = -1
+        self._looked_ns: int | None = None
+        self._table_size = 0
+
+    def look(self, now_ns: int) -> bool:
+        """Read the table if it has changed; whether there are other items now.
+
+        Raises:
+            BoardError: it cannot be believed.
+        """
+        generation = self._word(layout.GENERATION_AT)
+        if generation == self._generation or (self._looked_ns is not None and now_ns - self._looked_ns < LOOK_NS):
+            return False
+        self._looked_ns = now_ns
+        content = os.pread(self._descriptor, min(os.fstat(self._descriptor).st_size, BLOCK_SIZE_MAX), 0)
+        header = layout.read_header(content)
+        found = [record for record in layout.read_records(content, header) if not record.flags & NOT_SENT]
+        self._generation = generation if generation % 2 == 0 else -1
+        self._table_size = header.count * layout.RECORD_SIZE
+        self.records = {record.id: record for record in found}
+        self._known = {}
+        self.urgent = tuple(record for record in found if record.flags & URGENT)
+        return True
+
+    def newest(self) -> bytes:
+        """The table as it is now: for `number_in`.
+
+        Raises:
+            BoardError: the file was made shorter.
+        """
+        table = os.pread(self._descriptor, self._table_size, layout.RECORDS_AT)
+        if len(table) < self._table_size:
+            raise BoardError(f"{self._file.path}: the file was made shorter")
+        return table
+
+    def get(self, record: Record, table: bytes) -> Found | None:
+        """The newest put of an item, whole; None before the first. A put that was read before is not read again.
+
+        Args:
+            table: from `newest`, a moment ago.
+
+        Raises:
+            OvertakenError, BoardError: see `failover.core.board.banks.get_carefully`.
+        """
+        number = number_in(table, record)
+        known = self._known.get(record.id)
+        if known is not None and known.number == number:
+            return known
+        for _ in range(RETRIES):
+            if number == 0:
+                return None
+            bank = record.offset + number % record.banks * record.stride
+            content = os.pread(self._descriptor, layout.BANK_HEAD + record.size, bank)
+            if len(content) < layout.BANK_HEAD:
+                raise BoardError(f"{self._file.path}: item {record.name!r}: the file was made shorter")
+            _, stamp_ns, total, size, error_us = _BANK.unpack_from(content)
+            value = content[layout.BANK_HEAD : layout.BANK_HEAD + (size & LOW_HALF)]
+            if self._word(bank) == number:
+                if len(value) != size:
+                    raise BoardError(f"{self._file.path}: item {record.name!r}: damaged: a value of {size} bytes")
+                if total in (0, sum_of(value, stamp_ns, number)):
+                    found = self._known[record.id] = Found(value, stamp_ns, error_us, number)
+                    return found
+            number = self._word(record.at + layout.NEWEST_FIELD)
+        raise OvertakenError(f"item {record.name!r} was written {RETRIES} times while it was read")
+
+    def _word(self, offset: int) -> int:
+        return int.from_bytes(os.pread(self._descriptor, 8, offset), "little")
+
+
+def number_in(table: bytes, record: Record) -> int:
+    """Number of the newest put of an item; 0: none."""
+    at = record.index * layout.RECORD_SIZE + layout.NEWEST_FIELD
+    return int.from_bytes(table[at : at + 8], "little")
