@@ -57,6 +57,10 @@ class ScheduleError(FailoverError):
     """Something about the schedule of tasks does not work; the message names the task or the file, and the cure. Nothing changed."""
 
 
+class ScheduleGoneError(ScheduleError):
+    """The schedule that was open was removed or made anew; a program that calls again works with the new one."""
+
+
 class NeverWrittenError(BoardError):
     """An item has no value yet: its writer has not put one."""
 

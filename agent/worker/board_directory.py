@@ -18,11 +18,12 @@ from agent.config import Settings
 from agent.errors import AgentError
 from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
+from failover.boards.schedule_file import ScheduleFile
 from failover.core.board import layout
 from failover.core.board.items import Item
 from failover.core.wire.codec import team_tag
 from failover.core.wire.names import weight
-from failover.errors import BoardError
+from failover.errors import BoardError, ScheduleError
 
 DIRECTORY_MODE: Final = 0o755
 PROGRAMS_MODE: Final = 0o660
@@ -58,6 +59,7 @@ def provide(settings: Settings) -> Path | None:
             directory.dismiss(path)
     files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me))
     files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me))
+    files.have_schedule(me)
     _point(link, place)
     return place
 
@@ -91,6 +93,20 @@ class _Files:
             mode=mode,
             group=self._group,
         )
+
+    def have_schedule(self, robot: str) -> None:
+        """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""
+        path = self._place / directory.SCHEDULE_NAME
+        with contextlib.suppress(ScheduleError, FileNotFoundError):
+            file = ScheduleFile.open(path, writable=True)
+            header = file.header
+            file.close()
+            if (header.boot_id, header.robot) == (boottime.boot_id(), robot):
+                os.chown(path, -1, self._group)
+                path.chmod(PROGRAMS_MODE)
+                return
+        directory.dismiss(path)
+        directory.make_schedule(self._place, robot, mode=PROGRAMS_MODE, group=self._group)
 
     def _fits(self, path: Path, area: int, robot: str) -> bool:
         try:

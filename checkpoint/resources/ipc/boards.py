@@ -5,7 +5,7 @@ that others have, too, nor carry one robot's values to another. A restore maps p
 /dev/null in place of the files. A generation of zero tells the program's client that it must open the board again: it then opens
 the board of the robot where it runs, and takes its locks there.
 
-A board's files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``) in a directory ``/dev/shm/failover-…``. In
+Its files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``, and ``schedule``, the tasks of the robot) in a directory ``/dev/shm/failover-…``. In
 any other directory a file counts as a board's if it also begins as one.
 
 Facts of a descriptor: ``descriptors``, ``path``, ``flags`` of open(2). Facts of the mappings: ``descriptors`` (none),
@@ -48,7 +48,8 @@ CAPABILITIES: Final = (
 MAGIC: Final = b"\x89FOBRD\r\n"
 PLACE: Final = "/dev/shm/failover-"
 """How the path of a board's directory begins where an agent makes it."""
-NAMES: Final = ("own", "private")
+SCHEDULE_MAGIC: Final = b"\x89FOSCH\r\n"
+NAMES: Final = ("own", "private", "schedule")
 PREFIXES: Final = ("own+", "peer-")
 HARMLESS: Final = "/dev/null"
 FLAGS: Final = os.O_ACCMODE | os.O_NONBLOCK
@@ -86,7 +87,7 @@ def _begins_as_one(path: str, key: tuple[int, int]) -> bool:
     except OSError:  # closed to us, or gone
         return False
     try:
-        return stat.S_ISREG(os.fstat(descriptor).st_mode) and os.pread(descriptor, len(MAGIC), 0) == MAGIC
+        return stat.S_ISREG(os.fstat(descriptor).st_mode) and os.pread(descriptor, len(MAGIC), 0) in (MAGIC, SCHEDULE_MAGIC)
     except OSError:
         return False
     finally:
