@@ -54,7 +54,7 @@ class BoardGoneError(BoardError):
 
 
 class ScheduleError(FailoverError):
-    """Something about the schedule of tasks does not work; the message names the task or the file, and the cure. Nothing changed."""
+    """Something about the schedule of tasks does not work, and nothing changed; the message names the task and the cure."""
 
 
 class ScheduleGoneError(ScheduleError):

@@ -451,8 +451,8 @@ static inline uint64_t fb_digest_(const void *at, uint64_t size)
 
 /* --- Clock and kernel ---------------------------------------------------------------------------------------------------------------- */
 
-/* What this process's CLOCK_BOOTTIME is ahead of the machine's: a protected program may live in a time namespace. 0 without those. */
-static inline int64_t fb_skew_(void)
+/* What a clock of this process, "boottime" or "monotonic", is ahead of the machine's: a protected program may live in a time namespace. 0 without those. */
+static inline int64_t fb_skew_of_(const char *clock)
 {
     char line[128];
     long long seconds = 0, nanoseconds = 0;
@@ -460,11 +460,15 @@ static inline int64_t fb_skew_(void)
     if (file == NULL)
         return 0;
     while (fgets(line, sizeof line, file) != NULL)
-        if (sscanf(line, "boottime %lld %lld", &seconds, &nanoseconds) == 2)
+        if (strncmp(line, clock, strlen(clock)) == 0 && sscanf(line + strlen(clock), "%lld %lld", &seconds, &nanoseconds) == 2)
             break;
+        else
+            seconds = nanoseconds = 0;
     fclose(file);
     return (int64_t)seconds * 1000000000 + nanoseconds;
 }
+
+static inline int64_t fb_skew_(void) { return fb_skew_of_("boottime"); }
 
 static inline int64_t fb_clock_(clockid_t clock)
 {
@@ -884,7 +888,7 @@ static inline void fb_remove_(const fb_board *board, int own)
     if (pwrite(own, &gone, 8, FB_GENERATION_AT_) != 8)
         return;
     for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder)) {
-        if (strcmp(entry->d_name, "private") != 0 && strncmp(entry->d_name, "own+", 4) != 0 && strncmp(entry->d_name, "peer-", 5) != 0)
+        if (strcmp(entry->d_name, "private") != 0 && strcmp(entry->d_name, "schedule") != 0 && strncmp(entry->d_name, "own+", 4) != 0 && strncmp(entry->d_name, "peer-", 5) != 0)
             continue;
         snprintf(path, sizeof path, "%s/%s", board->directory, entry->d_name);
         int file = open(path, O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK);

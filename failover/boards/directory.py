@@ -22,8 +22,8 @@ from failover.client.control import socket_path
 from failover.core.board import layout
 from failover.core.board.items import ITEMS_MAX, Item
 from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
-from failover.core.wire.names import check_robot
 from failover.core.schedule import layout as schedule_layout
+from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError, ScheduleError
 
 VARIABLE: Final = "FAILOVER_BOARD"
@@ -288,7 +288,12 @@ def _is_abandoned(path: Path, descriptor: int) -> bool:
 def _remove(directory: Path, own: int) -> None:
     """Tell all who have the files open, and unlink them, ``own`` last; the table lock of ``own`` is held."""
     os.pwrite(own, layout.WORD.pack(GONE), layout.GENERATION_AT)
-    for path in (directory / PRIVATE_NAME, directory / SCHEDULE_NAME, *directory.glob(f"{OWN_NAME}+*"), *directory.glob(f"{PEER_PREFIX}*")):
+    for path in (
+        directory / PRIVATE_NAME,
+        directory / SCHEDULE_NAME,
+        *directory.glob(f"{OWN_NAME}+*"),
+        *directory.glob(f"{PEER_PREFIX}*"),
+    ):
         dismiss(path)
     (directory / OWN_NAME).unlink(missing_ok=True)
     with contextlib.suppress(OSError):

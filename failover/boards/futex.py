@@ -55,8 +55,9 @@ def wait(address: int, value: int, timeout_s: float) -> None:
 
 
 def wait_until(address: int, value: int, instant_ns: int) -> None:
-    """Sleep until woken or until an instant of CLOCK_MONOTONIC, as this process reads it, as long as the 32 bits at ``address`` are
-    ``value``. May wake early.
+    """Sleep until woken, or until an instant of CLOCK_MONOTONIC as this process reads it. May wake early.
+
+    Only as long as the 32 bits at ``address`` are ``value``.
     """
     limit = _Timespec(*divmod(max(instant_ns, 0), _NS_PER_S))
     if _call()(_number(), ctypes.c_void_p(address), _WAIT_BITSET, ctypes.c_uint32(value), ctypes.byref(limit), None, _ANY) == -1:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-from pathlib import Path
 from typing import ClassVar, Final
 
 from failover.boards import locks
@@ -23,6 +22,8 @@ class MappedFile(SharedFile):
 
     SIZE_MIN: ClassVar[int] = layout.RECORDS_AT
     SIZE_MAX: ClassVar[int] = BLOCK_SIZE_MAX
+
+    header: Header
 
     # --- What the file says ---
 

@@ -27,6 +27,7 @@ class ScheduleFile(SharedFile):
     ERROR: ClassVar[type[FailoverError]] = ScheduleError
     GONE_ERROR: ClassVar[type[FailoverError]] = ScheduleGoneError
 
+    header: Header
     table: View
 
     def _map(self, area: mmap.mmap) -> None:

@@ -1,7 +1,7 @@
 """A file that programs of one robot share by mapping it: opened, mapped, locked, its table changed.
 
-Such a file is opened twice. The first opening is for the mapping (Python's mmap keeps a duplicate of its descriptor for as long as it
-lives); the locks belong to the second one, which can be closed at any time, and so be given back.
+Such a file is opened twice. The first opening is for the mapping (Python's mmap keeps a duplicate of its descriptor for as
+long as it lives); the locks belong to the second one, which can be closed at any time, and so be given back.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ GENERATION: Final = GENERATION_AT // 8
 
 
 class SharedFile:
-    """A file of this robot's shared memory, mapped. It stays mapped for as long as anything refers to it; `close` gives back locks and
-    descriptor.
+    """A file of this robot's shared memory, mapped. It stays mapped for as long as anything refers to it.
+
+    `close` gives back locks and descriptor.
 
     Attributes:
         path: for messages.

@@ -441,6 +441,71 @@ def board(room: argparse.ArgumentParser) -> None:
     imported.set_defaults(function="failover.cli.verbs.board_files:import_file")
 
 
+def ps(room: argparse.ArgumentParser) -> None:
+    """Of ``failover ps``."""
+    _place_of_board(room)
+    _repeated(room, 500)
+    _json(room)
+
+
+SET_DESCRIPTION: Final = """
+    Change a task that is declared. Its terms come into force between two of its activations: at once while it waits, or with
+    --next when its next activation begins. A changed period goes on from the last instant that was due.
+
+      failover task set mapper period_ms=100
+      failover task set mapper mode=eco --next
+    """
+
+ADD_DESCRIPTION: Final = """
+    Declare a task. A process runs it when one of that name begins. Without period_ms it runs once, or, with distance_ms, whenever
+    its program triggers it.
+
+      failover task add logger period_ms=1000 after=mapper
+    """
+
+REMOVE_DESCRIPTION: Final = """
+    Take tasks off the schedule. The loops of their programs come to an end, and tasks that run after them wait for them no more.
+
+      failover task remove logger
+    """
+
+HISTOGRAM_DESCRIPTION: Final = """
+    How late the activations of a task began, and how long they took: how many were below each bound.
+
+      failover task histogram mapper
+    """
+
+
+def task(room: argparse.ArgumentParser) -> None:
+    """Of ``failover task`` and its acts."""
+    shared = argparse.ArgumentParser(add_help=False)
+    _json(shared)
+    _place_of_board(shared)
+    acts = room.add_subparsers(dest="act", metavar="ACT", title="acts", required=True)
+    for name, summary, description, function in (
+        ("add", "declare a task", ADD_DESCRIPTION, "add"),
+        ("set", "change a task while it runs", SET_DESCRIPTION, "change"),
+    ):
+        act = _act(acts, name, shared, summary, description)
+        act.add_argument("task", metavar="TASK", help="the task's name")
+        act.add_argument(
+            "settings",
+            metavar="KEY=VALUE",
+            nargs="+",
+            help="period_ms, phase_ms, deadline_ms, budget_ms, distance_ms, priority, cpus, after, overrun, strict, mode",
+        )
+        act.add_argument("--force", action="store_true", help="also if not all tasks would meet their deadlines then")
+        if name == "set":
+            act.add_argument("--next", action="store_true", help="in force from the task's next activation on")
+        act.set_defaults(function=f"failover.cli.verbs.tasks:{function}")
+    act = _act(acts, "remove", shared, "take tasks off the schedule", REMOVE_DESCRIPTION)
+    act.add_argument("tasks", metavar="TASK", nargs="+", help="a task's name")
+    act.set_defaults(function="failover.cli.verbs.tasks:remove")
+    act = _act(acts, "histogram", shared, "how late it began, how long it took", HISTOGRAM_DESCRIPTION)
+    act.add_argument("task", metavar="TASK", help="the task's name")
+    act.set_defaults(function="failover.cli.verbs.tasks:histogram")
+
+
 def _place_of_board(room: argparse.ArgumentParser) -> None:
     room.add_argument(
         "--board", metavar="DIR", help="the board's directory (default: $FAILOVER_BOARD, else the agent's, else this user's)"

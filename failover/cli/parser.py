@@ -303,6 +303,36 @@ VERBS: Final = (
         "failover.cli.verbs.board:show",
     ),
     Verb(
+        "ps",
+        "the tasks of this robot's schedule: state, period, lateness, duration, misses",
+        """
+        Shows the tasks that programs of this robot run at their times (docs/tasks.md), the most urgent first. Lateness is
+        the span from the instant at which an activation was due to its beginning: half of the activations, and 99 of 100, were
+        below the bound that is shown. No agent is needed. Exit status 1: no process runs one of them.
+
+          failover ps
+          failover ps --watch
+        """,
+        arguments.ps,
+        "failover.cli.verbs.tasks:show",
+    ),
+    Verb(
+        "task",
+        "orders to tasks: add, set, remove; histogram shows how late one began",
+        """
+        Changes tasks while they run. A change comes into force between two activations of its task, never within one, and no
+        other task notices. All of an order is done, or nothing. failover task ACT --help explains an act.
+
+          failover task set mapper period_ms=100
+          failover task set mapper after=odometry,vision --next
+          failover task add logger period_ms=1000
+          failover task remove logger
+          failover task histogram mapper
+        """,
+        arguments.task,
+        "failover.cli.verbs.tasks:show",
+    ),
+    Verb(
         "check",
         "can failover protect programs here, or this process; and what to change",
         """

@@ -21,7 +21,7 @@ from failover.boards.schedule_file import ScheduleFile
 from failover.core.board.layout import ALONE
 from failover.core.schedule import layout, orders
 from failover.core.schedule.activation import NO_ROW, Sleep, State, Task, Tick
-from failover.core.schedule.course import Course, Overrun
+from failover.core.schedule.course import Overrun
 from failover.core.schedule.layout import LATENESS_FIELD, LIVE_FIELD, SERIAL_FIELD, SETTLED_FIELD, Live
 from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
 from failover.errors import ScheduleError, ScheduleGoneError
@@ -123,7 +123,10 @@ class ScheduledTask:
         self.close()
 
     def __iter__(self) -> Iterator[Tick]:
-        """The activations; each ends where the body does. They come to an end when a one-shot task has run, or the task is removed."""
+        """The activations; each ends where the body does.
+
+        They come to an end when a one-shot task has run, or the task is removed.
+        """
         while (tick := self.wait_activation()) is not None:
             yield tick
 
@@ -163,6 +166,8 @@ class ScheduledTask:
         if self._task.state is not State.RUNNING:
             return
         opened = self._ensured()
+        if self._task.state is not State.RUNNING:
+            return  # the schedule is another one now: nothing is under way there
         self._task.end(boottime.now_monotonic_ns() - opened.skew_ns)
         layout.count(opened.file.table, self._row, layout.DURATION_FIELD, self._task.ended_ns - self._task.started_ns)
         if self._task.course is not self._course:
@@ -172,8 +177,13 @@ class ScheduledTask:
             futex.wake(opened.base + layout.row_at(self._row) + SETTLED_FIELD)
 
     def trigger(self) -> None:
-        """A sporadic task is due now: what it waits for has happened."""
-        self._task.trigger(boottime.now_monotonic_ns() - self._ensured().skew_ns)
+        """A sporadic task is due now: what it waits for has happened.
+
+        Another thread may call it, too; the task then begins within 100 ms.
+        """
+        opened = self._ensured()
+        self._task.trigger(boottime.now_monotonic_ns() - opened.skew_ns)
+        futex.wake(opened.base + layout.row_at(self._row) + SERIAL_FIELD)
 
     @property
     def live(self) -> Live:
@@ -209,10 +219,15 @@ class ScheduledTask:
         futex.wait_until(opened.base + at, settled, until_ns + opened.skew_ns)
 
     def _look(self, row: int) -> Any:
-        return layout.read_predecessor(self._ensured().file.table, row)
+        return layout.read_predecessor(self._present().file.table, row)
 
     def _lives(self, row: int) -> bool:
-        return self._ensured().file.is_run(row)
+        return self._present().file.is_run(row)
+
+    def _present(self) -> Opened:
+        """The schedule that is open: in the middle of a look at it, it is not opened anew."""
+        assert self._holder.opened is not None
+        return self._holder.opened
 
     def _publish(self, opened: Opened) -> None:
         """Write how the task is; the order of the stores is that of SCHEDULE.md."""
@@ -290,16 +305,19 @@ class ScheduledTask:
         if not file.is_writable:
             raise ScheduleError(f"cannot run task {self.name!r}: {file.path} may only be read by uid {os.geteuid()}")
         row = file.row_of(self.name)
+        if row is not None and not file.take_row(row):
+            raise self._taken(file, row)
         if row is None or self._declaration.terms != Terms():
             declared = self._declaration
-            outcome = file.give(lambda rows, held: orders.added(rows, [declared], held, _cpus_there()))
+            outcome = file.give(
+                lambda rows, held: orders.added(rows, [declared], held, _cpus_there()), -1 if row is None else row
+            )
             self.notes = outcome.notes
             row = file.row_of(self.name)
             if row is None:
                 raise ScheduleGoneError(f"task {self.name!r} was removed while it began")
-        if not file.take_row(row):
-            pid = layout.read_live(file.table, row).pid
-            raise ScheduleError(f"task {self.name!r} is run by pid {pid} already; end that one, or choose another name")
+            if not file.take_row(row):
+                raise self._taken(file, row)
         self._row = row
         self._pid = os.getpid()
         self._serial = (layout.row_at(row) + SERIAL_FIELD) // 4
@@ -308,12 +326,16 @@ class ScheduledTask:
         self._be_as(terms)
         self._holder.idle = lambda: _set_idle(file, row)
 
+    def _taken(self, file: ScheduleFile, row: int) -> ScheduleError:
+        pid = layout.read_live(file.table, row).pid
+        return ScheduleError(f"task {self.name!r} is run by pid {pid} already; end that one, or choose another name")
+
     def _begin_task(self, opened: Opened, terms: Terms) -> None:
         """Go on where an earlier process has left, if its course is that of the terms."""
         table = opened.file.table
         live, left = layout.read_live(table, self._row), layout.read_course(table, self._row)
         self._task = task = Task(terms, opened.file.header.origin_ns, live.counts)
-        is_left = left != Course(0, 0, 0) and left.period_ns == terms.period_ns
+        is_left = live.adopted == self._adopted and left.period_ns == terms.period_ns
         now_ns = boottime.now_monotonic_ns() - opened.skew_ns
         task.begin(now_ns, left if is_left else None, live.settled)
         self._published = State.IDLE
@@ -333,8 +355,8 @@ class ScheduledTask:
             except OSError as error:
                 self.notes = (
                     *self.notes,
-                    f"{self.name} runs at normal priority: SCHED_FIFO {terms.priority} is refused ({error.strerror}); grant CAP_SYS_NICE, or "
-                    "LimitRTPRIO of its service",
+                    f"{self.name} runs at normal priority: SCHED_FIFO {terms.priority} is refused ({error.strerror}); "
+                    "grant CAP_SYS_NICE, or LimitRTPRIO of its service",
                 )
 
     def forget_after_fork(self) -> None:

@@ -34,7 +34,7 @@ from failover.core.schedule.terms import Kind, Terms
 
 
 class State(enum.IntEnum):
-    """Of a task: nobody runs it; until it is due; until its predecessors have ended; under way; until it is due once more."""
+    """Of a task: no process runs it; until it is due; until its predecessors have ended; under way; until it is due once more."""
 
     IDLE = 0
     WAITING = 1
@@ -52,7 +52,7 @@ class Predecessor(Struct, frozen=True):
     """What a task sees of one that it runs after.
 
     Attributes:
-        is_declared: else nobody waits for it.
+        is_declared: else no task waits for it.
         settled: activations below this number have ended, or were skipped.
     """
 
@@ -160,15 +160,19 @@ class Task:
         """A process runs the task from now on.
 
         Args:
-            course, number: as an earlier one has left them, ``number`` as it was `settled`; None: of a new row.
+            course: as an earlier one has left it, if its terms are still in force.
+            number: what an earlier one has `settled`.
         """
         assert self.state is State.IDLE
-        self.course = course or self.course
-        self.number = max(number, self.course.number)
+        if course is None:
+            fresh = first_course(self.terms, self.origin_ns)
+            first = fresh.first_from(now_ns)
+            course = Course(max(number, first), fresh.due_ns(first), fresh.period_ns)
+        self.course, self.number = course, max(number, course.number)
         self.state = State.WAITING
         if self.terms.kind is Kind.PERIODIC:
-            self.number = max(self.number, self.course.first_from(now_ns))
-        elif self.number > self.course.number:
+            self.number = max(self.number, course.first_from(now_ns))
+        elif self.number > course.number:
             self.number -= 1
             self.state = State.DONE
         elif self.terms.kind is Kind.SPORADIC:
@@ -219,7 +223,10 @@ class Task:
             self._adopt(terms, now_ns)
 
     def trigger(self, now_ns: int) -> None:
-        """What a sporadic task waits for has happened. One that is due already covers it; while one is under way, one is remembered."""
+        """What a sporadic task waits for has happened.
+
+        An activation that is due already covers it; while one is under way, one is remembered.
+        """
         if self.state in (State.WAITING, State.HELD):
             return
         if self._triggered_ns is None:
@@ -231,7 +238,7 @@ class Task:
             self._take_trigger()
 
     def leave(self) -> None:
-        """Nobody runs the task any more. An activation under way has not ended."""
+        """The process runs the task no more. An activation under way has not ended."""
         self.state = State.IDLE
 
     # --- Parts ---

@@ -1,10 +1,10 @@
 """Whether all tasks meet their deadlines: response times under fixed priorities, in the order of deadlines. Pure.
 
-Tasks that share exactly one processor get the exact answer for the worst instant, the one at which all are due together: phases and
-predecessors can only make it better, if budgets hold. Tasks on several processors are judged by their load alone.
+Tasks that share exactly one processor get the exact answer for the worst instant, at which all are due together. Phases can only
+make it better; waiting for a predecessor is not in it. Tasks on several processors are judged by their load alone.
 
-Source: N. C. Audsley, A. Burns, M. F. Richardson, K. W. Tindell, A. J. Wellings (1993); for deadlines beyond the period K. W. Tindell,
-A. Burns, A. J. Wellings (1994).
+Source: N. C. Audsley, A. Burns, M. F. Richardson, K. W. Tindell, A. J. Wellings (1993); for deadlines beyond the period
+K. W. Tindell, A. Burns, A. J. Wellings (1994).
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ class Load(Struct, frozen=True):
         """What a person is told of it; "" if all is well."""
         where = _where(self.cpus)
         if self.share > 1:
-            return f"the tasks {where} need {self.share:.0%} of it: fewer, slower or shorter ones; --force takes them nevertheless"
+            return (
+                f"the tasks {where} need {self.share:.0%} of it: fewer, slower or shorter ones; --force takes them nevertheless"
+            )
         if self.late:
             response = self.responses.get(self.late[0])
             told = "for ever" if response is None else f"{response / _NS:g} s"
@@ -65,7 +67,10 @@ def _where(cpus: int) -> str:
 
 
 def by_deadline(tasks: Mapping[str, Terms]) -> list[str]:
-    """The tasks, most urgent first: the shorter deadline, then the shorter period, then the name. Those without a deadline come last."""
+    """The tasks, most urgent first: the shorter deadline, then the shorter period, then the name.
+
+    Those without a deadline come last.
+    """
     return sorted(tasks, key=lambda name: (not tasks[name].deadline_ns, tasks[name].deadline_ns, tasks[name].period_ns, name))
 
 

@@ -1,7 +1,7 @@
 """The bytes of a schedule's table: header, rows, terms, courses, histograms. SCHEDULE.md beside this file is normative.
 
-This file turns bytes into values and values into bytes, and checks each value that it reads: a row that another program has spoilt
-is an error in a sentence for that task, and stops no other one. It opens nothing: `failover.schedule` maps the table.
+This file turns bytes into values and values into bytes, and checks each value that it reads: a row that another program has
+spoilt is an error in a sentence for that task, and stops no other one. It opens nothing: `failover.schedule` maps the table.
 """
 
 from __future__ import annotations
@@ -170,7 +170,9 @@ def read_header(view: Buffer) -> Header:
     if magic != MAGIC:
         raise ScheduleError(f"this is no schedule: it begins with {magic.hex(' ')}")
     if version != VERSION:
-        raise ScheduleError(f"the schedule has version {version}, this program reads version {VERSION}; update the older of the two")
+        raise ScheduleError(
+            f"the schedule has version {version}, this program reads version {VERSION}; update the older of the two"
+        )
     if generation == HOLE or capacity != TASKS_MAX or origin_ns > 2**63:
         raise ScheduleError(f"damaged: generation {generation}, room for {capacity} tasks, origin {origin_ns}")
     return Header(flags, generation, boot_id, origin_ns, robot.rstrip(b"\0").decode(errors="replace"))
@@ -188,7 +190,7 @@ def name_of(view: View, index: int) -> str:
 
 
 def is_declared(view: View, index: int) -> bool:
-    """Whether a row is a task; else nobody waits for it."""
+    """Whether a row is a task; else no task waits for it."""
     return bool(view.ints[(row_at(index) + FLAGS_FIELD) // 4] & DECLARED)
 
 

@@ -1,7 +1,7 @@
 """What people and programs order of a schedule: tasks added, removed, changed; all of one order, or nothing. Pure.
 
-A predecessor that no one has declared yet has a row without terms, so that its successors can name it; until it is declared, nobody
-waits for it. A row whose task was removed and that no one names is used again.
+A predecessor that is not declared yet has a row without terms, so that its successors can name it; until it is declared, no task
+waits for it. A row is used again when its task was removed and no other task names it.
 """
 
 from __future__ import annotations
@@ -105,11 +105,13 @@ def changed(rows: Rows, changes: Iterable[Change], held: frozenset[int] = frozen
             terms = in_mode(terms, row.modes, change.mode)
         unknown = sorted(set(change.fields) - FIELDS)
         if unknown:
-            raise ScheduleError(f"cannot change {change.name!r}: a task has no {unknown[0]!r}; it has {', '.join(sorted(FIELDS))}")
+            raise ScheduleError(
+                f"cannot change {change.name!r}: a task has no {unknown[0]!r}; it has {', '.join(sorted(FIELDS))}"
+            )
         fields = dict(change.fields)
         if "period_ns" in fields and "deadline_ns" not in fields and terms.deadline_ns == terms.period_ns:
             fields["deadline_ns"] = fields["period_ns"]
-        terms = replace(terms, at_next=change.at_next, after=(), **fields)  # type: ignore[arg-type]
+        terms = replace(terms, at_next=change.at_next, after=(), **fields)
         names = tuple(draft.rows[one].name for one in row.terms.after) if change.after is None else change.after  # type: ignore[union-attr]
         declaration = checked(Declaration(change.name, terms, names), cpus_there)
         after = tuple(draft.place(name) for name in declaration.after)
@@ -174,7 +176,9 @@ class _Draft:
         """The rows that are to be written, if all of them together are a schedule."""
         circle = circle_of(self.rows)
         if circle:
-            raise ScheduleError(f"these tasks would wait for one another: {' after '.join((*circle, circle[0]))}; break the circle")
+            raise ScheduleError(
+                f"these tasks would wait for one another: {' after '.join((*circle, circle[0]))}; break the circle"
+            )
         written = {index: row for index, row in self.rows.items() if self._before.get(index) != row}
         for row in written.values():
             absent = [self.rows[one].name for one in (row.terms.after if row.terms else ()) if self.rows[one].terms is None]

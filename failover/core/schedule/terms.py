@@ -70,7 +70,7 @@ class Terms(Struct, frozen=True):
         mode: index of its quality mode.
         after: rows of its predecessors.
         strict: a predecessor that does not run holds it for ever, not until its deadline.
-        at_next: whoever adopts these terms does so when its next activation begins; else before.
+        at_next: the task adopts these terms when its next activation begins; else before.
     """
 
     kind: Kind = Kind.PERIODIC
@@ -147,15 +147,18 @@ def checked_terms(terms: Terms, what: str, cpus_there: int = 0) -> tuple[Terms, 
     notes = []
     if terms.kind is Kind.PERIODIC:
         if not PERIOD_MIN_NS <= terms.period_ns <= PERIOD_MAX_NS:
-            raise ScheduleError(f"{what}: a period of {terms.period_ns / _NS:g} s; {PERIOD_MIN_NS / _NS:g} to 1,000,000 s are possible")
+            raise ScheduleError(
+                f"{what}: a period of {terms.period_ns / _NS:g} s; {PERIOD_MIN_NS / _NS:g} to 1,000,000 s are possible"
+            )
         if terms.phase_ns >= terms.period_ns:
             notes.append(f"phase {terms.phase_ns / _NS:g} s is taken modulo the period {terms.period_ns / _NS:g} s")
             terms = replace(terms, phase_ns=terms.phase_ns % terms.period_ns)
         if terms.deadline_ns > terms.period_ns:
             if terms.overrun is Overrun.SKIP:
                 raise ScheduleError(
-                    f"{what}: its deadline, {terms.deadline_ns / _NS:g} s, is longer than its period, {terms.period_ns / _NS:g} s, "
-                    "and what falls due meanwhile is skipped; take overrun = 'queue', or a shorter deadline"
+                    f"{what}: its deadline, {terms.deadline_ns / _NS:g} s, is longer than its period, "
+                    f"{terms.period_ns / _NS:g} s, and what falls due meanwhile is skipped; "
+                    "take overrun = 'queue', or a shorter deadline"
                 )
             notes.append("its deadline is longer than its period: activations that fall due meanwhile wait")
         terms = replace(terms, deadline_ns=terms.deadline_ns or terms.period_ns)
@@ -163,9 +166,13 @@ def checked_terms(terms: Terms, what: str, cpus_there: int = 0) -> tuple[Terms, 
         terms = replace(terms, period_ns=0, phase_ns=0)
     for name in ("phase_ns", "deadline_ns", "distance_ns", "budget_ns"):
         if not 0 <= getattr(terms, name) <= PERIOD_MAX_NS:
-            raise ScheduleError(f"{what}: {name.removesuffix('_ns')} is {getattr(terms, name) / _NS:g} s; 0 to 1,000,000 s are possible")
+            raise ScheduleError(
+                f"{what}: {name.removesuffix('_ns')} is {getattr(terms, name) / _NS:g} s; 0 to 1,000,000 s are possible"
+            )
     if terms.deadline_ns and terms.budget_ns > terms.deadline_ns:
-        raise ScheduleError(f"{what}: its budget, {terms.budget_ns / _NS:g} s, is longer than its deadline, {terms.deadline_ns / _NS:g} s")
+        raise ScheduleError(
+            f"{what}: its budget, {terms.budget_ns / _NS:g} s, is longer than its deadline, {terms.deadline_ns / _NS:g} s"
+        )
     if not 0 <= terms.priority <= PRIORITY_MAX:
         raise ScheduleError(f"{what}: priority {terms.priority}; 1 to {PRIORITY_MAX} are possible, 0: by the order of deadlines")
     absent = terms.cpus & ~cpus_there

@@ -42,7 +42,9 @@ def test_a_task_that_begins_late_keeps_to_the_numbers_of_its_origin() -> None:
 
 
 @given(st.integers(-50, 50), st.integers(-(10**6), 10**6), st.integers(1, 1000), st.integers(-(10**6), 10**6))
-def test_what_covers_an_instant_is_due_before_it_and_the_next_one_after(number: int, anchor: int, period: int, instant: int) -> None:
+def test_what_covers_an_instant_is_due_before_it_and_the_next_one_after(
+    number: int, anchor: int, period: int, instant: int
+) -> None:
     course = Course(number, anchor, period)
     found, first = course.covering(instant), course.first_from(instant)
     if instant >= anchor:
@@ -133,7 +135,9 @@ def graph_of_twelve(seed: int) -> dict[str, Terms]:
 
 
 def disorders(rounds: int, seed: int = 1) -> list[str]:
-    """What ran in a wrong order in so many rounds of the longest period; judged from the log and the arithmetic of periods alone."""
+    """What ran in a wrong order in so many rounds of the longest period; judged from the log and the arithmetic
+    of periods alone.
+    """
     dice = random.Random(seed)
     terms = graph_of_twelve(seed)
     world = World(terms, takes=lambda *_: dice.randrange(100_000, 900_000), late=lambda *_: dice.randrange(200_000))
@@ -154,6 +158,8 @@ def disorders(rounds: int, seed: int = 1) -> list[str]:
     return wrong
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_twelve_tasks_of_three_periods_run_in_order_in_ten_thousand_rounds() -> None:
     assert disorders(10_000) == []
 
@@ -234,7 +240,11 @@ def test_a_one_shot_task_runs_once_and_once_more_when_it_is_ordered() -> None:
 
 
 def test_a_one_shot_task_runs_after_what_covers_its_instant() -> None:
-    terms = {"a": periodic(10), "b": Terms(kind=Kind.ONE_SHOT, at_ns=ORIGIN + 20 * MS, after=(0,)), "c": periodic(10, 1, after=(1,))}
+    terms = {
+        "a": periodic(10),
+        "b": Terms(kind=Kind.ONE_SHOT, at_ns=ORIGIN + 20 * MS, after=(0,)),
+        "c": periodic(10, 1, after=(1,)),
+    }
     world = World(terms, takes=lambda *_: 3 * MS)
     world.run_until(ORIGIN + 40 * MS)
     assert [ran.started_ns - ORIGIN for ran in world.of("b")] == [23 * MS]

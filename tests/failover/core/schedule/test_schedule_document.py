@@ -1,4 +1,6 @@
-"""SCHEDULE.md is normative: a reader written from the document alone reads the sample, and what our layout writes is the sample."""
+"""SCHEDULE.md is normative: a reader written from the document alone reads the sample, and what our layout
+writes is the sample.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,11 @@ def test_a_reader_written_from_the_document_reads_the_sample() -> None:
     assert struct.unpack_from("<iHHHH3H", content, second + 64) == (40, 1, 0, 1, 2, 0, 2, 0)
     assert number(content, mapper + 12, 4) == 2
     assert struct.unpack_from("<24sQQQQ", content, mapper + 1024 + 64) == (b"eco".ljust(24, b"\0"), 100 * MS, 0, 5 * MS, 0)
-    assert (number(content, odometry + 768, 4), number(content, odometry + 772, 4), number(content, odometry + 776)) == (3, 4711, 7)
+    assert (number(content, odometry + 768, 4), number(content, odometry + 772, 4), number(content, odometry + 776)) == (
+        3,
+        4711,
+        7,
+    )
     words = [number(content, odometry + offset) for offset in range(784, 872, 8)]
     assert words == [7, 8, 5_072_000_000, 5_072_060_000, 5_063_000_000, 5_080_000_000, 7, 1, 2, 1, 0]
     assert [number(content, odometry + offset, 4) for offset in (872, 876, 880)] == [0, 1, 1]
@@ -145,7 +151,6 @@ def test_terms_that_were_spoilt_are_an_error_of_that_row_alone(offset: int, form
     with pytest.raises(ScheduleError, match="row 1"):
         layout.read_terms(view, 1)
     assert layout.read_terms(view, 0)[1].period_ns == layout.read_terms(view, 2)[1].period_ns == 10 * MS
-
 
 
 def test_a_row_that_gets_another_name_begins_anew() -> None:

@@ -1,4 +1,4 @@
-"""Tasks in virtual time: the rules run as in a robot, each activation takes as long as a test says, every wake-up is as late as it says."""
+"""Tasks in virtual time: an activation takes as long as a test says, a wake-up is as late as it says."""
 
 from __future__ import annotations
 
@@ -49,6 +49,7 @@ class World:
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._under_way: dict[int, Tick] = {}
+        self._asked: dict[int, Sleep] = {}
         self.dead: set[int] = set()
         for index, task in enumerate(self.tasks):
             task.begin(now_ns)
@@ -97,10 +98,12 @@ class World:
             self.at(self.now_ns + self._takes(self.names[index], told.number), lambda: self._end(index, told))
         elif told.until_ns is not None and told.until_ns > self.now_ns:
             late = self._late(self.names[index], task.number) if task.state is State.WAITING else 0
+            self._asked[index] = told
             self.at(told.until_ns + late, lambda: self._wake_for(index, told))
 
     def _wake_for(self, index: int, asked: Sleep) -> None:
-        self.wake(index)
+        if self._asked.get(index) is asked:
+            self.wake(index)
 
     def _end(self, index: int, tick: Tick) -> None:
         if self._under_way.get(index) is not tick:
