@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from failover.boards import boottime, locks
+from failover.boards import LINK_NAME, boottime, locks
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
 from failover.boards.shared_file import GENERATION, SharedFile
@@ -27,8 +27,6 @@ from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError, ScheduleError
 
 VARIABLE: Final = "FAILOVER_BOARD"
-LINK_NAME: Final = "board"
-"""A symbolic link in the agent's runtime directory, to the board of its robot."""
 SHARED_MEMORY: Final = Path("/dev/shm")
 
 OWN_NAME: Final = "own"
