@@ -792,28 +792,33 @@ static inline void fb_give_up_(fb_board *board)
     board->own = NULL;
 }
 
+/* What lies beside the agent's socket under a name; `path` has PATH_MAX bytes. */
+static inline void fb_beside_socket_(char *path, const char *name)
+{
+    const char *socket = getenv("FAILOVER_SOCKET"), *runtime = getenv("XDG_RUNTIME_DIR");
+    char *slash;
+    if (socket != NULL && *socket != '\0') {
+        snprintf(path, PATH_MAX, "%s", socket);
+    } else {
+        snprintf(path, PATH_MAX, "%s/failover/control.sock", runtime == NULL ? "" : runtime);
+        if (runtime == NULL || *runtime == '\0' || access(path, F_OK) != 0)
+            snprintf(path, PATH_MAX, "/run/failover/control.sock");
+    }
+    slash = strrchr(path, '/');
+    slash = slash == NULL ? path : slash + 1;
+    snprintf(slash, PATH_MAX - (size_t)(slash - path), "%s", name);
+}
+
 /* Where this program's board is, as BOARD.md says. `is_named`: by the caller or the environment. */
 static inline int fb_find_directory_(fb_board *board, bool *is_named)
 {
-    char path[PATH_MAX], robot[65] = "robot", *slash;
-    const char *named = board->chosen != NULL ? board->chosen : getenv("FAILOVER_BOARD"), *socket = getenv("FAILOVER_SOCKET");
+    char path[PATH_MAX], robot[65] = "robot";
+    const char *named = board->chosen != NULL ? board->chosen : getenv("FAILOVER_BOARD");
     *is_named = named != NULL && *named != '\0';
     if (*is_named) {
         snprintf(path, sizeof path, "%s", named);
     } else {
-        const char *runtime = getenv("XDG_RUNTIME_DIR");
-        if (socket != NULL && *socket != '\0') {
-            snprintf(path, sizeof path, "%s", socket);
-        } else {
-            snprintf(path, sizeof path, "%s/failover/control.sock", runtime == NULL ? "" : runtime);
-            if (runtime == NULL || *runtime == '\0' || access(path, F_OK) != 0)
-                snprintf(path, sizeof path, "/run/failover/control.sock");
-        }
-        slash = strrchr(path, '/');
-        if (slash == NULL)
-            snprintf(path, sizeof path, "board");
-        else
-            snprintf(slash, sizeof path - (size_t)(slash - path), "/board");
+        fb_beside_socket_(path, "board");
         if (access(path, F_OK) != 0) {
             gethostname(robot, sizeof robot - 1);
             for (const char *at = robot; *at != '\0'; at++)

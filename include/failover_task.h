@@ -69,6 +69,7 @@ static inline void ft_close(ft_task *task);
 
 /* --- Bytes (SCHEDULE.md) ------------------------------------------------------------------------------------------------------------ */
 
+#define FT_PLACE_ "failover-schedule"
 #define FT_MAGIC_ "\x89" "FOSCH\r\n"
 
 enum {
@@ -138,7 +139,7 @@ typedef struct ft_course_ {
 struct ft_task {
     fb_board *board;
     unsigned char *map;
-    char *directory;
+    char directory[PATH_MAX], *chosen;
     int file;
     pid_t pid;
     uint32_t row, adopted;
@@ -146,7 +147,7 @@ struct ft_task {
     char name[FT_NAME_MAX_ + 1];
     ft_terms wanted;
     char *after[FT_AFTER_MAX];
-    bool is_declared, has_ordered, is_missed;
+    bool is_at_agents, is_declared, has_ordered, is_missed;
     int state;
     ft_bank_ terms, ordered;
     ft_course_ course;
@@ -414,14 +415,15 @@ static inline void ft_leave_(ft_task *task)
     task->file = -1;
 }
 
-/* Make the table of a board without an agent: 0, also where another process was quicker. */
+/* Make the table, without an agent or at its place: 0, also where another process was quicker. */
 static inline int ft_make_(ft_task *task, const char *path)
 {
     unsigned char header[128] = {0};
     char made_at[40];
-    const uint32_t halves[] = {1, FB_ALONE_, 0, FT_TASKS_MAX_};
+    const uint32_t halves[] = {1, task->is_at_agents ? 0U : (uint32_t)FB_ALONE_, 0, FT_TASKS_MAX_};
+    const mode_t mode = task->is_at_agents ? 0660 : 0600;
     const uint64_t words[] = {2, FT_FILE_SIZE_, (uint64_t)((fb_clock_(CLOCK_MONOTONIC) - task->skew) / 1000000000 * 1000000000)};
-    int outcome = 0, made = open(task->board->directory, O_TMPFILE | O_RDWR | O_CLOEXEC, 0600);
+    int outcome = 0, made = open(task->directory, O_TMPFILE | O_RDWR | O_CLOEXEC, mode);
     if (made < 0)
         return -errno;
     memcpy(header, FT_MAGIC_, 8);
@@ -431,12 +433,44 @@ static inline int ft_make_(ft_task *task, const char *path)
     memcpy(header + 32, words + 1, 8);
     fb_boot_id_(header + 40);
     memcpy(header + FT_ORIGIN_AT_, words + 2, 8);
-    memcpy(header + 64, task->board->own->robot, 64);
+    if (task->board != NULL)
+        memcpy(header + 64, task->board->own->robot, 64);
+    else
+        gethostname((char *)header + 64, 63);
     snprintf(made_at, sizeof made_at, "/proc/self/fd/%d", made);
-    if (fchmod(made, 0600) != 0 || ftruncate(made, FT_FILE_SIZE_) != 0 || pwrite(made, header, sizeof header, 0) != sizeof header ||
+    if (fchmod(made, mode) != 0 || ftruncate(made, FT_FILE_SIZE_) != 0 || pwrite(made, header, sizeof header, 0) != sizeof header ||
         linkat(AT_FDCWD, made_at, AT_FDCWD, path, AT_SYMLINK_FOLLOW) != 0)
         outcome = errno == EEXIST ? 0 : -errno;
     close(made);
+    return outcome;
+}
+
+/* Where the schedule is: beside the board; without one, the agent's place if this user may use it. */
+static inline int ft_find_(ft_task *task)
+{
+    const char *named = task->chosen != NULL ? task->chosen : getenv("FAILOVER_BOARD");
+    size_t size, place = strlen(FT_PLACE_);
+    int outcome = 0;
+    task->is_at_agents = false;
+    if (named == NULL || *named == '\0') {
+        fb_beside_socket_(task->directory, "board");
+        if (access(task->directory, F_OK) != 0) {
+            fb_beside_socket_(task->directory, FT_PLACE_);
+            task->is_at_agents = faccessat(AT_FDCWD, task->directory, R_OK | W_OK | X_OK, AT_EACCESS) == 0;
+        }
+    } else {
+        snprintf(task->directory, sizeof task->directory, "%s", named);
+        size = strlen(task->directory);
+        task->is_at_agents = size > place && task->directory[size - place - 1] == '/' && strcmp(task->directory + size - place, FT_PLACE_) == 0;
+    }
+    if (task->is_at_agents)
+        return 0;
+    if (task->board == NULL)
+        return (task->board = fb_open(task->chosen)) == NULL ? -errno : ft_find_(task);
+    pthread_mutex_lock(&task->board->guard);
+    outcome = fb_ensure_(task->board);
+    pthread_mutex_unlock(&task->board->guard);
+    snprintf(task->directory, sizeof task->directory, "%s", task->board->directory);
     return outcome;
 }
 
@@ -445,18 +479,15 @@ static inline int ft_map_(ft_task *task)
 {
     char path[PATH_MAX + 16];
     struct stat about;
-    int outcome;
-    pthread_mutex_lock(&task->board->guard);
-    outcome = fb_ensure_(task->board);
-    pthread_mutex_unlock(&task->board->guard);
+    int outcome = ft_find_(task);
     if (outcome != 0)
         return outcome;
     task->skew = fb_skew_of_("monotonic");
-    snprintf(path, sizeof path, "%s/schedule", task->board->directory);
+    snprintf(path, sizeof path, "%s/schedule", task->directory);
     task->file = open(path, O_RDWR | O_CLOEXEC | O_NOFOLLOW);
     if (task->file < 0 && errno == ENOENT) {
-        if ((task->board->own->flags & FB_ALONE_) == 0)
-            return fb_fail_(ENOENT, "the board %.400s has no schedule: its agent is older than this program; update it", task->board->directory);
+        if (!task->is_at_agents && (task->board->own->flags & FB_ALONE_) == 0)
+            return fb_fail_(ENOENT, "the board %.400s has no schedule: its agent is older than this program; update it", task->directory);
         outcome = ft_make_(task, path);
         return outcome == 0 || outcome == -ENOENT ? 1 : fb_fail_(-outcome, "cannot make %.400s: %s", path, strerror(-outcome));
     }
@@ -540,7 +571,7 @@ static inline int ft_attach_(ft_task *task)
     if (outcome != 0)
         return outcome;
     if (task->is_declared) {
-        outcome = fb_take_table_(task->file, task->board->directory);
+        outcome = fb_take_table_(task->file, task->directory);
         if (outcome != 0)
             return outcome;
         generation = ft_load_word_(task->map + FB_GENERATION_AT_);
@@ -557,7 +588,7 @@ static inline int ft_attach_(ft_task *task)
         if (ft_is_declared_(task->map, task->row) && ft_is_named_(task->map, task->row, task->name))
             break;
     if (task->row == FT_TASKS_MAX_)
-        return fb_fail_(ENOENT, "the schedule %.400s has no task %s; declare it, or give its terms", task->board->directory, task->name);
+        return fb_fail_(ENOENT, "the schedule %.400s has no task %s; declare it, or give its terms", task->directory, task->name);
     if (!fb_take_(task->file, FT_ROW_LOCKS_ + task->row))
         return ft_taken_(task, task->row);
     task->pid = getpid();
@@ -595,6 +626,7 @@ static inline void ft_close(ft_task *task)
         ft_store_(ft_row_(task->map, task->row) + FT_LIVE_, FT_IDLE_);
     ft_leave_(task);
     fb_close(task->board);
+    free(task->chosen);
     for (int place = 0; place < FT_AFTER_MAX; place++)
         free(task->after[place]);
     free(task);
@@ -624,8 +656,8 @@ static inline ft_task *ft_begin(const char *directory, const char *name, const f
         if (outcome == 0)
             outcome = ft_examined_(task);
     }
-    if (outcome == 0 && (task->board = fb_open(directory)) == NULL)
-        outcome = -errno;
+    if (outcome == 0 && directory != NULL && (task->chosen = strdup(directory)) == NULL)
+        outcome = fb_fail_(ENOMEM, "cannot schedule %s: no memory", name);
     if (outcome == 0)
         outcome = ft_ensure_(task);
     if (outcome != 0) {

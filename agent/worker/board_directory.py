@@ -16,7 +16,7 @@ from typing import Final
 
 from agent.config import Settings
 from agent.errors import AgentError
-from failover.boards import LINK_NAME, boottime, directory
+from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.board import layout
@@ -45,6 +45,8 @@ def provide(settings: Settings) -> Path | None:
     board = settings.team.items()
     link = Path(settings.config.runtime_directory) / LINK_NAME
     if not board.items or settings.me.role != "robot":
+        if link.is_symlink():
+            directory.dismiss(link / SCHEDULE_NAME)  # its tasks go on at the place without a board
         link.unlink(missing_ok=True)
         return None
     place, me = place_of(settings), settings.config.robot
@@ -61,7 +63,15 @@ def provide(settings: Settings) -> Path | None:
     files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me))
     files.have_schedule(me)
     _point(link, place)
+    _leave(Path(settings.config.runtime_directory) / SCHEDULE_PLACE)
     return place
+
+
+def _leave(former: Path) -> None:
+    """The robot had no board before: tell its tasks that the schedule is beside the board now."""
+    directory.dismiss(former / SCHEDULE_NAME)
+    with contextlib.suppress(OSError):
+        former.rmdir()
 
 
 class _Files:
@@ -96,7 +106,7 @@ class _Files:
 
     def have_schedule(self, robot: str) -> None:
         """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""
-        path = self._place / directory.SCHEDULE_NAME
+        path = self._place / SCHEDULE_NAME
         with contextlib.suppress(ScheduleError, FileNotFoundError):
             file = ScheduleFile.open(path, writable=True)
             header = file.header

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from failover.boards import LINK_NAME, boottime, locks
+from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, locks
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
 from failover.boards.shared_file import GENERATION, SharedFile
@@ -32,7 +32,6 @@ SHARED_MEMORY: Final = Path("/dev/shm")
 OWN_NAME: Final = "own"
 PRIVATE_NAME: Final = "private"
 PEER_PREFIX: Final = "peer-"
-SCHEDULE_NAME: Final = "schedule"
 
 TURNS: Final = 1000
 """Of making or opening a board that others make and remove at the same time."""
@@ -46,6 +45,24 @@ def find() -> Path:
     link = socket_path().parent / LINK_NAME
     if link.exists():
         return link
+    return _of_this_user()
+
+
+def find_schedule() -> Path:
+    """Where this program's schedule is: beside the board; without one, the agent's place if this user may use it."""
+    place = socket_path().parent / SCHEDULE_PLACE
+    found = find()
+    if found == _of_this_user() and os.access(place, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
+        return place
+    return found
+
+
+def is_agents_place(directory: Path) -> bool:
+    """Whether a directory holds the schedule of a robot without a board: no board is made there."""
+    return directory.name == SCHEDULE_PLACE
+
+
+def _of_this_user() -> Path:
     return SHARED_MEMORY / f"failover-u{os.geteuid()}-{this_robot()}"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from failover.boards import directory
+from failover.boards import SCHEDULE_NAME, directory
 from failover.boards.schedule_file import Order, ScheduleFile
 from failover.core.schedule import layout
 from failover.core.schedule.activation import STATES, State
@@ -64,9 +64,9 @@ def open_schedule(place: Path | None = None) -> ScheduleFile:
     Raises:
         ScheduleError: there is none.
     """
-    there = place or directory.find()
+    there = place or directory.find_schedule()
     try:
-        return ScheduleFile.open(there / directory.SCHEDULE_NAME)
+        return ScheduleFile.open(there / SCHEDULE_NAME)
     except FileNotFoundError:
         raise ScheduleError(
             f"there is no schedule in {there}: no program of this user runs a task; "

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
-from failover.boards import boottime, directory, futex
+from failover.boards import SCHEDULE_NAME, boottime, directory, futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
@@ -40,8 +40,9 @@ class Opened:
 
     def __init__(self, place: Path, name: str) -> None:
         self.directory = place.resolve() if place.exists() else place
-        self._own: MappedFile
-        self._own, self._index = directory.enter(self.directory, name)
+        self._own: MappedFile | None = None
+        if not directory.is_agents_place(self.directory):
+            self._own, self._index = directory.enter(self.directory, name)
         self.pid = os.getpid()
         try:
             self.file = self._schedule()
@@ -52,7 +53,7 @@ class Opened:
         self.base = self.file.address(0)
 
     def _schedule(self) -> ScheduleFile:
-        path = self.directory / directory.SCHEDULE_NAME
+        path = self.directory / SCHEDULE_NAME
         for _ in range(TURNS):
             try:
                 return ScheduleFile.open(path)
@@ -61,16 +62,29 @@ class Opened:
         raise ScheduleError(f"cannot open {path}: others have made and removed it {TURNS} times meanwhile; try again")
 
     def _make(self) -> None:
-        header = self._own.header
-        if not header.flags & ALONE:
-            raise ScheduleError(f"the board {self.directory} has no schedule: its agent is older than this program; update it")
-        with contextlib.suppress(FileExistsError):
-            directory.make_schedule(self.directory, header.robot, ALONE)
+        if self._own is None:
+            mode, robot, flags = 0o660, directory.this_robot(), 0  # its group is that of the directory
+        else:
+            mode, robot, flags = 0o600, self._own.header.robot, ALONE
+            if not self._own.header.flags & ALONE:
+                raise ScheduleError(
+                    f"the board {self.directory} has no schedule: its agent is older than this program; update it"
+                )
+        try:
+            directory.make_schedule(self.directory, robot, flags, mode=mode)
+        except FileExistsError:
+            pass
+        except OSError as error:
+            raise ScheduleError(
+                f"cannot make the schedule in {self.directory}: {error.strerror}; {directory.VARIABLE} names another place"
+            ) from error
 
     def close(self) -> None:
         """Give all locks back; without an agent the last user removes the files."""
         if hasattr(self, "file"):
             self.file.close()
+        if self._own is None:
+            return
         if self.pid != os.getpid():
             self._own.close()
         elif self._own.descriptor >= 0:
@@ -79,7 +93,8 @@ class Opened:
     def drop(self) -> None:
         """Close all without being the last user: the schedule is another one now, or this is a forked child."""
         self.file.close()
-        self._own.close()
+        if self._own is not None:
+            self._own.close()
 
 
 class _Holder:
@@ -286,7 +301,7 @@ class ScheduledTask:
     def _open(self) -> None:
         """Find or add the task's row, and become the process that runs it."""
         for _ in range(TURNS):
-            opened = Opened(self._place or directory.find(), self._program)
+            opened = Opened(self._place or directory.find_schedule(), self._program)
             try:
                 self._holder.opened = opened
                 self._attach(opened)

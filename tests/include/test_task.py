@@ -13,7 +13,7 @@ import pytest
 
 import failover
 from failover import ScheduleError
-from failover.boards.directory import SCHEDULE_NAME
+from failover.boards import SCHEDULE_NAME, SCHEDULE_PLACE
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout, orders
 from failover.core.schedule.activation import State
@@ -98,6 +98,23 @@ def test_a_task_in_c_keeps_to_the_origin_and_python_reads_its_row(place: Path) -
         assert layout.read_terms(file.table, row)[1].deadline_ns == 5 * MS
         file.close()
     assert not place.exists()
+
+
+def test_on_a_robot_without_a_board_c_and_python_share_the_agents_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FAILOVER_BOARD", raising=False)
+    monkeypatch.setenv("FAILOVER_SOCKET", str(tmp_path / "control.sock"))
+    place = tmp_path / SCHEDULE_PLACE
+    place.mkdir()
+    with loop("c", 5 * MS, 0, 0, 0, "-", 2, 0) as process:
+        assert len([line(process) for _ in range(2)]) == 2
+        process.wait()
+    with failover.scheduled("python", period=0.005, after="c") as task:
+        assert task.wait_activation() is not None  # at the deadline: no process runs its predecessor
+    file = opened(place)
+    assert [row.name for row in file.rows().values()] == ["c", "python"]
+    assert layout.read_live(file.table, 0).counts.ended == 2
+    assert (file.header.flags, oct((place / SCHEDULE_NAME).stat().st_mode & 0o777)) == (0, "0o660")
+    file.close()
 
 
 def test_the_last_program_in_c_leaves_nothing(place: Path) -> None:

@@ -6,7 +6,8 @@ that others have, too, nor carry one robot's values to another. A restore maps p
 the board of the robot where it runs, and takes its locks there.
 
 Its files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``, and ``schedule``, the tasks of the robot) in a
-directory ``/dev/shm/failover-…``. In any other directory a file counts as a board's if it also begins as one.
+directory ``/dev/shm/failover-…``; ``schedule`` also in one that is called ``failover-schedule``. In any other directory a file
+counts as a board's if it also begins as one.
 
 Facts of a descriptor: ``descriptors``, ``path``, ``flags`` of open(2). Facts of the mappings: ``descriptors`` (none),
 ``mappings``: [address, pages] of each.
@@ -48,6 +49,8 @@ CAPABILITIES: Final = (
 MAGIC: Final = b"\x89FOBRD\r\n"
 PLACE: Final = "/dev/shm/failover-"
 """How the path of a board's directory begins where an agent makes it."""
+SCHEDULE: Final = "/failover-schedule/schedule"
+"""How the path of the schedule ends on a robot without a board."""
 SCHEDULE_MAGIC: Final = b"\x89FOSCH\r\n"
 NAMES: Final = ("own", "private", "schedule")
 PREFIXES: Final = ("own+", "peer-")
@@ -71,6 +74,8 @@ def is_board(pid: int, path: str, key: tuple[int, int]) -> bool:
     if name not in NAMES and not name.startswith(PREFIXES):
         return False
     if directory.startswith(PLACE) and "/" not in directory[len(PLACE) :]:
+        return True
+    if path.removesuffix(DELETED).endswith(SCHEDULE):
         return True
     return not path.endswith(DELETED) and _begins_as_one(f"{procfs.outlook(pid)}{path}", key)
 

@@ -12,7 +12,8 @@ import pytest
 
 import failover
 from agent import config as configuration
-from agent.worker import board_directory
+from agent.worker import board_directory, schedule_place
+from failover.boards import SCHEDULE_PLACE
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
 from failover.config import team
@@ -155,6 +156,24 @@ def test_tasks_go_on_over_the_end_of_an_agent_and_the_start_of_the_next(folder: 
         second = task.wait_activation()
         assert first is not None and second is not None and second.number > first.number
         assert task.live.counts.started == 2
+
+
+@pytest.mark.usefixtures("found")
+def test_tasks_follow_their_schedule_to_a_board_that_is_declared_and_back(folder: Path) -> None:
+    runtime = folder / "runtime"
+    schedule_place.provide(runtime, "")
+    with failover.scheduled("mapper", period=0.005) as task:
+        task.wait_activation()
+        assert (runtime / SCHEDULE_PLACE / "schedule").exists()
+        place = board_directory.provide(loaded(folder, BALL))
+        assert place is not None
+        task.wait_activation()
+        assert not (runtime / SCHEDULE_PLACE).exists()
+        assert [row.name for row in ScheduleFile.open(place / "schedule").rows().values()] == ["mapper"]
+        board_directory.provide(loaded(folder, ""))
+        schedule_place.provide(runtime, "")
+        task.wait_activation()
+        assert [row.name for row in ScheduleFile.open(runtime / SCHEDULE_PLACE / "schedule").rows().values()] == ["mapper"]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory to another user")

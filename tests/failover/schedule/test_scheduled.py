@@ -14,7 +14,8 @@ import pytest
 
 import failover
 from failover import ScheduleError
-from failover.boards.directory import SCHEDULE_NAME, make_schedule
+from failover.boards import SCHEDULE_NAME
+from failover.boards.directory import make_schedule
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout, orders
 from failover.core.schedule.activation import State
