@@ -8,12 +8,13 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from failover.boards import SCHEDULE_NAME, directory
+from failover.boards import SCHEDULE_NAME, boottime, directory
 from failover.boards.schedule_file import Order, ScheduleFile
 from failover.core.schedule import layout
 from failover.core.schedule.activation import STATES, State
 from failover.core.schedule.admission import admission, by_deadline
 from failover.core.schedule.course import Overrun
+from failover.core.schedule.hanging import has_untold_miss, past_deadline_ns
 from failover.core.schedule.orders import Outcome, Rows
 from failover.core.schedule.terms import KINDS, TASKS_MAX
 from failover.errors import ScheduleError
@@ -31,6 +32,8 @@ class Seen(Struct, frozen=True, kw_only=True):
         late_p50_ns, late_p99_ns, took_p50_ns, took_p99_ns: bounds of the buckets of the histograms, powers of two; 0: none yet.
         pid: as the process that runs it sees itself; 0: none.
         blamed: the predecessor for which a deadline was missed last; "".
+        misses: one that the task has not told yet, because its activation does not end, is among them.
+        past_deadline_ns: how long its activation is past its deadline now; 0: it is not.
     """
 
     task: str
@@ -48,6 +51,7 @@ class Seen(Struct, frozen=True, kw_only=True):
     started: int
     ended: int
     misses: int
+    past_deadline_ns: int
     overruns: int
     skipped: int
     orphaned: int
@@ -94,7 +98,7 @@ def _seen(file: ScheduleFile, rows: Rows, index: int) -> Seen:
     late = layout.read_histogram(table, index, layout.LATENESS_FIELD)
     took = layout.read_histogram(table, index, layout.DURATION_FIELD)
     after = [rows[one] for one in terms.after if one in rows]
-    counts = live.counts
+    counts, now_ns = live.counts, boottime.machine_ns()
     return Seen(
         task=row.name,
         kind=KINDS[terms.kind],
@@ -110,7 +114,8 @@ def _seen(file: ScheduleFile, rows: Rows, index: int) -> Seen:
         pid=live.pid if is_run else 0,
         started=counts.started,
         ended=counts.ended,
-        misses=counts.misses,
+        misses=counts.misses + (is_run and has_untold_miss(live, terms, now_ns)),
+        past_deadline_ns=past_deadline_ns(live, terms, now_ns) if is_run else 0,
         overruns=counts.overruns,
         skipped=counts.skipped,
         orphaned=counts.orphaned,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,7 +36,8 @@ BAR_WIDTH: Final = 50
 
 
 @contextlib.contextmanager
-def _open(arguments: argparse.Namespace) -> Iterator[ScheduleFile]:
+def opened(arguments: argparse.Namespace) -> Iterator[ScheduleFile]:
+    """The schedule of this robot, as ``--board`` or the environment says."""
     file = open_schedule(Path(arguments.board) if arguments.board else None)
     try:
         yield file
@@ -45,8 +46,8 @@ def _open(arguments: argparse.Namespace) -> Iterator[ScheduleFile]:
 
 
 def show(arguments: argparse.Namespace) -> int:
-    """The tasks; with --watch again and again until Ctrl-C. Exit status 1: a task is idle."""
-    with _open(arguments) as file:
+    """The tasks; with --watch again and again until Ctrl-C. Exit status 1: a task is idle, or past its deadline."""
+    with opened(arguments) as file:
         with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
             while True:
                 seen = overview(file)
@@ -55,7 +56,7 @@ def show(arguments: argparse.Namespace) -> int:
                 else:
                     draw(COLUMNS, [_row(one) for one in seen], f"tasks of {file.header.robot}")
                 if not arguments.watch:
-                    return 1 if any(one.state == "idle" for one in seen) else 0
+                    return 1 if any(one.state == "idle" or one.past_deadline_ns for one in seen) else 0
                 time.sleep(arguments.every_ms / 1000)
     return 0  # Ctrl-C ended the watch
 
@@ -69,10 +70,11 @@ def _told(one: Seen) -> dict[str, Any]:
 
 
 def _row(one: Seen) -> Row:
-    mood: Mood = "warning" if one.state in ("idle", "held") or one.misses else "good"
+    mood: Mood = "bad" if one.past_deadline_ns else "warning" if one.state in ("idle", "held") or one.misses else "good"
+    state = f"{one.state}, {span(one.past_deadline_ns)} past its deadline" if one.past_deadline_ns else one.state
     after = ", ".join(f"{name} (not declared)" if name in one.missing else name for name in one.after)
     cells = (
-        *(one.task, one.state, span(one.period_ns) if one.period_ns else one.kind, span(one.late_p50_ns or None)),
+        *(one.task, state, span(one.period_ns) if one.period_ns else one.kind, span(one.late_p50_ns or None)),
         *(span(one.late_p99_ns or None), span(one.took_p50_ns or None), span(one.took_p99_ns or None)),
         *(f"{one.misses} ({one.blamed} was late)" if one.blamed else str(one.misses), str(one.overruns), after),
     )
@@ -82,7 +84,7 @@ def _row(one: Seen) -> Row:
 # --- Orders ----------------------------------------------------------------------------------------------------------
 
 
-def _parsed(words: Sequence[str]) -> tuple[dict[str, object], tuple[str, ...] | None, str]:
+def parsed(words: Sequence[str]) -> tuple[dict[str, object], tuple[str, ...] | None, str]:
     """Fields of terms, predecessors and mode, of words such as ``period_ms=10``.
 
     Raises:
@@ -113,6 +115,15 @@ def _parsed(words: Sequence[str]) -> tuple[dict[str, object], tuple[str, ...] | 
     return fields, after, mode
 
 
+def terms_of(fields: Mapping[str, object]) -> Terms:
+    """The terms of a new task: periodic, sporadic with a distance, else due once, now."""
+    terms = replace(Terms(), **fields)
+    if terms.period_ns:
+        return terms
+    kind = Kind.SPORADIC if terms.distance_ns else Kind.ONE_SHOT
+    return replace(terms, kind=kind, at_ns=0 if kind is Kind.SPORADIC else boottime.machine_ns())
+
+
 def _known() -> str:
     return f"there are {', '.join(SPANS)}, priority, cpus=0,1, after=A,B, overrun={'|'.join(OVERRUNS)}, strict=true|false, mode"
 
@@ -124,45 +135,42 @@ def _number(key: str, text: str) -> float:
         raise ScheduleError(f"{key}={text}: {text!r} is no number") from None
 
 
-def _given(arguments: argparse.Namespace, order: Order) -> int:
-    with _open(arguments) as file:
+def given(arguments: argparse.Namespace, order: Order, told: str = "") -> int:
+    """Give an order that a person wants; what is to be told of it is said."""
+    with opened(arguments) as file:
         outcome = file.give(judged(file, order, getattr(arguments, "force", True)))
         if arguments.json:
             render.as_json({"changed": [row.name for row in outcome.written.values()], "notes": list(outcome.notes)})
         else:
-            for note in outcome.notes:
+            for note in (*outcome.notes, *([told] if told else [])):
                 print(note)
     return 0
 
 
 def add(arguments: argparse.Namespace) -> int:
     """Declare a task; a process runs it when one of that name begins."""
-    fields, after, mode = _parsed(arguments.settings)
+    fields, after, mode = parsed(arguments.settings)
     if mode:
         raise ScheduleError(f"cannot add {arguments.task!r} in mode {mode!r}: a task has modes when its program declares some")
-    terms = replace(Terms(), **fields)
-    if not terms.period_ns:
-        kind = Kind.SPORADIC if terms.distance_ns else Kind.ONE_SHOT
-        terms = replace(terms, kind=kind, at_ns=0 if kind is Kind.SPORADIC else boottime.machine_ns())
-    declaration = Declaration(arguments.task, terms, after or ())
-    return _given(arguments, lambda rows, held: orders.added(rows, [declaration], held))
+    declaration = Declaration(arguments.task, terms_of(fields), after or ())
+    return given(arguments, lambda rows, held: orders.added(rows, [declaration], held))
 
 
 def change(arguments: argparse.Namespace) -> int:
     """Change a task: at once, or with its next activation."""
-    fields, after, mode = _parsed(arguments.settings)
+    fields, after, mode = parsed(arguments.settings)
     wanted = Change(arguments.task, fields, after, mode, arguments.next)
-    return _given(arguments, lambda rows, held: orders.changed(rows, [wanted], held))
+    return given(arguments, lambda rows, held: orders.changed(rows, [wanted], held))
 
 
 def remove(arguments: argparse.Namespace) -> int:
     """Take tasks off the schedule; their programs' loops come to an end."""
-    return _given(arguments, lambda rows, _: orders.removed(rows, arguments.tasks))
+    return given(arguments, lambda rows, _: orders.removed(rows, arguments.tasks))
 
 
 def histogram(arguments: argparse.Namespace) -> int:
     """How late a task began, and how long it took, as bars."""
-    with _open(arguments) as file:
+    with opened(arguments) as file:
         row = file.row_of(arguments.task)
         if row is None:
             orders.removed(file.rows(), [arguments.task])  # says what there is instead
