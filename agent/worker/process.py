@@ -104,6 +104,7 @@ class Worker(Switchboard):
         for directory in (self.places.sockets, self.places.logs):
             make_directory(directory)
         await self._provide_board()
+        await self._declare_tasks()
         store = self._store = await self._open_store()
         records = Records(self._runtime / "running")
         hooks, here = Hooks(self._starter), self.settings.component
@@ -158,6 +159,18 @@ class Worker(Switchboard):
         except (AgentError, OSError) as error:
             log.warning("no schedule: %s", error)
             self._own_troubles.append(f"tasks of different users have no schedule together: {error}")
+
+    async def _declare_tasks(self) -> None:
+        if not self.settings.config.tasks:
+            return
+        from agent.worker import declared_tasks  # here: a robot without tasks does not load them
+
+        try:
+            for note in await asyncio.to_thread(declared_tasks.declare, self.settings):
+                log.info("%s", note)
+        except (FailoverError, OSError) as error:
+            log.warning("tasks not declared: %s", error)
+            self._own_troubles.append(f"the tasks of agent.toml are not on the schedule: {error}")
 
     async def _give_signs(self) -> None:
         """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""

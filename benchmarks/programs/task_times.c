@@ -23,7 +23,7 @@ int main(int count, char **words)
         if (task != NULL) {
             if (ft_wait(task, &tick) != 0)
                 return 1;
-            printf("%lld\n", (long long)tick.late_ns);
+            printf("%lld\n", (long long)(fb_clock_(CLOCK_MONOTONIC) - tick.due_ns));
         } else {
             struct timespec limit;
             due += period;

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import sys
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +23,7 @@ from failover.core.board.layout import ALONE
 from failover.core.schedule import layout, orders
 from failover.core.schedule.activation import NO_ROW, Sleep, State, Task, Tick
 from failover.core.schedule.course import Overrun
-from failover.core.schedule.layout import LATENESS_FIELD, LIVE_FIELD, SERIAL_FIELD, SETTLED_FIELD, Live
+from failover.core.schedule.layout import LATENESS_FIELD, LIVE_FIELD, SERIAL_FIELD, SETTLED_FIELD, Live, View
 from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
 from failover.errors import ScheduleError, ScheduleGoneError
 
@@ -30,6 +31,9 @@ SLICE_NS: Final = 100_000_000
 """The longest sleep on a predecessor without a look at the own row, which may have changed meanwhile."""
 TURNS: Final = 100
 """Of opening a schedule that is made anew each time."""
+FORMER_LIFE_S: Final = 5.0
+FORMER_LIFE_POLL_S: Final = 0.01
+"""A program that resumes where it has just died: the kernel gives locks back when its last thread has ended."""
 PR_SET_TIMERSLACK: Final = 29
 """Source: linux/prctl.h."""
 OVERRUNS: Final = {"skip": Overrun.SKIP, "queue": Overrun.QUEUE, "catch_up": Overrun.CATCH_UP}
@@ -123,6 +127,8 @@ class ScheduledTask:
         self.name = declaration.name
         self.notes: tuple[str, ...] = ()
         self._declaration = declaration
+        self._known: Declaration | None = None
+        """As it was on the schedule last: where this program resumes on another robot it is declared so there."""
         self._place = place
         self._program = program
         self._holder = _Holder()
@@ -275,6 +281,7 @@ class ScheduledTask:
             self.notes = (*self.notes, f"{error}; {self.name} goes on as before")
             self._adopted = table.ints[self._serial]
             return True
+        self._remember(table, terms)
         self._task.order(terms, boottime.now_monotonic_ns() - opened.skew_ns)
         if self._task.course is not self._course:
             self._write_course(opened)
@@ -320,10 +327,12 @@ class ScheduledTask:
         if not file.is_writable:
             raise ScheduleError(f"cannot run task {self.name!r}: {file.path} may only be read by uid {os.geteuid()}")
         row = file.row_of(self.name)
-        if row is not None and not file.take_row(row):
+        if row is not None and not self._take(file, row):
             raise self._taken(file, row)
         if row is None or self._declaration.terms != Terms():
-            declared = self._declaration
+            declared = self._known or self._declaration
+            if declared.terms == Terms():
+                raise ScheduleError(f"the schedule {file.path} has no task {self.name!r}; declare it, or give its period")
             outcome = file.give(
                 lambda rows, held: orders.added(rows, [declared], held, _cpus_there()), -1 if row is None else row
             )
@@ -337,9 +346,23 @@ class ScheduledTask:
         self._pid = os.getpid()
         self._serial = (layout.row_at(row) + SERIAL_FIELD) // 4
         self._adopted, terms = layout.read_terms(file.table, row)
+        self._remember(file.table, terms)
         self._begin_task(opened, terms)
         self._be_as(terms)
         self._holder.idle = lambda: _set_idle(file, row)
+
+    def _take(self, file: ScheduleFile, row: int) -> bool:
+        """Become the process that runs it. One that resumes waits for an earlier life of itself to end."""
+        end = time.monotonic() + (FORMER_LIFE_S if self._known is not None else 0)
+        while not file.take_row(row):
+            if time.monotonic() >= end:
+                return False
+            time.sleep(FORMER_LIFE_POLL_S)
+        return True
+
+    def _remember(self, table: View, terms: Terms) -> None:
+        names = tuple(layout.name_of(table, row) for row in terms.after)
+        self._known = Declaration(self.name, replace(terms, after=()), names, layout.read_modes(table, self._row))
 
     def _taken(self, file: ScheduleFile, row: int) -> ScheduleError:
         pid = layout.read_live(file.table, row).pid

@@ -20,6 +20,7 @@ from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout, orders
 from failover.core.schedule.activation import State
 from failover.core.schedule.orders import Change
+from failover.core.schedule.terms import Declaration, Terms
 from tests.failover.boards.programs import program
 
 MS = 1_000_000
@@ -168,7 +169,7 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(place: Path) -> None:
         ({"period": 0.01, "overrun": "drop"}, "overrun is 'drop'"),
         ({"period": 0.01, "cpus": (63,)}, "processor 63 is not there"),
         ({"period": 0.01, "after": "a"}, "after itself"),
-        ({}, "a period of 0 s"),
+        ({}, "has no task 'a'; declare it, or give its period"),
     ]:
         with pytest.raises(ScheduleError, match=said):
             failover.scheduled("a", **terms)  # type: ignore[arg-type]
@@ -216,3 +217,27 @@ def test_a_forked_child_runs_no_task_and_keeps_no_lock(place: Path) -> None:
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+
+
+def test_a_task_that_others_declared_takes_its_terms_along_to_another_schedule(place: Path) -> None:
+    with failover.scheduled("keep", period=1) as keep:
+        file = opened(place)
+        declared = Declaration("mapper", Terms(period_ns=5 * MS, phase_ns=2 * MS), ("odometry",))
+        file.give(lambda rows, held: orders.added(rows, [declared], held))
+        with failover.scheduled("mapper") as mapper:
+            assert mapper.wait_activation() is not None
+            change(place, Change("mapper", {"period_ns": 10 * MS}))
+            assert mapper.wait_activation() is not None
+            file.words[layout.GENERATION_AT // 8] = layout.GONE  # as where the program resumes on another robot
+            (place / SCHEDULE_NAME).unlink()
+            file.close()
+            assert mapper.wait_activation() is not None
+            assert keep.wait_activation() is not None
+            file = opened(place)
+            rows = {row.name: row for row in file.rows().values()}
+            assert set(rows) == {"mapper", "odometry", "keep"}
+            terms = rows["mapper"].terms
+            assert terms is not None and (terms.period_ns, terms.phase_ns) == (10 * MS, 2 * MS)
+            file.close()
+        with pytest.raises(ScheduleError, match="has no task 'other'; declare it, or give its period"):
+            failover.scheduled("other")
