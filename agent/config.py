@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Final, Literal
 
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
+from agent.task_config import TaskConfig, declaration, user_of
 from checkpoint.arch import EVERY_LEVEL
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import contradiction
@@ -206,6 +208,7 @@ class Config:
     keep_size: str = ""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     components: dict[str, ComponentConfig] = field(default_factory=dict)
+    tasks: dict[str, TaskConfig] = field(default_factory=dict)
 
     @property
     def xor_cache_size(self) -> int:
@@ -307,6 +310,7 @@ def load(path: Path) -> Settings:
     _check_keys(path, config, members)
     _check_rule(path, config, members)
     _check_components(path, config, members)
+    _check_tasks(path, config, members)
     return Settings(path, config, members, secret)
 
 
@@ -357,6 +361,27 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
         _check_command(where, component)
         _check_carry(where, component)
         _check_devices(where, component)
+
+
+def _check_tasks(path: Path, config: Config, members: Team) -> None:
+    """Programs that cannot be started, or have no time at which they could run, are found when the agent starts."""
+    for name, task in config.tasks.items():
+        where = f"{path}:{strict_toml.line_of(path.read_text(), ('tasks', name))}"
+        try:
+            check_component(name)
+            declaration(name, task)
+        except FailoverError as error:
+            raise ConfigError(f"{where}: {error}") from error
+        if not task.command or not task.command[0]:
+            raise ConfigError(f'{where}: command is missing: command = ["/opt/controller", "--fast"]')
+        if members.robots[config.robot].role != "robot":
+            raise ConfigError(f"{where}: {config.robot} is a {members.robots[config.robot].role}, and runs no programs")
+        try:
+            uid = user_of(task.user).pw_uid if task.user else os.geteuid()
+        except KeyError as error:
+            raise ConfigError(f"{where}: user = {task.user!r}: this robot has no such user; see getent passwd") from error
+        if uid != os.geteuid() and os.geteuid() != 0:
+            raise ConfigError(f"{where}: user = {task.user!r}: this agent has no root's rights: it runs programs of its own user")
 
 
 def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Final
 
+from msgspec import msgpack
 from msgspec.structs import replace
 
 from agent.config import ComponentConfig, Config, Settings
-from checkpoint.device_rules import arrived, merged
+from agent.task_config import TaskConfig, user_of
+from checkpoint.device_rules import arrived, merged, travelling
 from checkpoint.engine import Carry, Terms
 from checkpoint.program import cpu_baseline
 from checkpoint.store.retention import Retention
@@ -36,7 +40,41 @@ def node_config(settings: Settings) -> types.Config:
         witnesses=_members(settings, "witness"),
         patience_ms=config.patience_s * 1_000,
         boot_patience_ms=config.boot_patience_s * 1_000,
+        components=tuple(_declared(settings, name, task) for name, task in config.tasks.items()),
     )
+
+
+def _declared(settings: Settings, name: str, task: TaskConfig) -> types.ComponentSpec:
+    """A component that the agent starts by itself, as if ``failover run`` had been told so."""
+    from failover.client.control import SOCKET_NAME, SYSTEM_SOCKET  # here: an agent without tasks does not load it
+
+    config, component = settings.config, settings.component(name)
+    variables = {"PATH": os.environ.get("PATH", os.defpath)}
+    if (socket := Path(config.runtime_directory) / SOCKET_NAME) != SYSTEM_SOCKET:
+        variables["FAILOVER_SOCKET"] = str(socket)
+    inheritance, owner = b"", os.geteuid()
+    if task.user:
+        from checkpoint.linux.spawn.inherited_limits import Inheritance  # here: an agent without tasks does not load it
+
+        user = user_of(task.user)
+        owner, groups = user.pw_uid, tuple(os.getgrouplist(user.pw_name, user.pw_gid))
+        inheritance = msgpack.encode(Inheritance(user.pw_uid, user.pw_gid, groups))
+        variables |= {"HOME": user.pw_dir, "USER": user.pw_name, "LOGNAME": user.pw_name}
+    level = level_of("", config, component)
+    variables = cpu_baseline.environment(variables, level) if level else variables
+    launch = Launch(
+        task.command,
+        tuple({**variables, **task.environment}.items()),
+        task.directory,
+        engine=task.engine,
+        inheritance=inheritance,
+        carry=component.carry,
+        devices=travelling(component.device_rules()),
+        connections=component.connections,
+        shared=component.shared,
+        shared_memory=component.shared_memory,
+    )
+    return types.ComponentSpec(name, config.robot, launch, rules_for(config, component), owner)
 
 
 def retention(config: Config) -> Retention:

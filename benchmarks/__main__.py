@@ -46,6 +46,7 @@ from benchmarks import (
     results,
     soak,
     task,
+    task_times,
 )
 from benchmarks.figures import Absent, Findings
 from benchmarks.running import BenchmarkError
@@ -119,6 +120,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "task": task.task,
     "board": board.board,
     "board_in_c": board_in_c.board_in_c,
+    "task_times": task_times.task_times,
 }
 
 BY_ITSELF: Final = "soak"

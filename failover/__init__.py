@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         NoAgentError,
         NotCommittedError,
         OvertakenError,
+        ScheduleError,
         StaleEpochError,
         StateTakenError,
         TaskError,
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     )
     from failover.fencing.epoch import epoch
     from failover.fencing.gateway import Gateway
+    from failover.schedule.task import scheduled
     from failover.task.api import Resumed, activations, commit, resume, resumed, transaction, wait_committed
     from failover.task.component import component, kept, run
     from failover.task.loop import every
@@ -79,11 +81,13 @@ _HOMES = {
     "FINISHED": "failover.task.period",
     "every": "failover.task.loop",
     "resumable": "failover.task.resumable",
+    "scheduled": "failover.schedule.task",
     "scratch": "failover.task.scratch",
     "AgentRefusedError": "failover.errors",
     "BoardError": "failover.errors",
     "NeverWrittenError": "failover.errors",
     "OvertakenError": "failover.errors",
+    "ScheduleError": "failover.errors",
     "ValueMisfitError": "failover.errors",
     "WriterTakenError": "failover.errors",
     "FailoverError": "failover.errors",
@@ -111,6 +115,7 @@ __all__ = [
     "NotCommittedError",
     "OvertakenError",
     "Resumed",
+    "ScheduleError",
     "StaleEpochError",
     "StateTakenError",
     "TaskError",
@@ -128,6 +133,7 @@ __all__ = [
     "resume",
     "resumed",
     "run",
+    "scheduled",
     "scratch",
     "transaction",
     "wait_committed",

@@ -53,6 +53,14 @@ class BoardGoneError(BoardError):
     """The board that was open was removed or made anew; a program that calls again works with the new one."""
 
 
+class ScheduleError(FailoverError):
+    """Something about the schedule of tasks does not work, and nothing changed; the message names the task and the cure."""
+
+
+class ScheduleGoneError(ScheduleError):
+    """The schedule that was open was removed or made anew; a program that calls again works with the new one."""
+
+
 class NeverWrittenError(BoardError):
     """An item has no value yet: its writer has not put one."""
 

@@ -451,8 +451,8 @@ static inline uint64_t fb_digest_(const void *at, uint64_t size)
 
 /* --- Clock and kernel ---------------------------------------------------------------------------------------------------------------- */
 
-/* What this process's CLOCK_BOOTTIME is ahead of the machine's: a protected program may live in a time namespace. 0 without those. */
-static inline int64_t fb_skew_(void)
+/* What a clock of this process, "boottime" or "monotonic", is ahead of the machine's: a protected program may live in a time namespace. 0 without those. */
+static inline int64_t fb_skew_of_(const char *clock)
 {
     char line[128];
     long long seconds = 0, nanoseconds = 0;
@@ -460,11 +460,15 @@ static inline int64_t fb_skew_(void)
     if (file == NULL)
         return 0;
     while (fgets(line, sizeof line, file) != NULL)
-        if (sscanf(line, "boottime %lld %lld", &seconds, &nanoseconds) == 2)
+        if (strncmp(line, clock, strlen(clock)) == 0 && sscanf(line + strlen(clock), "%lld %lld", &seconds, &nanoseconds) == 2)
             break;
+        else
+            seconds = nanoseconds = 0;
     fclose(file);
     return (int64_t)seconds * 1000000000 + nanoseconds;
 }
+
+static inline int64_t fb_skew_(void) { return fb_skew_of_("boottime"); }
 
 static inline int64_t fb_clock_(clockid_t clock)
 {
@@ -788,28 +792,33 @@ static inline void fb_give_up_(fb_board *board)
     board->own = NULL;
 }
 
+/* What lies beside the agent's socket under a name; `path` has PATH_MAX bytes. */
+static inline void fb_beside_socket_(char *path, const char *name)
+{
+    const char *socket = getenv("FAILOVER_SOCKET"), *runtime = getenv("XDG_RUNTIME_DIR");
+    char *slash;
+    if (socket != NULL && *socket != '\0') {
+        snprintf(path, PATH_MAX, "%s", socket);
+    } else {
+        snprintf(path, PATH_MAX, "%s/failover/control.sock", runtime == NULL ? "" : runtime);
+        if (runtime == NULL || *runtime == '\0' || access(path, F_OK) != 0)
+            snprintf(path, PATH_MAX, "/run/failover/control.sock");
+    }
+    slash = strrchr(path, '/');
+    slash = slash == NULL ? path : slash + 1;
+    snprintf(slash, PATH_MAX - (size_t)(slash - path), "%s", name);
+}
+
 /* Where this program's board is, as BOARD.md says. `is_named`: by the caller or the environment. */
 static inline int fb_find_directory_(fb_board *board, bool *is_named)
 {
-    char path[PATH_MAX], robot[65] = "robot", *slash;
-    const char *named = board->chosen != NULL ? board->chosen : getenv("FAILOVER_BOARD"), *socket = getenv("FAILOVER_SOCKET");
+    char path[PATH_MAX], robot[65] = "robot";
+    const char *named = board->chosen != NULL ? board->chosen : getenv("FAILOVER_BOARD");
     *is_named = named != NULL && *named != '\0';
     if (*is_named) {
         snprintf(path, sizeof path, "%s", named);
     } else {
-        const char *runtime = getenv("XDG_RUNTIME_DIR");
-        if (socket != NULL && *socket != '\0') {
-            snprintf(path, sizeof path, "%s", socket);
-        } else {
-            snprintf(path, sizeof path, "%s/failover/control.sock", runtime == NULL ? "" : runtime);
-            if (runtime == NULL || *runtime == '\0' || access(path, F_OK) != 0)
-                snprintf(path, sizeof path, "/run/failover/control.sock");
-        }
-        slash = strrchr(path, '/');
-        if (slash == NULL)
-            snprintf(path, sizeof path, "board");
-        else
-            snprintf(slash, sizeof path - (size_t)(slash - path), "/board");
+        fb_beside_socket_(path, "board");
         if (access(path, F_OK) != 0) {
             gethostname(robot, sizeof robot - 1);
             for (const char *at = robot; *at != '\0'; at++)
@@ -884,7 +893,7 @@ static inline void fb_remove_(const fb_board *board, int own)
     if (pwrite(own, &gone, 8, FB_GENERATION_AT_) != 8)
         return;
     for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder)) {
-        if (strcmp(entry->d_name, "private") != 0 && strncmp(entry->d_name, "own+", 4) != 0 && strncmp(entry->d_name, "peer-", 5) != 0)
+        if (strcmp(entry->d_name, "private") != 0 && strcmp(entry->d_name, "schedule") != 0 && strncmp(entry->d_name, "own+", 4) != 0 && strncmp(entry->d_name, "peer-", 5) != 0)
             continue;
         snprintf(path, sizeof path, "%s/%s", board->directory, entry->d_name);
         int file = open(path, O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK);

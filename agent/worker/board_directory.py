@@ -16,11 +16,12 @@ from typing import Final
 
 from agent.config import Settings
 from agent.errors import AgentError
-from failover.boards import LINK_NAME, boottime, directory
+from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, directory
 from failover.boards.mapping import MappedFile
+from failover.boards.schedule_file import ScheduleFile
 from failover.core.board import layout
 from failover.core.board.items import Item
-from failover.errors import BoardError
+from failover.errors import BoardError, ScheduleError
 
 DIRECTORY_MODE: Final = 0o755
 PROGRAMS_MODE: Final = 0o660
@@ -41,6 +42,8 @@ def provide(settings: Settings) -> Path | None:
     board = settings.team.items()
     link = Path(settings.config.runtime_directory) / LINK_NAME
     if not board.items or settings.me.role != "robot":
+        if link.is_symlink():
+            directory.dismiss(link / SCHEDULE_NAME)  # its tasks go on at the place without a board
         link.unlink(missing_ok=True)
         return None
     place, me = place_of(settings), settings.config.robot
@@ -56,8 +59,17 @@ def provide(settings: Settings) -> Path | None:
             directory.dismiss(path)
     files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me))
     files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me))
+    files.have_schedule(me)
     _point(link, place)
+    _leave(Path(settings.config.runtime_directory) / SCHEDULE_PLACE)
     return place
+
+
+def _leave(former: Path) -> None:
+    """The robot had no board before: tell its tasks that the schedule is beside the board now."""
+    directory.dismiss(former / SCHEDULE_NAME)
+    with contextlib.suppress(OSError):
+        former.rmdir()
 
 
 class _Files:
@@ -89,6 +101,20 @@ class _Files:
             mode=mode,
             group=self._group,
         )
+
+    def have_schedule(self, robot: str) -> None:
+        """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""
+        path = self._place / SCHEDULE_NAME
+        with contextlib.suppress(ScheduleError, FileNotFoundError):
+            file = ScheduleFile.open(path, writable=True)
+            header = file.header
+            file.close()
+            if (header.boot_id, header.robot) == (boottime.boot_id(), robot):
+                os.chown(path, -1, self._group)
+                path.chmod(PROGRAMS_MODE)
+                return
+        directory.dismiss(path)
+        directory.make_schedule(self._place, robot, mode=PROGRAMS_MODE, group=self._group)
 
     def _fits(self, path: Path, area: int, robot: str) -> bool:
         try:

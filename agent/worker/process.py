@@ -22,6 +22,7 @@ from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.system.crash import end_worker_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
+from agent.worker import schedule_place
 from agent.worker.components import launch, prerequisites
 from agent.worker.components.context import Surroundings
 from agent.worker.components.hooks import Hooks
@@ -103,6 +104,7 @@ class Worker(Switchboard):
         for directory in (self.places.sockets, self.places.logs):
             make_directory(directory)
         await self._provide_board()
+        await self._declare_tasks()
         store = self._store = await self._open_store()
         records = Records(self._runtime / "running")
         hooks, here = Hooks(self._starter), self.settings.component
@@ -134,6 +136,7 @@ class Worker(Switchboard):
 
     async def _provide_board(self) -> None:
         if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):
+            self._provide_place_of_schedule()
             return
         from agent.worker import board_directory  # here: a team without a board does not load it
 
@@ -145,6 +148,29 @@ class Worker(Switchboard):
         else:
             if place is not None:
                 log.info("the board is %s", place)
+            else:
+                self._provide_place_of_schedule()
+
+    def _provide_place_of_schedule(self) -> None:
+        if self.settings.me.role != "robot":
+            return
+        try:
+            schedule_place.provide(self._runtime, self.settings.config.group)
+        except (AgentError, OSError) as error:
+            log.warning("no schedule: %s", error)
+            self._own_troubles.append(f"tasks of different users have no schedule together: {error}")
+
+    async def _declare_tasks(self) -> None:
+        if not self.settings.config.tasks:
+            return
+        from agent.worker import declared_tasks  # here: a robot without tasks does not load them
+
+        try:
+            for note in await asyncio.to_thread(declared_tasks.declare, self.settings):
+                log.info("%s", note)
+        except (FailoverError, OSError) as error:
+            log.warning("tasks not declared: %s", error)
+            self._own_troubles.append(f"the tasks of agent.toml are not on the schedule: {error}")
 
     async def _give_signs(self) -> None:
         """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""

@@ -8,3 +8,7 @@ from typing import Final
 
 LINK_NAME: Final = "board"
 """A symbolic link in the agent's runtime directory, to the board of its robot."""
+SCHEDULE_PLACE: Final = "failover-schedule"
+"""A directory there, in which the first task makes the schedule of a robot without a board."""
+SCHEDULE_NAME: Final = "schedule"
+"""The file of a schedule in its directory."""

@@ -17,8 +17,8 @@ _OFFSETS: Final = Path("/proc/self/timens_offsets")
 _NS_PER_S: Final = 1_000_000_000
 
 
-def skew_ns() -> int:
-    """What this process's CLOCK_BOOTTIME is ahead of the machine's; 0 on a kernel without time namespaces.
+def skew_ns(clock: str = "boottime") -> int:
+    """What this process's CLOCK_BOOTTIME, or "monotonic", is ahead of the machine's; 0 on a kernel without time namespaces.
 
     To be read again after a restore: the program may be in another namespace.
     """
@@ -26,12 +26,22 @@ def skew_ns() -> int:
         rows = [line.split() for line in _OFFSETS.read_text().splitlines()]
     except OSError:
         return 0
-    return next((int(row[1]) * _NS_PER_S + int(row[2]) for row in rows if row[0] == "boottime"), 0)
+    return next((int(row[1]) * _NS_PER_S + int(row[2]) for row in rows if row[0] == clock), 0)
 
 
 def now_ns(skew: int) -> int:
     """The machine's CLOCK_BOOTTIME."""
     return CLOCK(time.CLOCK_BOOTTIME) - skew
+
+
+def now_monotonic_ns() -> int:
+    """This process's CLOCK_MONOTONIC."""
+    return CLOCK(time.CLOCK_MONOTONIC)
+
+
+def machine_ns() -> int:
+    """The machine's CLOCK_MONOTONIC, which the schedule goes by."""
+    return CLOCK(time.CLOCK_MONOTONIC) - skew_ns("monotonic")
 
 
 def boot_id() -> bytes:

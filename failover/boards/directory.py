@@ -9,19 +9,23 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from failover.boards import LINK_NAME, boottime, locks
-from failover.boards.mapping import GENERATION, MappedFile
+from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, locks
+from failover.boards.mapping import MappedFile
+from failover.boards.schedule_file import ScheduleFile
+from failover.boards.shared_file import GENERATION, SharedFile
 from failover.client.control import socket_path
 from failover.core.board import layout
 from failover.core.board.items import ITEMS_MAX, Item
 from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LOCK, USER_LOCKS, USERS_MAX
+from failover.core.schedule import layout as schedule_layout
 from failover.core.wire.codec import team_tag
 from failover.core.wire.names import check_robot
-from failover.errors import BoardError, BoardGoneError, NameFormatError
+from failover.errors import BoardError, BoardGoneError, NameFormatError, ScheduleError
 
 VARIABLE: Final = "FAILOVER_BOARD"
 SHARED_MEMORY: Final = Path("/dev/shm")
@@ -42,6 +46,24 @@ def find() -> Path:
     link = socket_path().parent / LINK_NAME
     if link.exists():
         return link
+    return _of_this_user()
+
+
+def find_schedule() -> Path:
+    """Where this program's schedule is: beside the board; without one, the agent's place if this user may use it."""
+    place = socket_path().parent / SCHEDULE_PLACE
+    found = find()
+    if found == _of_this_user() and os.access(place, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
+        return place
+    return found
+
+
+def is_agents_place(directory: Path) -> bool:
+    """Whether a directory holds the schedule of a robot without a board: no board is made there."""
+    return directory.name == SCHEDULE_PLACE
+
+
+def _of_this_user() -> Path:
     return SHARED_MEMORY / f"failover-u{os.geteuid()}-{this_robot()}"
 
 
@@ -92,10 +114,7 @@ def make_file(
     header = layout.new_header(
         flags, capacity, check_robot(robot), boottime.boot_id(), rank=rank, state=state, roster_digest=digest
     )
-    made = os.open(path.parent, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, mode)
-    try:
-        os.fchown(made, -1, group)
-        os.fchmod(made, mode)  # not what the umask leaves of it
+    with _linked(path, mode, group) as made:
         os.ftruncate(made, layout.names_at(capacity))
         os.pwrite(made, header, 0)
         for number, item in (items or {}).items():
@@ -107,14 +126,40 @@ def make_file(
         if hold:
             locks.take(made, TABLE_LOCK)
             locks.take(made, USER_LOCKS)
-        os.link(f"/proc/self/fd/{made}", path, src_dir_fd=made)  # with a descriptor Python follows the link, linkat(2)
-    except BaseException:
-        os.close(made)
-        raise
     if hold:
         return made
     os.close(made)
     return -1
+
+
+@contextmanager
+def _linked(path: Path, mode: int, group: int = -1) -> Iterator[int]:
+    """A file without a name that the body fills; then it has its place. The caller closes it."""
+    made = os.open(path.parent, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, mode)
+    try:
+        os.fchown(made, -1, group)
+        os.fchmod(made, mode)  # not what the umask leaves of it
+        yield made
+        os.link(f"/proc/self/fd/{made}", path, src_dir_fd=made)  # with a descriptor Python follows the link, linkat(2)
+    except BaseException:
+        os.close(made)
+        raise
+
+
+def make_schedule(place: Path, robot: str, flags: int = 0, *, mode: int = 0o600, group: int = -1) -> None:
+    """The table of a robot's tasks, without tasks.
+
+    Raises:
+        FileExistsError: there is one.
+        OSError: it cannot be made there.
+    """
+    second = 1_000_000_000
+    origin_ns = boottime.machine_ns() // second * second
+    header = schedule_layout.new_header(check_robot(robot), boottime.boot_id(), origin_ns, flags)
+    with _linked(place / SCHEDULE_NAME, mode, group) as made:
+        os.ftruncate(made, schedule_layout.FILE_SIZE)
+        os.pwrite(made, header, 0)
+    os.close(made)
 
 
 def make_peer(
@@ -131,9 +176,10 @@ def make_peer(
 
 
 def dismiss(path: Path) -> None:
-    """Unlink a file of a board, and tell all who have it open that it is another one now."""
-    with contextlib.suppress(OSError, BoardError):
-        file = MappedFile.open(path, writable=True)
+    """Unlink a file of a board, or the schedule, and tell all who have it open that it is another one now."""
+    kind: type[SharedFile] = ScheduleFile if path.name == SCHEDULE_NAME else MappedFile
+    with contextlib.suppress(OSError, BoardError, ScheduleError):
+        file = kind.open(path, writable=True)
         file.words[GENERATION] = GONE
         file.close()
     path.unlink(missing_ok=True)
@@ -263,7 +309,12 @@ def _is_abandoned(path: Path, descriptor: int) -> bool:
 def _remove(directory: Path, own: int) -> None:
     """Tell all who have the files open, and unlink them, ``own`` last; the table lock of ``own`` is held."""
     os.pwrite(own, layout.WORD.pack(GONE), layout.GENERATION_AT)
-    for path in (directory / PRIVATE_NAME, *directory.glob(f"{OWN_NAME}+*"), *directory.glob(f"{PEER_PREFIX}*")):
+    for path in (
+        directory / PRIVATE_NAME,
+        directory / SCHEDULE_NAME,
+        *directory.glob(f"{OWN_NAME}+*"),
+        *directory.glob(f"{PEER_PREFIX}*"),
+    ):
         dismiss(path)
     (directory / OWN_NAME).unlink(missing_ok=True)
     with contextlib.suppress(OSError):

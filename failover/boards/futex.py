@@ -1,6 +1,6 @@
 """Sleep until a word of a mapped file changes, and wake those that do, also from another process.
 
-Source: futex(2), FUTEX_WAIT and FUTEX_WAKE without FUTEX_PRIVATE_FLAG; Python's C API, buffer protocol.
+Source: futex(2), FUTEX_WAIT, FUTEX_WAIT_BITSET and FUTEX_WAKE without FUTEX_PRIVATE_FLAG; Python's C API, buffer protocol.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ NUMBERS: Final = {"x86_64": 202, "aarch64": 98, "riscv64": 98}
 
 _WAIT: Final = 0
 _WAKE: Final = 1
+_WAIT_BITSET: Final = 9
+_ANY: Final = 0xFFFFFFFF
 _ALL: Final = 2**31 - 1
 _NS_PER_S: Final = 1_000_000_000
 
@@ -51,6 +53,18 @@ def wait(address: int, value: int, timeout_s: float) -> None:
         wrong = ctypes.get_errno()
         if wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
             raise BoardError(f"cannot wait for the board: {os.strerror(wrong)}")
+
+
+def wait_until(address: int, value: int, instant_ns: int) -> None:
+    """Sleep until woken, or until an instant of CLOCK_MONOTONIC as this process reads it. May wake early.
+
+    Only as long as the 32 bits at ``address`` are ``value``.
+    """
+    limit = _Timespec(*divmod(max(instant_ns, 0), _NS_PER_S))
+    if _call()(_number(), ctypes.c_void_p(address), _WAIT_BITSET, ctypes.c_uint32(value), ctypes.byref(limit), None, _ANY) == -1:
+        wrong = ctypes.get_errno()
+        if wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
+            raise BoardError(f"cannot wait in the schedule: {os.strerror(wrong)}")
 
 
 def wake(address: int) -> None:

@@ -14,7 +14,7 @@ from typing import Final
 
 from checkpoint.segment.layout import lock_of
 from failover.core.board.layout import TABLE_LOCK
-from failover.errors import BoardError
+from failover.errors import BoardError, FailoverError
 
 TABLE_WAIT_S: Final = 5.0
 """A change of a table takes microseconds. Whoever holds the lock for so long is stopped."""
@@ -44,16 +44,16 @@ def is_taken(descriptor: int, byte: int) -> bool:
 
 
 @contextmanager
-def table(descriptor: int, what: str) -> Iterator[None]:
+def table(descriptor: int, what: str, error: type[FailoverError] = BoardError) -> Iterator[None]:
     """Hold the table lock of a file.
 
     Raises:
-        BoardError: another process has held it for `TABLE_WAIT_S`.
+        BoardError, or ``error``: another process has held it for `TABLE_WAIT_S`.
     """
     end = time.monotonic() + TABLE_WAIT_S
     while not take(descriptor, TABLE_LOCK):
         if time.monotonic() > end:
-            raise BoardError(f"{what}: another process has held the lock of the table for {TABLE_WAIT_S:g} s; is it stopped?")
+            raise error(f"{what}: another process has held the lock of the table for {TABLE_WAIT_S:g} s; is it stopped?")
         time.sleep(PAUSE_S)
     try:
         yield

@@ -1,102 +1,31 @@
-"""One mapped file of a board: its records, its items' places, changes of its table, its users' and writers' locks.
-
-A file is opened twice. The first opening is for the mapping (Python's mmap keeps a duplicate of its descriptor for as long as it
-lives); the locks belong to the second one, which can be closed at any time, and so be given back.
-"""
+"""One mapped file of a board: its records, its items' places, its users' and writers' locks."""
 
 from __future__ import annotations
 
-import contextlib
-import mmap
 import os
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
-from failover.boards import futex, locks
+from failover.boards import locks
+from failover.boards.shared_file import SharedFile
 from failover.core.board import layout
 from failover.core.board.banks import Place, place_of
 from failover.core.board.items import BLOCK_SIZE_MAX
-from failover.core.board.layout import GENERATION_AT, GONE, HOLE, USER_LOCKS, USERS_MAX, WRITER_LOCKS, Header, Record, Wanted
+from failover.core.board.layout import USER_LOCKS, USERS_MAX, WRITER_LOCKS, Header, Record, Wanted
 from failover.errors import BoardError, BoardGoneError
 
-GENERATION: Final = GENERATION_AT // 8
 _U32: Final = struct.Struct("<I")
 
 
-class MappedFile:
-    """A file of a board, mapped. It stays mapped for as long as anything refers to it; `close` gives back locks and descriptor.
+class MappedFile(SharedFile):
+    """A file of a board, mapped; see `SharedFile`. It may grow while it is open."""
 
-    Attributes:
-        path: for messages.
-        is_writable: this process may put items here, and change the table.
-        area, words, halves: the mapping as bytes, as words of eight bytes and of two.
-        header: as it was when the file was mapped.
-        descriptor: for locks; -1: closed, or the file may only be read.
-    """
+    SIZE_MIN: ClassVar[int] = layout.RECORDS_AT
+    SIZE_MAX: ClassVar[int] = BLOCK_SIZE_MAX
 
-    def __init__(self, path: Path, area: mmap.mmap, is_writable: bool, descriptor: int, identity: tuple[int, int]) -> None:
-        self._identity = identity
-        self.path = path
-        self.is_writable = is_writable
-        self.descriptor = descriptor
-        self._map(area)
-        self.header = self.read_header()
-
-    def _map(self, area: mmap.mmap) -> None:
-        self.area = area
-        self.view = memoryview(area)
-        whole = self.view[: len(area) & ~7]
-        self.words, self.halves = whole.cast("Q"), whole.cast("H")
-
-    @classmethod
-    def open(cls, path: Path, descriptor: int = -1, *, writable: bool | None = None) -> MappedFile:
-        """Map a file.
-
-        Args:
-            descriptor: an opening of it for its locks, which becomes the file's; -1: one is made.
-            writable: None: if this user may write it.
-
-        Raises:
-            BoardError: it is no board, or cannot be opened.
-            FileNotFoundError: there is none.
-        """
-        if writable is None:
-            writable = os.access(path, os.W_OK, effective_ids=True)
-        flags = (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC | os.O_NOFOLLOW
-        try:
-            opened = os.open(path, flags)
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise BoardError(f"cannot open {path}: {error.strerror}") from error
-        try:
-            file = cls(path, _mapped(path, opened, writable), writable, descriptor, _identity(opened))
-            if writable and descriptor < 0:
-                file.descriptor = _second_opening(path, opened)
-            return file
-        finally:
-            os.close(opened)
-
-    def close(self) -> None:
-        """Give back the locks and the descriptor; what is mapped can still be read."""
-        descriptor, self.descriptor = self.descriptor, -1
-        if descriptor >= 0:
-            os.close(descriptor)
+    header: Header
 
     # --- What the file says ---
-
-    @property
-    def generation(self) -> int:
-        """As it is now."""
-        return self.words[GENERATION]
-
-    @property
-    def is_gone(self) -> bool:
-        """The board was made anew or removed, or the mapping is a hole."""
-        return self.generation in (GONE, HOLE)
 
     def read_header(self) -> Header:
         """As it is now.
@@ -126,13 +55,7 @@ class MappedFile:
         """
         header = self.read_header()
         if header.file_size > len(self.area):
-            opened = os.open(self.path, (os.O_RDWR if self.is_writable else os.O_RDONLY) | os.O_CLOEXEC | os.O_NOFOLLOW)
-            try:
-                if _identity(opened) != self._identity:
-                    raise BoardGoneError(f"{self.path}: it was made anew")
-                self._map(_mapped(self.path, opened, self.is_writable))
-            finally:
-                os.close(opened)
+            self._map_again()
         return self.read_header()
 
     def record(self, name: str) -> Record | None:
@@ -159,34 +82,6 @@ class MappedFile:
     def set_word16(self, offset: int, word: int) -> None:
         """Two bytes."""
         self.halves[offset // 2] = word
-
-    def address(self, offset: int) -> int:
-        """Where a byte lies in this process; good while the mapping is."""
-        return futex.address_of(self.area) + offset
-
-    # --- Changes of the table ---
-
-    @contextmanager
-    def changing(self) -> Iterator[None]:
-        """The generation is odd for the body, and the table lock is held; the caller keeps other threads out."""
-        with locks.table(self.descriptor, f"cannot change the items of {self.path}"):
-            generation = self.read_header().generation
-            generation += generation % 2  # an odd one: whoever changed the table has died
-            self.words[GENERATION] = generation + 1
-            try:
-                yield
-            finally:
-                if not self.is_gone:
-                    self.words[GENERATION] = generation + 2
-
-    def mend(self) -> None:
-        """Make the generation even if the process that was to do it has died."""
-        if self.is_writable and self.generation % 2 and not self.is_gone and locks.take(self.descriptor, layout.TABLE_LOCK):
-            try:
-                if self.generation % 2 and not self.is_gone:
-                    self.words[GENERATION] += 1
-            finally:
-                locks.give(self.descriptor, layout.TABLE_LOCK)
 
     def add(self, wanted: Wanted) -> None:
         """Append an item, inside of `changing`.
@@ -238,31 +133,3 @@ class MappedFile:
             return False
         self.set_word32(record.at + layout.PID_FIELD, pid)
         return True
-
-
-def _identity(descriptor: int) -> tuple[int, int]:
-    opened = os.fstat(descriptor)
-    return opened.st_dev, opened.st_ino
-
-
-def _mapped(path: Path, descriptor: int, writable: bool) -> mmap.mmap:
-    size = os.fstat(descriptor).st_size
-    if size < layout.RECORDS_AT:
-        raise BoardError(f"{path}: this is no board: it has {size} bytes")
-    size = min(size, BLOCK_SIZE_MAX)
-    protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
-    try:
-        return mmap.mmap(descriptor, size, mmap.MAP_SHARED, protection)
-    except OSError as error:
-        raise BoardError(f"cannot map {path}: {error.strerror}") from error
-
-
-def _second_opening(path: Path, first: int) -> int:
-    """Another opening of the very file that is open already."""
-    with contextlib.suppress(OSError):
-        return os.open(f"/proc/self/fd/{first}", os.O_RDWR | os.O_CLOEXEC)
-    again = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
-    if not os.path.sameopenfile(first, again):
-        os.close(again)
-        raise BoardGoneError(f"{path}: it was made anew while it was opened")
-    return again

@@ -303,6 +303,62 @@ VERBS: Final = (
         "failover.cli.verbs.board:show",
     ),
     Verb(
+        "ps",
+        "the tasks of this robot's schedule: state, period, lateness, duration, misses",
+        """
+        Shows the tasks that programs of this robot run at their times (docs/tasks.md), the most urgent first. Lateness is
+        the span from the instant at which an activation was due to its beginning: half of the activations, and 99 of 100, were
+        below the bound that is shown. No agent is needed. Exit status 1: no process runs one of them.
+
+          failover ps
+          failover ps --watch
+        """,
+        arguments.ps,
+        "failover.cli.verbs.tasks:show",
+    ),
+    Verb(
+        "task",
+        "orders to tasks: add, set, remove, run, run-once, import; histogram shows how late one began",
+        """
+        Changes tasks while they run. A change comes into force between two activations of its task, never within one, and no
+        other task notices. All of an order is done, or nothing. failover task ACT --help explains an act.
+
+          failover task set mapper period_ms=100
+          failover task set mapper after=odometry,vision --next
+          failover task add logger period_ms=1000
+          failover task remove logger
+          failover task run logger period_ms=1000 -- ./log-disk
+          failover task histogram mapper
+        """,
+        arguments.task,
+        "failover.cli.verbs.tasks:show",
+    ),
+    Verb(
+        "trace",
+        "what the tasks do in some seconds, as a file for Perfetto",
+        """
+        Looks at the tasks of this robot, and writes a file that https://ui.perfetto.dev and chrome://tracing open: a track for
+        each task, a slice for each activation, missed deadlines, and arrows from predecessors to what waited for them. The tasks
+        do not notice.
+
+          failover trace -o robot.pftrace --for 10s
+        """,
+        arguments.trace,
+        "failover.cli.verbs.task_files:write_trace",
+    ),
+    Verb(
+        "wait-activation",
+        "in a script that failover task run --loop has started: wait for the next activation",
+        """
+        The activation before ends, and the next one begins when this returns. It says number, instant at which the activation was
+        due, lateness (both in nanoseconds), and how many were missed before it. Exit status 1: there is no next one.
+
+          while failover wait-activation -q; do df / >> disk.log; done
+        """,
+        arguments.wait_activation,
+        "failover.cli.verbs.task_programs:wait_activation",
+    ),
+    Verb(
         "check",
         "can failover protect programs here, or this process; and what to change",
         """

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+from failover.core.schedule.course import Course
+
 
 @dataclass(slots=True)
 class Activations:
@@ -30,12 +32,10 @@ class Activations:
         self.steps += 1
         if not self.period_ns:
             return now_ns
-        self._due += 1
-        late = (now_ns - self.begin_ns) // self.period_ns - self._due + 1
-        if late > 0 and now_ns > self.begin_ns + self._due * self.period_ns:
-            self.overruns += late
-            self._due += late
-        return self.begin_ns + self._due * self.period_ns
+        course = Course(0, self.begin_ns, self.period_ns)
+        before, self._due = self._due, course.following(self._due, now_ns)
+        self.overruns += self._due - before - 1
+        return course.due_ns(self._due)
 
 
 class Finished(enum.Enum):

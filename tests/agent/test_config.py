@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import pwd
 import re
 import tomllib
 from dataclasses import replace
@@ -16,7 +18,9 @@ from agent.config import ComponentConfig, Config
 from agent.core_config import level_of, node_config, started_here
 from agent.errors import ConfigError
 from agent.main import main as agent_main
+from agent.task_config import TaskConfig, declaration
 from agent.worker.network.replication_link import new_keys
+from checkpoint.linux.spawn.inherited_limits import Inheritance
 from failover.config import team
 from failover.config.team import Robot, Role, Team
 from failover.core.types import Launch, Rule
@@ -42,12 +46,71 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     text = DOCUMENTED.read_text()
     documented = tomllib.loads(re.sub(r"^#(\w+ = |\[)", r"\1", text, flags=re.MULTILINE))
     (component,) = documented.pop("components").values()
+    (task,) = documented.pop("tasks").values()
     assert documented.pop("robot") == "robot1"
     defaults = dataclasses.asdict(Config("robot1"))
-    del defaults["robot"], defaults["components"]
+    del defaults["robot"], defaults["components"], defaults["tasks"]
     assert documented == defaults
     assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
     assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
+    assert set(task) == {one.name for one in dataclasses.fields(TaskConfig)}
+    assert msgspec.convert(task, TaskConfig) == TaskConfig()
+
+
+TASK = ('[tasks."/lab/robot1/controller"]', 'command = ["/opt/controller", "--fast"]')
+
+
+def test_a_declared_task_is_a_component_that_the_core_starts_by_itself(directory: Path) -> None:
+    user = pwd.getpwuid(os.geteuid())
+    lines = (
+        'runtime_directory = "/run/other"',
+        *TASK,
+        f'user = "{user.pw_name}"',
+        'environment = { SPEED = "2" }',
+        "period_ms = 10",
+    )
+    rules = ('[components."/lab/robot1/controller"]', 'on_crash = "leave"')
+    (spec,) = node_config(configuration.load(written(directory, *lines, *rules))).components
+    assert (spec.name, spec.home, spec.owner, spec.launch.argv) == (
+        "/lab/robot1/controller",
+        "robot1",
+        os.geteuid(),
+        ("/opt/controller", "--fast"),
+    )
+    assert spec.rules.on_crash == "leave"
+    told = dict(spec.launch.environment)
+    assert (told["SPEED"], told["HOME"], told["FAILOVER_SOCKET"]) == ("2", user.pw_dir, "/run/other/control.sock")
+    rights = msgspec.msgpack.decode(spec.launch.inheritance, type=Inheritance)
+    assert (rights.uid, rights.gid) == (user.pw_uid, user.pw_gid)
+
+
+def test_a_task_without_a_period_runs_and_is_on_no_schedule(directory: Path) -> None:
+    settings = configuration.load(written(directory, *TASK))
+    assert len(node_config(settings).components) == 1
+    assert declaration("/lab/robot1/controller", settings.config.tasks["/lab/robot1/controller"]) is None
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("period_ms = 0.01", "a period of 1e-05 s; 0.0001 to 1,000,000 s are possible"),
+        ("period_ms = -1", "period_ms is -0.001 s"),
+        ("period_ms = nan", "period_ms is nan"),
+        ("period_ms = 10\ndeadline_ms = 20", "is longer than its period"),
+        ("period_ms = 10\nafter = ['/lab/robot1/controller']", "it is to run after itself"),
+        ("period_ms = 10\ncpus = [99]", "cpus = [99]: processors have the numbers 0 to 63"),
+        ("period_ms = 10\npriority = 100", "priority 100"),
+        ("user = 'no-such-user'", "user = 'no-such-user': this robot has no such user"),
+        ("directory = 'here'", "directory = 'here' is not absolute"),
+        ("command = ['']", "command is missing"),
+        ("environment = { 'A=B' = '' }", "environment has a variable 'A=B'"),
+    ],
+)
+def test_a_task_that_cannot_be_is_refused(directory: Path, line: str, said: str) -> None:
+    head = TASK[:1] if line.startswith("command") else TASK
+    with pytest.raises(ConfigError) as refusal:
+        configuration.load(written(directory, *head, line))
+    assert said in str(refusal.value) and "agent.toml:4" in str(refusal.value)
 
 
 def test_a_whole_configuration_is_read(directory: Path) -> None:

@@ -107,14 +107,14 @@ def until_taken_over(robot: RobotMachine, name: str = "count") -> None:
     until(lambda: component(robot, name).get("restores"), f"{robot.name} to resume {name}")
 
 
-def counts_on_elsewhere(first: RobotMachine, second: RobotMachine, more: int) -> None:
+def counts_on_elsewhere(first: RobotMachine, second: RobotMachine, more: int, name: str = "count") -> None:
     """A component counts, the first robot's power is cut, and it goes on at the second: each number once."""
-    until(lambda: len(numbers(first)) > more, "some numbers")
+    until(lambda: len(numbers(first, name)) > more, "some numbers")
     first.cut_power()
-    until_taken_over(second)
-    before = len(numbers(second))
-    until(lambda: len(numbers(second)) > before + more, "it to go on")
-    counted = numbers(second)
+    until_taken_over(second, name)
+    before = len(numbers(second, name))
+    until(lambda: len(numbers(second, name)) > before + more, "it to go on")
+    counted = numbers(second, name)
     assert counted == list(range(len(counted))), "each number once, in order"
 
 

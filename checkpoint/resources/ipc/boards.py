@@ -5,8 +5,9 @@ that others have, too, nor carry one robot's values to another. A restore maps p
 /dev/null in place of the files. A generation of zero tells the program's client that it must open the board again: it then opens
 the board of the robot where it runs, and takes its locks there.
 
-A board's files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``) in a directory ``/dev/shm/failover-…``. In
-any other directory a file counts as a board's if it also begins as one.
+Its files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``, and ``schedule``, the tasks of the robot) in a
+directory ``/dev/shm/failover-…``; ``schedule`` also in one that is called ``failover-schedule``. In any other directory a file
+counts as a board's if it also begins as one.
 
 Facts of a descriptor: ``descriptors``, ``path``, ``flags`` of open(2). Facts of the mappings: ``descriptors`` (none),
 ``mappings``: [address, pages] of each.
@@ -48,7 +49,10 @@ CAPABILITIES: Final = (
 MAGIC: Final = b"\x89FOBRD\r\n"
 PLACE: Final = "/dev/shm/failover-"
 """How the path of a board's directory begins where an agent makes it."""
-NAMES: Final = ("own", "private")
+SCHEDULE: Final = "/failover-schedule/schedule"
+"""How the path of the schedule ends on a robot without a board."""
+SCHEDULE_MAGIC: Final = b"\x89FOSCH\r\n"
+NAMES: Final = ("own", "private", "schedule")
 PREFIXES: Final = ("own+", "peer-")
 HARMLESS: Final = "/dev/null"
 FLAGS: Final = os.O_ACCMODE | os.O_NONBLOCK
@@ -71,6 +75,8 @@ def is_board(pid: int, path: str, key: tuple[int, int]) -> bool:
         return False
     if directory.startswith(PLACE) and "/" not in directory[len(PLACE) :]:
         return True
+    if path.removesuffix(DELETED).endswith(SCHEDULE):
+        return True
     return not path.endswith(DELETED) and _begins_as_one(f"{procfs.outlook(pid)}{path}", key)
 
 
@@ -86,7 +92,7 @@ def _begins_as_one(path: str, key: tuple[int, int]) -> bool:
     except OSError:  # closed to us, or gone
         return False
     try:
-        return stat.S_ISREG(os.fstat(descriptor).st_mode) and os.pread(descriptor, len(MAGIC), 0) == MAGIC
+        return stat.S_ISREG(os.fstat(descriptor).st_mode) and os.pread(descriptor, len(MAGIC), 0) in (MAGIC, SCHEDULE_MAGIC)
     except OSError:
         return False
     finally:

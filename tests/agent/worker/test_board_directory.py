@@ -12,8 +12,10 @@ import pytest
 
 import failover
 from agent import config as configuration
-from agent.worker import board_directory
+from agent.worker import board_directory, schedule_place
+from failover.boards import SCHEDULE_PLACE
 from failover.boards.mapping import MappedFile
+from failover.boards.schedule_file import ScheduleFile
 from failover.config import team
 from failover.config.team import Robot, Team
 from failover.core.board import layout
@@ -62,6 +64,11 @@ def found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FAILOVER_SOCKET", str(folder / "runtime" / "control.sock"))
 
 
+def boards_of(place: Path) -> list[Path]:
+    """The files of a board, without the schedule beside them."""
+    return [path for path in place.iterdir() if path.name != "schedule"]
+
+
 def test_a_team_without_a_board_has_no_directory(folder: Path) -> None:
     settings = loaded(folder)
     assert board_directory.provide(settings) is None
@@ -73,8 +80,8 @@ def test_the_declared_items_lie_in_the_files_of_their_robots(folder: Path) -> No
     place = board_directory.provide(loaded(folder, BALL))
     assert place is not None
     modes = {path.name: oct(path.stat().st_mode & 0o777) for path in place.iterdir()}
-    assert modes == {"own": "0o660", "private": "0o660", "peer-robot2": "0o640"}
-    names = {path.name: [record.name for record in MappedFile.open(path).records()] for path in place.iterdir()}
+    assert modes == {"own": "0o660", "private": "0o660", "schedule": "0o660", "peer-robot2": "0o640"}
+    names = {path.name: [record.name for record in MappedFile.open(path).records()] for path in boards_of(place)}
     assert names == {"own": ["ball"], "private": ["notes"], "peer-robot2": ["ball"]}
     with failover.board() as board:
         assert (board.robot, board.directory) == ("robot1", place)
@@ -126,17 +133,47 @@ def test_a_robot_that_left_the_team_leaves_the_board(folder: Path) -> None:
     members = {"robot1": settings.team.robots["robot1"], "robot3": settings.team.robots["robot2"]}
     team.write(directory, Team(settings.team.team, members, settings.team.board))
     board_directory.provide(loaded(folder))
-    assert {path.name for path in place.iterdir()} == {"own", "private", "peer-robot3"}
+    assert {path.name for path in place.iterdir()} == {"own", "private", "schedule", "peer-robot3"}
 
 
 def test_a_file_that_is_damaged_is_made_anew(folder: Path) -> None:
     settings = loaded(folder, BALL)
     place = board_directory.provide(settings)
     assert place is not None
-    for name, content in (("own", b"garbage" * 5000), ("private", b""), ("peer-robot2", bytes(40000))):
+    for name, content in (("own", b"garbage" * 5000), ("private", b""), ("schedule", b"x"), ("peer-robot2", bytes(40000))):
         (place / name).write_bytes(content)
     board_directory.provide(settings)
-    assert all(MappedFile.open(path).header.flags in layout.AREAS for path in place.iterdir())
+    assert all(MappedFile.open(path).header.flags in layout.AREAS for path in boards_of(place))
+    assert ScheduleFile.open(place / "schedule").rows() == {}
+
+
+@pytest.mark.usefixtures("found")
+def test_tasks_go_on_over_the_end_of_an_agent_and_the_start_of_the_next(folder: Path) -> None:
+    board_directory.provide(loaded(folder, BALL))
+    with failover.scheduled("mapper", period=0.005) as task:
+        first = task.wait_activation()
+        board_directory.provide(loaded(folder))
+        second = task.wait_activation()
+        assert first is not None and second is not None and second.number > first.number
+        assert task.live.counts.started == 2
+
+
+@pytest.mark.usefixtures("found")
+def test_tasks_follow_their_schedule_to_a_board_that_is_declared_and_back(folder: Path) -> None:
+    runtime = folder / "runtime"
+    schedule_place.provide(runtime, "")
+    with failover.scheduled("mapper", period=0.005) as task:
+        task.wait_activation()
+        assert (runtime / SCHEDULE_PLACE / "schedule").exists()
+        place = board_directory.provide(loaded(folder, BALL))
+        assert place is not None
+        task.wait_activation()
+        assert not (runtime / SCHEDULE_PLACE).exists()
+        assert [row.name for row in ScheduleFile.open(place / "schedule").rows().values()] == ["mapper"]
+        board_directory.provide(loaded(folder, ""))
+        schedule_place.provide(runtime, "")
+        task.wait_activation()
+        assert [row.name for row in ScheduleFile.open(runtime / SCHEDULE_PLACE / "schedule").rows().values()] == ["mapper"]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory to another user")

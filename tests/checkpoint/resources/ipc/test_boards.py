@@ -46,6 +46,13 @@ OTHER = (
 Compiled = Callable[..., Path]
 
 
+def test_the_schedule_of_a_robot_without_a_board_is_known_by_its_path() -> None:
+    nowhere = "/run/failover-of-a-test"
+    assert boards.is_board(os.getpid(), f"{nowhere}/failover-schedule/schedule", (0, 0))
+    assert not boards.is_board(os.getpid(), f"{nowhere}/schedule/schedule", (0, 0))
+    assert not boards.is_board(os.getpid(), f"{nowhere}/failover-schedule/own", (0, 0))
+
+
 def made(directory: Path) -> Path:
     """A directory with files of a board, as far as a capture looks at them."""
     directory.mkdir()

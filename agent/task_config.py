@@ -1,0 +1,93 @@
+"""A task that agent.toml declares: a component that the agent starts by itself, at its times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from pwd import struct_passwd
+
+    from failover.core.schedule.terms import Declaration
+
+
+@dataclass(frozen=True, slots=True)
+class TaskConfig:
+    """``[tasks."/lab/robot1/controller"]``. Times in milliseconds.
+
+    Attributes:
+        command: the program; it takes its times by ``failover.scheduled(NAME)``, `ft_begin`, or ``failover task run``.
+        user: whose rights it has; "" for the agent's own.
+        directory: an absolute path.
+        environment: variables besides PATH, HOME, USER and FAILOVER_SOCKET, or instead of them.
+        engine: as of ``failover run``.
+        period_ms: 0: it is started, and is no task of the schedule.
+        phase_ms, deadline_ms, budget_ms, after, overrun, cpus, priority, strict: see `failover.core.schedule.terms.Terms`.
+    """
+
+    command: tuple[str, ...] = field(default_factory=tuple)
+    user: str = ""
+    directory: str = "/"
+    environment: dict[str, str] = field(default_factory=dict)
+    engine: Literal["auto", "ptrace", "cooperative"] = "auto"
+    period_ms: float = 0
+    phase_ms: float = 0
+    deadline_ms: float = 0
+    budget_ms: float = 0
+    after: tuple[str, ...] = field(default_factory=tuple)
+    overrun: Literal["skip", "queue", "catch_up"] = "skip"
+    cpus: tuple[int, ...] = field(default_factory=tuple)
+    priority: int = 0
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what no program can be started with.
+
+        Raises:
+            ValueError: says what.
+        """
+        if any("\0" in word for word in (*self.command, self.directory, *self.environment.values())):
+            raise ValueError("command, directory or environment holds a zero byte; no program can be given one")
+        if not self.directory.startswith("/"):
+            raise ValueError(f"directory = {self.directory!r} is not absolute; an agent has no directory of its own")
+        for name in self.environment:
+            if not name or "=" in name:
+                raise ValueError(f"environment has a variable {name!r}; a name is not empty and has no '=' in it")
+
+
+def user_of(name: str) -> struct_passwd:
+    """A user by name or number.
+
+    Raises:
+        KeyError: this system has none.
+    """
+    import pwd  # here: an agent without tasks does not load it
+
+    return pwd.getpwuid(int(name)) if name.isdecimal() else pwd.getpwnam(name)
+
+
+def declaration(name: str, task: TaskConfig) -> Declaration | None:
+    """The task as the schedule is told of it; None: it is none, only a program that is to run.
+
+    Raises:
+        ScheduleError: it cannot be; names what.
+    """
+    if not task.period_ms:
+        return None
+    from failover.core.schedule.course import Overrun  # here: an agent without tasks does not load them
+    from failover.core.schedule.terms import CPUS_MAX, Declaration, Terms, checked, nanoseconds
+    from failover.errors import ScheduleError
+
+    if any(not 0 <= one < CPUS_MAX for one in task.cpus):
+        raise ScheduleError(f"cpus = {list(task.cpus)}: processors have the numbers 0 to {CPUS_MAX - 1}")
+    terms = Terms(
+        period_ns=nanoseconds(task.period_ms / 1000, "period_ms"),
+        phase_ns=nanoseconds(task.phase_ms / 1000, "phase_ms"),
+        deadline_ns=nanoseconds(task.deadline_ms / 1000, "deadline_ms"),
+        budget_ns=nanoseconds(task.budget_ms / 1000, "budget_ms"),
+        cpus=sum(1 << one for one in set(task.cpus)),
+        priority=task.priority,
+        overrun=Overrun[task.overrun.upper()],
+        strict=task.strict,
+    )
+    return checked(Declaration(name, terms, task.after))

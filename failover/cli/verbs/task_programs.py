@@ -1,0 +1,171 @@
+"""task run, task run-once, wait-activation: programs that know nothing of the schedule, at their times."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from msgspec.structs import replace
+
+from failover.boards import boottime
+from failover.cli.verbs.tasks import parsed, terms_of
+from failover.core.schedule.activation import Tick
+from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
+from failover.errors import ScheduleError
+from failover.schedule.task import ScheduledTask
+
+VARIABLE: Final = "FAILOVER_ACTIVATION_FD"
+"""Of a program that `run` has started with ``--loop``: its end of a socket of sequenced packets. It sends a packet when it wants
+the next activation, and receives one: number, instant at which it was due, lateness (ns), activations missed before it. The end
+of the socket: there is none."""
+PACKET_SIZE: Final = 256
+KILLED: Final = 128
+"""Added to a signal's number, as shells do."""
+
+
+class _ProgramEnded(Exception):
+    """The program of a loop, while its task waits."""
+
+
+def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Settings, which come first and have an equals sign; the command.
+
+    Raises:
+        ScheduleError: there is no command.
+    """
+    place = next((place for place, word in enumerate(words) if "=" not in word), len(words))
+    if place == len(words):
+        raise ScheduleError("there is no command: failover task run TASK period_ms=1000 -- COMMAND")
+    return list(words[:place]), list(words[place:])
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run a command at each activation of a task; with --loop run it once, and let it ask for them."""
+    settings, command = _split(arguments.words)
+    fields, after, _ = parsed(settings)
+    terms = terms_of(fields) if settings else Terms()
+    with _running(arguments, terms, after or ()) as task:
+        return _looped(task, command) if arguments.loop else _each(task, command)
+
+
+def run_once(arguments: argparse.Namespace) -> int:
+    """Run a command once, at an instant and after other tasks; its exit status."""
+    settings, command = _split(arguments.words)
+    fields, after, _ = parsed(settings)
+    at_ns = boottime.machine_ns() + nanoseconds(arguments.in_ms / 1000, "--in-ms")
+    terms = replace(Terms(), **{**fields, "kind": Kind.ONE_SHOT, "at_ns": at_ns})
+    with _running(arguments, terms, after or ()) as task:
+        return _each(task, command)
+
+
+@contextlib.contextmanager
+def _running(arguments: argparse.Namespace, terms: Terms, after: tuple[str, ...]) -> Iterator[ScheduledTask]:
+    """The task, as this process runs it; SIGTERM ends it as the end of the body does."""
+    before = signal.signal(signal.SIGTERM, _leave)
+    try:
+        place = Path(arguments.board) if arguments.board else None
+        with ScheduledTask(Declaration(arguments.task, terms, after), place, "failover") as task:
+            for note in task.notes:
+                print(note, file=sys.stderr)
+            yield task
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    sys.exit(KILLED + number)
+
+
+@contextlib.contextmanager
+def _started(command: Sequence[str], **options: object) -> Iterator[subprocess.Popen[bytes]]:
+    """A process of the command; told to end if the body is left before it has.
+
+    Raises:
+        ScheduleError: it cannot be started.
+    """
+    try:
+        process = subprocess.Popen(command, **options)  # type: ignore[call-overload]
+    except OSError as error:
+        raise ScheduleError(f"cannot run {command[0]}: {error.strerror}") from error
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait()
+
+
+def _status(process: subprocess.Popen[bytes]) -> int:
+    status = process.wait()
+    return status if status >= 0 else KILLED - status
+
+
+def _each(task: ScheduledTask, command: Sequence[str]) -> int:
+    """Run a command at each activation; the exit status of the last one."""
+    status = 0
+    for tick in task:
+        with _started(command) as process:
+            status = _status(process)
+        if status:
+            print(f"{task.name}: {command[0]} ended with status {status} at activation {tick.number}", file=sys.stderr)
+    return status
+
+
+def _looped(task: ScheduledTask, command: Sequence[str]) -> int:
+    """Run a command that asks for each activation; its exit status."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    before = signal.getsignal(signal.SIGCHLD)
+    try:
+        with _started(command, pass_fds=(theirs.fileno(),), env={**os.environ, VARIABLE: str(theirs.fileno())}) as process:
+            theirs.close()
+            with contextlib.suppress(_ProgramEnded, BrokenPipeError, ConnectionResetError):
+                try:
+                    signal.signal(signal.SIGCHLD, _notice)  # a task may sleep for long: it is woken when its program ends
+                    while process.poll() is None and ours.recv(PACKET_SIZE) and (tick := task.wait_activation()) is not None:
+                        ours.send(_told(tick).encode())
+                finally:
+                    signal.signal(signal.SIGCHLD, before)
+            task.end()
+            ours.close()
+            return _status(process)
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+        ours.close()
+        theirs.close()
+
+
+def _notice(number: int, frame: FrameType | None) -> None:
+    raise _ProgramEnded
+
+
+def _told(tick: Tick) -> str:
+    return f"{tick.number} {tick.due_ns} {tick.late_ns} {tick.missed}"
+
+
+def wait_activation(arguments: argparse.Namespace) -> int:
+    """In a program that `run` has started with --loop: wait for its next activation. Exit status 1: there is none."""
+    named = os.environ.get(VARIABLE, "")
+    try:
+        link = socket.socket(fileno=int(named))
+    except (ValueError, OSError):
+        raise ScheduleError(
+            f"no task runs this program ({VARIABLE} is {named!r}): "
+            "start it with failover task run --loop TASK period_ms=1000 -- COMMAND"
+        ) from None
+    try:
+        link.send(b"next")
+        told = link.recv(PACKET_SIZE)
+    except (BrokenPipeError, ConnectionResetError):
+        return 1
+    if told and not arguments.quiet:
+        print(told.decode())
+    return 0 if told else 1

@@ -1,0 +1,195 @@
+"""ps, task add, set, remove, histogram: the tasks of this robot's schedule, and orders by hand."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from msgspec.structs import asdict, replace
+
+from failover.boards import boottime
+from failover.boards.schedule_file import Order, ScheduleFile
+from failover.cli.output import render
+from failover.cli.output.board_tree import ms, span
+from failover.cli.output.team_tree import Mood, Row
+from failover.core.schedule import layout, orders
+from failover.core.schedule.course import Overrun
+from failover.core.schedule.orders import Change
+from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
+from failover.errors import ScheduleError
+from failover.schedule.overview import Seen, judged, open_schedule, overview
+
+COLUMNS: Final = ("task", "state", "period", "late p50", "p99", "took p50", "p99", "misses", "overruns", "after")
+SPANS: Final = {
+    "period_ms": "period_ns",
+    "phase_ms": "phase_ns",
+    "deadline_ms": "deadline_ns",
+    "budget_ms": "budget_ns",
+    "distance_ms": "distance_ns",
+}
+OVERRUNS: Final = {one.name.lower(): one for one in Overrun}
+BAR_WIDTH: Final = 50
+
+
+@contextlib.contextmanager
+def opened(arguments: argparse.Namespace) -> Iterator[ScheduleFile]:
+    """The schedule of this robot, as ``--board`` or the environment says."""
+    file = open_schedule(Path(arguments.board) if arguments.board else None)
+    try:
+        yield file
+    finally:
+        file.close()
+
+
+def show(arguments: argparse.Namespace) -> int:
+    """The tasks; with --watch again and again until Ctrl-C. Exit status 1: a task is idle, or past its deadline."""
+    with opened(arguments) as file:
+        with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
+            while True:
+                seen = overview(file)
+                if arguments.json:
+                    render.as_json({"robot": file.header.robot, "tasks": [_told(one) for one in seen]})
+                else:
+                    draw(COLUMNS, [_row(one) for one in seen], f"tasks of {file.header.robot}")
+                if not arguments.watch:
+                    return 1 if any(one.state == "idle" or one.past_deadline_ns for one in seen) else 0
+                time.sleep(arguments.every_ms / 1000)
+    return 0  # Ctrl-C ended the watch
+
+
+def _told(one: Seen) -> dict[str, Any]:
+    """A task as JSON: spans in milliseconds."""
+    return {
+        name.removesuffix("_ns") + "_ms" if name.endswith("_ns") else name: ms(value) if name.endswith("_ns") else value
+        for name, value in asdict(one).items()
+    }
+
+
+def _row(one: Seen) -> Row:
+    mood: Mood = "bad" if one.past_deadline_ns else "warning" if one.state in ("idle", "held") or one.misses else "good"
+    state = f"{one.state}, {span(one.past_deadline_ns)} past its deadline" if one.past_deadline_ns else one.state
+    after = ", ".join(f"{name} (not declared)" if name in one.missing else name for name in one.after)
+    cells = (
+        *(one.task, state, span(one.period_ns) if one.period_ns else one.kind, span(one.late_p50_ns or None)),
+        *(span(one.late_p99_ns or None), span(one.took_p50_ns or None), span(one.took_p99_ns or None)),
+        *(f"{one.misses} ({one.blamed} was late)" if one.blamed else str(one.misses), str(one.overruns), after),
+    )
+    return Row(cells, mood)
+
+
+# --- Orders ----------------------------------------------------------------------------------------------------------
+
+
+def parsed(words: Sequence[str]) -> tuple[dict[str, object], tuple[str, ...] | None, str]:
+    """Fields of terms, predecessors and mode, of words such as ``period_ms=10``.
+
+    Raises:
+        ScheduleError: a word is none of them; names it.
+    """
+    fields: dict[str, object] = {}
+    after, mode = None, ""
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise ScheduleError(f"{word!r} is no KEY=VALUE; {_known()}")
+        if key in SPANS:
+            fields[SPANS[key]] = nanoseconds(_number(key, value) / 1000, key.removesuffix("_ms"))
+        elif key == "priority":
+            fields[key] = int(_number(key, value))
+        elif key == "overrun" and value in OVERRUNS:
+            fields[key] = OVERRUNS[value]
+        elif key == "strict" and value in ("true", "false"):
+            fields[key] = value == "true"
+        elif key == "cpus":
+            fields[key] = sum(1 << int(_number(key, place)) for place in set(value.split(",")) if place)
+        elif key == "after":
+            after = tuple(name for name in value.split(",") if name)
+        elif key == "mode":
+            mode = value
+        else:
+            raise ScheduleError(f"{word!r} is no setting of a task; {_known()}")
+    return fields, after, mode
+
+
+def terms_of(fields: Mapping[str, object]) -> Terms:
+    """The terms of a new task: periodic, sporadic with a distance, else due once, now."""
+    terms = replace(Terms(), **fields)
+    if terms.period_ns:
+        return terms
+    kind = Kind.SPORADIC if terms.distance_ns else Kind.ONE_SHOT
+    return replace(terms, kind=kind, at_ns=0 if kind is Kind.SPORADIC else boottime.machine_ns())
+
+
+def _known() -> str:
+    return f"there are {', '.join(SPANS)}, priority, cpus=0,1, after=A,B, overrun={'|'.join(OVERRUNS)}, strict=true|false, mode"
+
+
+def _number(key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ScheduleError(f"{key}={text}: {text!r} is no number") from None
+
+
+def given(arguments: argparse.Namespace, order: Order, told: str = "") -> int:
+    """Give an order that a person wants; what is to be told of it is said."""
+    with opened(arguments) as file:
+        outcome = file.give(judged(file, order, getattr(arguments, "force", True)))
+        if arguments.json:
+            render.as_json({"changed": [row.name for row in outcome.written.values()], "notes": list(outcome.notes)})
+        else:
+            for note in (*outcome.notes, *([told] if told else [])):
+                print(note)
+    return 0
+
+
+def add(arguments: argparse.Namespace) -> int:
+    """Declare a task; a process runs it when one of that name begins."""
+    fields, after, mode = parsed(arguments.settings)
+    if mode:
+        raise ScheduleError(f"cannot add {arguments.task!r} in mode {mode!r}: a task has modes when its program declares some")
+    declaration = Declaration(arguments.task, terms_of(fields), after or ())
+    return given(arguments, lambda rows, held: orders.added(rows, [declaration], held))
+
+
+def change(arguments: argparse.Namespace) -> int:
+    """Change a task: at once, or with its next activation."""
+    fields, after, mode = parsed(arguments.settings)
+    wanted = Change(arguments.task, fields, after, mode, arguments.next)
+    return given(arguments, lambda rows, held: orders.changed(rows, [wanted], held))
+
+
+def remove(arguments: argparse.Namespace) -> int:
+    """Take tasks off the schedule; their programs' loops come to an end."""
+    return given(arguments, lambda rows, _: orders.removed(rows, arguments.tasks))
+
+
+def histogram(arguments: argparse.Namespace) -> int:
+    """How late a task began, and how long it took, as bars."""
+    with opened(arguments) as file:
+        row = file.row_of(arguments.task)
+        if row is None:
+            orders.removed(file.rows(), [arguments.task])  # says what there is instead
+            raise ScheduleError(f"the schedule has no task {arguments.task!r}")
+        found = {
+            "late": layout.read_histogram(file.table, row, layout.LATENESS_FIELD),
+            "took": layout.read_histogram(file.table, row, layout.DURATION_FIELD),
+        }
+    if arguments.json:
+        render.as_json(
+            {name: {str(1 << place): count for place, count in enumerate(counts) if count} for name, counts in found.items()}
+        )
+        return 0
+    for name, counts in found.items():
+        most = max(counts)
+        lines = [
+            (f"below {span(1 << place)}", str(count), "#" * max(round(count / most * BAR_WIDTH), 1))
+            for place, count in enumerate(counts)
+            if count
+        ]
+        print(render.plain_table((name, "activations", ""), lines) if lines else f"{name}: nothing yet")
+    return 0
