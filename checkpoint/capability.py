@@ -63,5 +63,5 @@ def by_rule(area: Area, kind: str, sentence: str, *said: str) -> Capability:
 
 
 def refused(area: Area, kind: str, sentence: str, *said: str) -> Capability:
-    """A row about what is refused by name, before the program is touched."""
+    """A row about a thing that is refused by name, before the program is touched."""
     return Capability(area, kind, Verdict.REFUSED, sentence, said)

@@ -170,8 +170,8 @@ class ProtectOrder(Struct, frozen=True):
     Attributes:
         component: its name.
         streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
-        names: of somebody who keeps the program's files by content (`checkpoint.store.content_store`): the paths by which the
-            program knows those that it has from there; snapshots name them so. None: nobody keeps them.
+        names: of a store that keeps the program's files by content (`checkpoint.store.content_store`): the paths by which the
+            program knows those that it has from there; snapshots name them so. None: no store keeps them.
         verb: what the user asked for, as a refusal says it.
     """
 
@@ -200,7 +200,7 @@ class CaptureOrder(Struct, frozen=True):
     """What the next snapshot is to be.
 
     Attributes:
-        base: whole, whatever was acknowledged; a delta is made only when this is False and a position was acknowledged.
+        base: make a base, also after an acknowledgement. A delta needs False here and an acknowledged position.
         generation, sequence: of the position that it gets.
         robot: name of the robot, "" for a one-shot capture.
         hold: leave the program standing still afterwards, until the session is closed.
@@ -228,8 +228,8 @@ class RestoreOptions(Struct, frozen=True):
             has in another version; "": there are none.
         stood_still: nothing of it has run since the capture, so that TCP connections that were taken along can be taken up.
         all_connections: refuse the restore where a TCP connection with another program cannot be taken up; else it is reset.
-        bound: whose rights it gets at most, whatever it asks for (`checkpoint.snapshot.credentials.bounded`); None: what it asks
-            for. The vessel is that user's already, so that the kernel keeps to it, too.
+        bound: whose rights it gets at most, although it may ask for more (`checkpoint.snapshot.credentials.bounded`); None: all
+            that it asks for. The vessel is that user's already, so that the kernel keeps to it, too.
     """
 
     elapsed_ns: int = 0
@@ -265,7 +265,7 @@ class Session(Protocol):
     """What is not as it could be: a fallback that was taken, something that will differ."""
 
     def capture(self, order: CaptureOrder) -> Snapshot:
-        """Take one snapshot; the program runs on whatever happens.
+        """Take one snapshot; the program runs on, also when that fails.
 
         Raises:
             ProcessGoneError: it ended.

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from msgspec import Struct, field
 
 Fact = int | str | bytes | bool | float | None | list["Fact"] | dict[str, "Fact"]
-"""One thing that a resource says about itself: whatever msgpack can carry."""
+"""One thing that a resource says about itself: any value that msgpack can carry."""
 
 
 class VmaKind(enum.StrEnum):
@@ -94,7 +94,7 @@ class Vma(Struct, frozen=True):
             "sr"/"rr" read advice, "mg" mergeable, "ht" huge pages, "dp" droppable, "sl" sealed, "mw" may be
             made writable), and two-letter codes of our own
             (`checkpoint.linux.procfs.vm_flags`): "gb" huge pages of 1 GiB, "k1" to "kf" a protection key.
-        guards: pages that MADV_GUARD_INSTALL (madvise(2)) lets nobody touch, in address order; they hold nothing.
+        guards: pages that MADV_GUARD_INSTALL (madvise(2)) makes inaccessible, in address order; they hold nothing.
     """
 
     start: int

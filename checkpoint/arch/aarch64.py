@@ -305,14 +305,14 @@ _SCALABLE: Final = struct.Struct("<IIHH4x")
 """struct sve_context, before the registers: Z, P, FFR."""
 _FURTHER_MAGIC, _SCALABLE_MAGIC = 0x45585401, 0x53564501
 _BEFORE_UCONTEXT: Final = 128
-"""Bytes of siginfo, which lie before struct ucontext in a frame; nobody reads them."""
+"""Bytes of siginfo, which lie before struct ucontext in a frame; rt_sigreturn(2) does not read them."""
 _VECTORS_HEAD: Final = 0x46508001 | 528 << 32
 _NO_STACK: Final = 7
 """Flags of an alternate stack that are none: rt_sigreturn(2) leaves the one that there is."""
 _PLACES: Final = {name: _GENERAL_OF_FRAME + 8 * index for index, name in enumerate((*_GENERAL, "sp", "pc", "pstate"))}
 _SCRATCH: Final = 9
 _STORES_BEFORE: Final = 0xD5033ABF
-"""``dmb ishst``: whoever sees a later store sees every earlier one."""
+"""``dmb ishst``: a processor that sees a later store sees every earlier one."""
 
 
 def _lost(place: int, content: bytes) -> bytes:
@@ -400,11 +400,11 @@ class _Code:
 
 
 SHOWS_STORES_IN_ORDER: Final = False
-"""Whether who reads what a thread has stored last sees what that one stored before, without asking a second time."""
+"""Whether a reader that sees a thread's last store also sees its earlier ones, without a second look."""
 
 
 def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
-    """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
+    """The batch: make every call once, then wait for the tracer; if it does not come, give everything back and go on.
 
     Args:
         address: where it will lie.
@@ -479,7 +479,7 @@ def entry_code(
 
 
 def _entry_instructions(address: int, calls: EntryCalls, frame: int) -> bytes:
-    """Those of `entry_code`, as many whatever the address of the frame."""
+    """Those of `entry_code`; their number does not depend on the address of the frame."""
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)
     code.move(19, 0)

@@ -18,7 +18,7 @@ DEFAULT: Final = V8
 """What every 64-bit ARM processor has."""
 
 _CHOSEN_BY_ALL: Final = frozenset(["atomics", "mops"])
-"""By the atomic operations of whatever gcc has compiled, and by memcpy(3)."""
+"""By the atomic operations of all code that gcc has compiled, and by memcpy(3)."""
 _FLAGS: Final = {V8: frozenset(["asimd", "fp"]) | _CHOSEN_BY_ALL}
 """Names in /proc/cpuinfo."""
 _NUMPY_BEYOND: Final = {V8: "ASIMDHP ASIMDDP ASIMDFHM SVE"}
@@ -36,7 +36,7 @@ def glibc_hwcaps(level: str) -> str:
 
 
 def variables(level: str) -> dict[str, str]:
-    """Variables of libraries that choose by themselves, unless somebody has set them."""
+    """Variables for libraries that choose by themselves. A variable that the user has set stays as it is."""
     return {
         "LD_BIND_NOW": "1",
         "NPY_DISABLE_CPU_FEATURES": _NUMPY_BEYOND[level],

@@ -38,7 +38,7 @@ a processor with SME."""
 _NEEDED: Final = {VECTORS: "fp", THREAD_POINTER: "fp", ADDRESS_KEYS: "paca", GENERIC_KEY: "pacg", SCALABLE: "sve"}
 """Features without which there is no such set; every processor that runs our kernels has the first.
 
-The kernel tells a set only to who asks for it by number, so all of them are asked for, one by one."""
+The kernel tells a set only if it is asked for by number, so we ask for all of them, one by one."""
 LOST_IN_CALLS: Final[int | None] = SCALABLE
 """The register set of which every system call may take a part. Source: sve.rst, "System call behaviour"."""
 UNKEPT: Final = {"sme": "scalable matrices (SME: arm64.nosme)"}
@@ -114,7 +114,7 @@ def lacking(state: bytes, theirs: Layout, ours: Layout) -> Iterator[str]:
 
 
 def _lacking_vectors(content: bytes, here: int) -> Iterator[str]:
-    """What is said of scalable vectors that cannot be had; a thread that has not used any can do without.
+    """Why a thread's scalable vectors cannot be restored here; a thread that has not used any can do without.
 
     Args:
         here: bytes of the set on this machine; 0: there is none.
@@ -127,7 +127,7 @@ def _lacking_vectors(content: bytes, here: int) -> Iterator[str]:
 
 
 def fitted(state: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes:
-    """The same state as this machine lays it out. What is `lacking` here is left out.
+    """The same state as this machine lays it out, without the parts that are `lacking` here.
 
     Args:
         example: the state of any thread here: of that is what the other machine did not have. Scalable vectors are not: what a

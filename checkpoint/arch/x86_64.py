@@ -123,7 +123,7 @@ def unkept(output: int) -> tuple[Unkept, ...]:
 
 
 PORT_RIGHTS: Final[int | None] = 0x201
-"""NT_386_IOPERM of linux/elf.h: the register set of who may use I/O ports; nobody else has it."""
+"""NT_386_IOPERM of linux/elf.h: only a thread that may use I/O ports has this register set."""
 
 
 def user_end(highest: int) -> int:
@@ -308,11 +308,11 @@ class _Code:
 
 
 SHOWS_STORES_IN_ORDER: Final = True
-"""Whether who reads what a thread has stored last sees what that one stored before, without asking a second time."""
+"""Whether a reader that sees a thread's last store also sees its earlier ones, without a second look."""
 
 
 def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
-    """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
+    """The batch: make every call once, then wait for the tracer; if it does not come, give everything back and go on.
 
     Args:
         address: where it will lie.

@@ -65,7 +65,7 @@ def glibc_hwcaps(level: str) -> str:
 
 
 def variables(level: str) -> dict[str, str]:
-    """Variables of libraries that choose by themselves, unless somebody has set them."""
+    """Variables for libraries that choose by themselves. A variable that the user has set stays as it is."""
     return {
         "LD_BIND_NOW": "1",  # what binds later saves registers by the size that it found at the start (dl-trampoline.h)
         "NPY_DISABLE_CPU_FEATURES": " ".join(_words(_NUMPY_BEYOND, level)),

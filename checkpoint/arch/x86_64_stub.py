@@ -93,7 +93,7 @@ OWN_LOOP: Final = bytes.fromhex(
     "5b"  #                pop  rbx
     "c3"  #                ret
 )
-"""A function of C that makes the calls of a table in a process of ours, all of them, whatever comes of each.
+"""A function of C that makes the calls of a table in a process of ours, all of them, also when some fail.
 
 Each call is eight little-endian words: number, six arguments, address where the result goes, 0 for nowhere.
 """

@@ -51,7 +51,7 @@ AMX: Final = (17, 18)
 LOST_IN_CALLS: Final[int | None] = None
 """The register set of which every system call may take a part: none."""
 UNKEPT: Final[dict[str, str]] = {}
-"""Features of which a thread has registers that are not kept: none, whatever XSAVE knows is."""
+"""Features of which a thread has registers that are not kept: none. All that XSAVE knows is kept."""
 PERMISSIONS: Final = (("amx_tile", "arch_prctl", (0x1023, 18)),)
 """What a process asks for before it may use some of it: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
 
@@ -102,7 +102,7 @@ def lacking(xstate: bytes, theirs: Layout, ours: Layout) -> Iterator[str]:
 
 
 def fitted(xstate: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes:
-    """The same state as this processor lays it out. What is `lacking` here is left out.
+    """The same state as this processor lays it out, without the parts that are `lacking` here.
 
     Args:
         example: the state of any thread here: of its size, with the kernel's own words.
@@ -183,7 +183,7 @@ def layout_here(features: Callable[[], Collection[str]], vector_size: Callable[[
 
     Args:
         vector_size: unused, see `sets`.
-        run: the address of instructions, in memory that nobody can write.
+        run: the address of instructions, in memory that is not writable.
 
     Raises:
         OSError: by `run`: the system forbids code of our own.

@@ -30,7 +30,7 @@ IN_MEMFD: Final = b"\x01"
 INLINE_LIMIT: Final = 64 << 10
 """Bytes of a message that travel in the packet itself; a larger one would not fit a socket's default buffer."""
 MEMFD_LIMIT: Final = 64 << 20
-"""Bytes of a message in a memfd; what is larger by nature (pages, streams) travels as descriptors of its own."""
+"""Bytes of a message in a memfd; larger things (pages, streams) travel as descriptors of its own."""
 DESCRIPTOR_LIMIT: Final = 250
 """Descriptors in one message: SCM_MAX_FD is 253; a chain of more files is folded by its sender first."""
 
@@ -66,7 +66,7 @@ class Channel(Generic[M]):
         """Send one message; the descriptors are copied, ours stay open.
 
         Raises:
-            ChannelClosedError: nobody is there any more.
+            ChannelClosedError: the other end is closed.
             ChannelError: the socket does not take it (full while non-blocking, or too many descriptors).
         """
         if len(descriptors) > DESCRIPTOR_LIMIT:
@@ -97,7 +97,7 @@ class Channel(Generic[M]):
 
         Raises:
             ChannelClosedError: the other end has gone.
-            ChannelError: what came is no message; its descriptors were closed.
+            ChannelError: the bytes are no message; their descriptors were closed.
             TimeoutError: the socket has a timeout and nothing came.
         """
         try:
@@ -231,7 +231,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     With a descriptor, of an empty file: it is encoded there, and the answer brings none.
 
     Attributes:
-        hold: leave the program standing still afterwards, until `Release`: who ends it now ends it in exactly this state.
+        hold: leave the program standing still afterwards, until `Release`: an end now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
     """
 
@@ -335,7 +335,7 @@ class OpenFile(msgspec.Struct, frozen=True, tag=True):
     """Open a file as the followed program has it: perhaps no name leads to it any more. Answer: `Opened` with the descriptor.
 
     Attributes:
-        digest: of its content when it was captured; whoever asks compares.
+        digest: of its content when it was captured; the asking process compares it.
     """
 
     path: str

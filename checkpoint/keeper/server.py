@@ -82,7 +82,7 @@ class _Encoded(msgspec.Struct, frozen=True):
     Attributes:
         snapshot: its pages are of no account any more.
         size: bytes of the file; ``dirty_bytes``: of the pages in it; ``known_bytes``: of those told as differences.
-        descriptors: the file, where nobody has brought one.
+        descriptors: the file, where the request brought none.
     """
 
     snapshot: Snapshot
@@ -224,7 +224,7 @@ class Keeper:
                 return _Encoded(snapshot, size, sum(run.size for run in snapshot.runs))
             except ProcessGoneError:
                 raise
-            except CaptureError:  # a page that nobody can read (a guard that this kernel does not tell): a copy leaves it out
+            except CaptureError:  # an unreadable page (a guard that this kernel does not tell): a copy leaves it out
                 os.ftruncate(target, 0)
                 os.lseek(target, 0, os.SEEK_SET)
                 captured = session.capture(order)
@@ -373,7 +373,7 @@ class Keeper:
         return messages.Resumed(notes, let_go_ns), ()
 
     def _follow(self, pid: int, request: messages.Restore, streams: Streams | None) -> tuple[str, ...]:
-        """Protect what has just been let go; that it cannot be protected again must not end it."""
+        """Protect the program that has just been let go; a failure must not end it."""
         try:
             order = ProtectOrder(request.component, streams, request.terms, self._names)
             self._session = self._tracer.protect(pid, order)
@@ -525,7 +525,7 @@ def folded(files: Descriptors) -> Snapshot:
 
 
 def main(arguments: list[str]) -> int:
-    """Run a keeper on an inherited socket, or for whoever calls at a path."""
+    """Run a keeper on an inherited socket, or for the first client that connects at a path."""
     if len(arguments) != 2 or arguments[0] != "keeper":
         sys.stderr.write(USAGE)
         return 2
@@ -553,10 +553,10 @@ def _allow_many_files() -> None:
 
 
 def called_at(path: str) -> socket.socket:
-    """Listen at a path (0600) until somebody connects; nobody can afterwards.
+    """Listen at a path (0600) until a client connects. No other client can connect afterwards.
 
     Raises:
-        OSError: it cannot be listened there, or nobody came.
+        OSError: it cannot listen there, or no client came.
     """
     before = os.umask(0o177)
     try:

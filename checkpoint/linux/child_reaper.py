@@ -26,9 +26,9 @@ PERIOD_NS: Final = 10_000_000
 
 
 def bury(tid: int) -> bool:
-    """Take note of the end of a thread that we trace; False when it has not ended, is not ours, or somebody has done so.
+    """Take note of the end of a thread that we trace; False when it has not ended, is not ours, or its end is noted already.
 
-    It is looked first what there is to note: a stop is told, once, to whoever waits for ends only.
+    We look first, without taking note: the kernel tells a tracer of a stop once, also one that waits for ends only.
 
     Source: wait_task_stopped() in kernel/exit.c.
     """

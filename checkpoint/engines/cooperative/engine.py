@@ -97,7 +97,7 @@ class GuardedTask:
             epoch_variable.renew(Memory(self.pid), stat.env_start, stat.env_end, epoch)
 
     def capture_standing(self, order: CaptureOrder) -> Snapshot:
-        """See `checkpoint.engine.Session.capture_standing`: its segment holds what was committed, whatever it does."""
+        """See `checkpoint.engine.Session.capture_standing`: its segment holds the committed state, also while it runs."""
         return self.capture(order)
 
     @property

@@ -38,7 +38,7 @@ class MappingLostError(CaptureError):
 
 
 class Question(NamedTuple):
-    """Which pages are wanted, and what is to be told of them: see struct pm_scan_arg."""
+    """Which pages are wanted, and the categories to tell of them: see struct pm_scan_arg."""
 
     inverted: int
     mask: int
@@ -81,7 +81,7 @@ class _Orders:
         self._loop = loop
 
     def ask(self, ranges: Words, flags: int, limit: int) -> None:
-        """Make the scans of these ranges, `BATCH` at most, which nobody changes afterwards.
+        """Make the scans of these ranges, `BATCH` at most. The caller does not change them afterwards.
 
         Args:
             limit: no more than so many pages in each; 0: all.
@@ -279,7 +279,7 @@ class PageScanner:
         return found[0] if len(found) == 1 else np.concatenate(found)
 
     def _collect_one(self, orders: _Orders, place: int, found: list[Words], refused: list[list[int]] | None) -> None:
-        """What was found in one range of the batch; the rest of it is asked for."""
+        """Collect the pages found in one range of the batch, and ask for the rest of it."""
         while True:
             count, end = int(orders.counts[place]), int(orders.ends[place])
             if count < 0:

@@ -58,7 +58,7 @@ class Tracker(Protocol):
         ...
 
     def arm(self, lines: Sequence[MapsLine]) -> None:
-        """Begin to follow: whatever is written from now on is in the next scan. The process may run."""
+        """Begin to follow: every page written from now on is in the next scan. The process may run."""
         ...
 
     def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
@@ -84,7 +84,7 @@ class Tracker(Protocol):
         ...
 
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
-        """As `scan`, while the process runs: what is written from now on, also during the call, is in the next scan.
+        """As `scan`, while the process runs: pages written from now on, also during the call, are in the next scan.
 
         A page that is read after the call is as it will be found, unless the next scan names it as written or cleared.
         """
@@ -131,7 +131,7 @@ ANONYMOUS: Final = f"/dev/zero{procfs.DELETED}"
 
 
 def is_shared_anonymous(line: MapsLine) -> bool:
-    """Whether it is shared memory without a file: who was born since may have written what was never touched here."""
+    """Whether it is shared memory without a file: a later child may have written pages that were never touched here."""
     return is_shared(line) and line.name == ANONYMOUS
 
 

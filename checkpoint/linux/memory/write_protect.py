@@ -49,10 +49,10 @@ def is_small(line: MapsLine) -> bool:
 
 
 def is_closed(line: MapsLine) -> bool:
-    """Whether nobody may look into a file's mapping, as into what lies between two parts of a library: nothing comes there.
+    """Whether a file's mapping has no permission at all, as the gap between two parts of a library: no page comes there.
 
-    To protect its holes would mark them, and who looks at a marked hole cannot tell it from a page that is swapped out; most of
-    these lie behind the end of their file, where they cannot be read either. A library has 16 to 31 of them on aarch64.
+    Protection of its holes would mark them, and a marked hole looks like a page that is swapped out. Most of these holes
+    lie behind the end of their file, where they cannot be read either. A library has 16 to 31 of them on aarch64.
     """
     return line.has_file and not line.protection
 
@@ -73,9 +73,9 @@ def windows_of(line: MapsLine, existing: Words) -> Words:
 class PagemapTracker:
     """Asynchronous write protection, and one scan that finds and protects again.
 
-    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest, but for what
-    `is_closed` and nothing existed in; a mapping
-    without registration is fresh, whatever maps says, and is copied whole; one that cannot be registered is fresh each time.
+    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest, but for
+    mappings that are `is_closed` and in which nothing existed; a mapping without registration is fresh, also if maps shows
+    it as before, and is copied whole; one that cannot be registered is fresh each time.
 
     Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
     again: the kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells. To
@@ -167,7 +167,7 @@ class PagemapTracker:
         1. Protection is renewed before it is looked which pages exist: one that comes or is written later is in the next scan.
         2. A mapping that goes, or is put in the place of another one, loses its registration: the next scan finds it fresh.
         3. One that does so in the middle of the scan makes the kernel break off, and pages before it may have been protected
-           without being told: they are ``_doubtful``, and the next scan finds them whatever was written.
+           without being told: they are ``_doubtful``, and the next scan finds them, written or not.
         """
         scan = self._found(lines, changed=changed, is_running=True)
         self._let_writers_finish()
@@ -213,7 +213,7 @@ class PagemapTracker:
         return Scan(written, page_set.union(cleared, emptied))
 
     def _written(self, ranges: Words, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
-        """Written pages of what is protected; while the process runs, mapping by mapping, so that only a lost one is in doubt."""
+        """Written pages of protected ranges; while the process runs, mapping by mapping, so that only a lost one is in doubt."""
         if not is_running:
             return self._scanner.written(ranges)
         parts = self._parts.of(ranges, lines, make=lambda: _by_mapping(ranges, lines))

@@ -165,7 +165,7 @@ def _attributes(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _rules(one: Connection, until_ns: int) -> list[_Message]:
-    """The table of a connection: what comes is dropped, and what goes."""
+    """The table of a connection: it drops packets in both directions."""
     table = one.table
     messages = [_message(_NEW_TABLE, _CREATE, _text(1, table) + _attribute(_USER_DATA, _UNTIL.pack(until_ns)))]
     for name, hook, source, target in (("input", _INPUT, one.peer, one.ours), ("output", _OUTPUT, one.ours, one.peer)):

@@ -57,7 +57,7 @@ SETTINGS, STATE, ASIDE = range(3)
 
 
 class Subject(Struct, frozen=True):
-    """What is asked of a socket follows from this.
+    """The questions to a socket follow from this.
 
     Attributes:
         options: those that a fresh one of its form has.
@@ -130,7 +130,7 @@ class Questions(Struct, frozen=True, eq=False):
 
 @lru_cache(maxsize=64)
 def questions(subject: Subject) -> Questions:
-    """What is asked of such sockets."""
+    """The questions to such sockets."""
     plan = _Plan()
     plan.ask(SETTINGS, "fstat", (0, 0), {2: (SETTINGS, plan.room(SETTINGS, bytes(STAT_SIZE)))})
     buffers = ((socket.SOL_SOCKET, socket.SO_SNDBUF), (socket.SOL_SOCKET, socket.SO_RCVBUF))
@@ -201,7 +201,7 @@ class _Sheet:
 
     Attributes:
         memory: (capacity, bytes) settings and states, in the order of those that are asked.
-        aside: (capacity, bytes) what is not compared as a whole.
+        aside: (capacity, bytes) the answers that are not compared as a whole.
         table: the calls, those about one socket after the other.
         of_buffers: the same of `BUFFERS`.
 
@@ -319,7 +319,7 @@ class Asking:
         return self._heard(count)
 
     def _ask_with(self, second: SecondThread, numbers: NDArray[np.int64]) -> bool:
-        """Ask from the front while a second thread asks from the back; what it has not finished by then we ask, too.
+        """Ask from the front while a second thread asks from the back; we also ask what it has not finished by then.
 
         False, and nothing was asked, where that thread is busy still.
         """

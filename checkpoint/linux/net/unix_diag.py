@@ -20,7 +20,7 @@ SIOCUNIXFILE: Final = 0x89E0
 _REQUEST: Final = struct.Struct("<BBHIIIII")
 _ANSWER: Final = struct.Struct("<BBBxIII")
 _SHOW: Final = 1 | 2 | 4 | 8 | 16
-"""Name, file, peer, who waits to be accepted, lengths."""
+"""Name, file, peer, sockets that wait to be accepted, lengths."""
 _NO_COOKIE: Final = 0xFFFFFFFF
 _ANY_STATE: Final = 0xFFFFFFFF
 _NAME, _FILE, _PEER, _WAITING, _LENGTHS, _SHUTDOWN = 0, 1, 2, 3, 4, 6
@@ -117,7 +117,7 @@ def _file_of(told: bytes) -> BoundFile | None:
 
 
 def bound_file(looked: socket.socket) -> int | None:
-    """An O_PATH descriptor for the file that a socket is bound to, whatever name that has by now.
+    """An O_PATH descriptor for the file that a socket is bound to, also if the file has another name by now.
 
     Source: unix_open_file() in net/unix/af_unix.c (Linux 4.13); it takes CAP_NET_ADMIN.
 

@@ -64,7 +64,7 @@ class Descriptor(Struct, frozen=True):
 
 
 class Standing(Struct, frozen=True):
-    """What must be asked, besides its fdinfo, to know that a descriptor is what it was.
+    """The questions, besides its fdinfo, that tell whether a descriptor is unchanged.
 
     Attributes:
         link: where it leads.
@@ -122,11 +122,11 @@ def _made(number: int, target: str, told: bytes, head: re.Match[bytes] | None, i
 
 
 class _Nameless(Struct, frozen=True):
-    """What all open files of one of the kernel's own file systems have in common, whoever has them; nobody can name a file there.
+    """Facts that all open files of one of the kernel's own file systems share, in all processes; files there have no names.
 
     Attributes:
         prefix: of their targets, before the number of the inode; "" where the target says what it is.
-        about: of one; what differs there (times, permissions that fchmod(2) sets) matters to nobody.
+        about: of one; its differences (times, permissions that fchmod(2) sets) do not matter.
     """
 
     prefix: str

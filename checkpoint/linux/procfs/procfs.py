@@ -172,7 +172,7 @@ def head_of_program(pid: int, size: int) -> bytes:
 
 
 def outlook(pid: int) -> str:
-    """What to put before an absolute path that the kernel tells of a process, so that we find there what it finds.
+    """The prefix for an absolute path that the kernel tells of a process, so that we find the same file as the process.
 
     The kernel tells paths from the root of the mount namespace, also of a process that has another root directory (chroot).
     Of a process that is gone, or not ours to look at, the answer leads nowhere.
@@ -242,8 +242,8 @@ def parse_maps_line(line: str) -> MapsLine:
 def lines_of(text: str) -> list[str]:
     """The lines of a text as the kernel ends them.
 
-    `str.splitlines` sees ends of its own (a carriage return, for one) in the name of a process or file, which whoever gave it
-    chose: a process could tell lines about itself.
+    `str.splitlines` sees ends of its own (a carriage return, for one) also inside the name of a process or file. A process
+    chooses such names, so it could forge lines about itself.
     """
     return [line for line in text.split("\n") if line]
 

@@ -63,7 +63,7 @@ def key_in(flags: tuple[str, ...]) -> int:
 
 
 REST: Final = 200
-"""How many times as long as a reading took nothing is read again while the mappings stay: a reader is in the way of who maps."""
+"""How many times as long as a reading took nothing is read again while the mappings stay: a reading delays a thread that maps."""
 REST_S_MIN: Final = 5.0
 
 
@@ -85,7 +85,7 @@ class FlagsReader(Struct):
 
         Args:
             lines: the mappings as they were read last.
-            anew: whatever was read before.
+            anew: read them in any case.
         """
         began = time.perf_counter()
         if lines == self._lines and began < self._due_s and not anew:

@@ -89,7 +89,7 @@ class CallTable(Struct):
         return number
 
     def obtain_pair(self, what: str, name: str, *arguments: int) -> tuple[int, int]:
-        """Add a call that makes two descriptors, whatever it writes about them."""
+        """Add a call that makes two descriptors; the numbers that it writes are not checked."""
         pair = []
         for _ in range(2):
             pair.append(self.lowest_descriptor())
@@ -230,7 +230,7 @@ RUN_TIMEOUT_S: Final = 30.0
 def single_call(tracee: Tracee, registers: bytes, instruction: int, number: int, *arguments: int) -> int:
     """Make one system call with a syscall instruction that the tracee already has; it stands after the call then.
 
-    Stops at entry and exit are no signals, so this works whatever the program does with SIGTRAP (a breakpoint would reset a
+    Stops at entry and exit are no signals, so this works with any use of SIGTRAP by the program (a breakpoint would reset a
     blocked or ignored SIGTRAP, see force_sig_info_to_task in kernel/signal.c).
     """
     tracee.set_registers(arch.at_call(registers, instruction, number, arguments))

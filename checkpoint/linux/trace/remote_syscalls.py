@@ -241,7 +241,7 @@ class BorrowedPages:
             raise failures[0]
 
     def _take_back_singly(self, places: Sequence[tuple[Desk, Guest]], failures: list[CaptureError]) -> list[Desk]:
-        """Stop them, and set them back: the desks of those with whom that worked."""
+        """Stop them, and set them back; answers with the desks of those for which that worked."""
         moving = [False] * len(places)
         for index, (_, guest) in enumerate(places):
             with _collected(failures):
@@ -266,7 +266,7 @@ class Errand:
 
     Attributes:
         answers: what they brought back.
-        asked: who takes it that they were asked to stop; None: none was.
+        asked: for each, whether it takes the request to stop; None: none was asked.
     """
 
     def __init__(self, memory: Memory, sent: Round, places: Sequence[tuple[Desk, Batch, Guest]]) -> None:

@@ -94,7 +94,7 @@ def why_not() -> str:
     if not (is_first and ours.capabilities[2] >> CAP_SYS_ADMIN & 1):
         return "to suspend it takes CAP_SYS_ADMIN: run failover as root, or the program without the filter"
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.ptrace(abi.PTRACE_SEIZE, os.getpid(), 0, abi.PTRACE_O_SUSPEND_SECCOMP)  # never succeeds: nobody traces himself
+    libc.ptrace(abi.PTRACE_SEIZE, os.getpid(), 0, abi.PTRACE_O_SUSPEND_SECCOMP)  # never succeeds: no process can trace itself
     if ctypes.get_errno() == errno.EINVAL:
         return "this kernel cannot suspend it: boot one with CONFIG_CHECKPOINT_RESTORE, or run the program without the filter"
     return ""

@@ -113,7 +113,7 @@ class FreezeBudget:
         return bool(self._until_ns)
 
     def copied(self) -> None:
-        """The last copy of the freeze is made: what follows is the tail."""
+        """The last copy of the freeze is made: the tail follows."""
         self._copied_ns = self._clock()
 
     # After it

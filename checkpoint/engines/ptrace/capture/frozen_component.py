@@ -37,7 +37,7 @@ class Frozen(Struct, frozen=True):
 
 
 def opened(first: Look, others: SeenOthers | None) -> list[OpenFile]:
-    """What any of the processes has open."""
+    """The open files of all processes."""
     looks = [first, *(look for _, look in others.looks())] if others else [first]
     return [held for look in looks for held in look.standing.opened]
 

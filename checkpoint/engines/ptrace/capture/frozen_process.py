@@ -58,7 +58,7 @@ class Place(Read, Struct, frozen=True):
     confinement: Confinement = FREE
 
     def every_pending(self) -> tuple[bytes, ...]:
-        """Whatever is pending anywhere."""
+        """All pending signals, of any thread and of the process."""
         return (*self.pending, *self.shared_pending, *(siginfo for other in self.others for siginfo in other.pending))
 
 
@@ -124,12 +124,12 @@ class Onlooker:
         self._inquiry_key: tuple[int, bytes] = (0, b"")
 
     def gather(self) -> Opened:
-        """What it has open; for an exact picture it stands still."""
+        """Its open files. The picture is exact only if the process stands still."""
         return gather(self._tracee.pid, self._kept)
 
     @property
     def owners(self) -> Owners:
-        """What is known of who has owners of its signals."""
+        """The known owners of its files' signals."""
         return self._kept.owners
 
     def overlooked(self, opened: Sequence[OpenFile]) -> OpenFile | None:

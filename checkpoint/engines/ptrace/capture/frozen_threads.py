@@ -36,7 +36,7 @@ from checkpoint.model import Rseq
 
 
 class Read:
-    """What was read of any thread that stands, the first one or another."""
+    """The state read of any thread that stands, the first one or another."""
 
     __slots__ = ()
 
@@ -222,7 +222,7 @@ class ThreadOnlooker:
             os.close(self._names.pop(tid).file)
 
     def prepare(self) -> None:
-        """Look up, while the program runs, what does not change; what is left of an earlier look."""
+        """Look up, while the program runs, what does not change and an earlier look has not found yet."""
         self._settle()
         for tid in thread_ids(self._threads.pid):
             if tid != self._threads.pid:
@@ -238,7 +238,7 @@ class ThreadOnlooker:
             standing.settle()
 
     def _named(self, tid: int) -> tuple[Life, bytes]:
-        """Who has this id now, and its comm.
+        """The thread that has this id now, and its comm.
 
         By a file that stays open: reading it again takes a third of opening it anew, and once its thread has ended it tells of no
         other one. So if it still answers after the thread's stat has been read, by name, that was the same thread's.

@@ -61,7 +61,7 @@ LARGE_COUNT: Final = 256
 PASS_LIMIT: Final = 3
 """Passes after the first: a program that writes faster than we copy is not caught up with by more of them."""
 BUDGET_PASS_LIMIT: Final = 12
-"""The same where what is left shall fit a budget."""
+"""The same where the rest shall fit a budget."""
 CATCHING_UP: Final = 0.8
 """Of what the pass before copied: a pass that copies more does not catch up."""
 VDSO: Final = "[vdso]"
@@ -84,7 +84,7 @@ def _is_within(line: MapsLine, places: SharedPlaces) -> bool:
 
 
 class RunningCopy(Struct):
-    """What was copied while the program ran.
+    """The pages that were copied while the program ran.
 
     Attributes:
         copies: oldest first; of a page that several have, the newest counts.
@@ -217,7 +217,7 @@ class MemoryCapture:
         return {self.acknowledged, *(held.position for held in self._unacknowledged)}
 
     def start_over(self) -> None:
-        """Follow from the beginning with the next base: what was written is not known any more."""
+        """Follow from the beginning with the next base: the written pages are not known any more."""
         self._is_armed, self.acknowledged = False, None
         self._start += 1
         self._guards.forget()
@@ -463,7 +463,7 @@ class MemoryCapture:
         self._boards = memory_tracker.extents_of([line for line in self.lines if line.name == memory_tracker.BOARD])
 
     def _scan(self, *, everywhere: bool) -> Scan:
-        """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
+        """The pages written since the last scan. A scan that fails half-way has protected pages without telling which."""
         try:
             scan = self._tracker.scan(self._private, changed=self._has_moved, everywhere=everywhere)
         except CaptureError:
@@ -499,6 +499,6 @@ class MemoryCapture:
             self._unacknowledged = [joined(oldest, next_one), *rest]
 
     def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
-        """What a delta must carry: the union of all scans since. A base needs what has become no snapshot yet."""
+        """The pages that a delta must carry: the union of all scans since. A base needs those that are in no snapshot yet."""
         self._join()
         return since(self._unacknowledged, self._mapped, is_base=base)

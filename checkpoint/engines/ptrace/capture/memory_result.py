@@ -55,7 +55,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
 
     @functools.cached_property
     def _named(self) -> tuple[Words, Words]:
-        """What was written and cleared since the acknowledged position."""
+        """The pages that were written and cleared since the acknowledged position."""
         return since(with_one_tail(self.scans, self.mapped, self.guards), self.mapped, is_base=self.is_base)
 
     @functools.cached_property
@@ -90,7 +90,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
         return sent.addresses, self._gathered(sent), dropped
 
     def _gathered(self, sent: PageMap) -> memoryview:
-        """Their bytes, in the largest copy that nobody needs any more, if that can be."""
+        """Their bytes, in the largest copy that is not needed any more, if that can be."""
         contents = [copy.content for copy in self.copies]
         if len(contents) > 1:
             largest = max(range(len(contents) - 1), key=lambda index: page_set.total_size(self.copies[index].pages))

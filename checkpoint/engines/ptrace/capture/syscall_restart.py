@@ -91,7 +91,7 @@ class Interruption:
         if self.begins_anew and not tracee.is_as_found:
             tracee.set_registers(anew)
             return anew
-        tracee.left_alone = anew  # who gives itself everything back has the kernel forget what it would go on with
+        tracee.left_alone = anew  # a thread that restores itself has the kernel forget the call that it would go on with
         return registers
 
     def remembers(self, registers: bytes) -> bool:

@@ -50,7 +50,7 @@ from checkpoint.snapshot import process_tree
 ENDING_S: Final = 0.2
 """How long a process that is about to end may take."""
 QUIET_LISTINGS: Final = 2
-"""Listings without anybody new that are believed: one may leave somebody out whose sibling ends just then (fs/proc/array.c)."""
+"""Listings in a row without a new process that are believed: one may omit a process whose sibling ends (fs/proc/array.c)."""
 NAMESPACES: Final = ("pid", "mnt", "user", "net", "ipc", "uts", "cgroup", "time")
 
 
@@ -107,7 +107,7 @@ class SeenOthers(Struct):
         return functools.reduce(operator.or_, (look.xstate_mask for _, look in self.taken), 0)
 
     def describe(self) -> None:
-        """Say what is still to be said; they may run.
+        """Tell the rest; they may run.
 
         Raises:
             MovedError: one is not what it was any more.
@@ -123,7 +123,7 @@ class SeenOthers(Struct):
         self.later.clear()
 
     def looks(self) -> list[tuple[CapturedProcess, Look]]:
-        """What was seen of each."""
+        """The look at each."""
         return self.taken
 
     def resources(self) -> tuple[Resource, ...]:
@@ -328,7 +328,7 @@ class CapturedTree:
     # The freeze
 
     def stand_still(self) -> bool:
-        """Stop everybody else, now that the first process stands; whether there is anybody.
+        """Stop all other processes, now that the first one stands; answers whether there are any.
 
         Raises:
             MovedError: one of them does not stop.
@@ -387,7 +387,7 @@ class CapturedTree:
     # While they stand
 
     def begin_look(self) -> SeenOthers:
-        """What all have open, and who has ended."""
+        """The open files of all, and the processes that have ended."""
         pids = [self._first.pid, *self._standing]
         try:
             opened = shared_descriptions.together({pid: gather(pid, owners=self._owners_of(pid)) for pid in pids})
@@ -397,7 +397,7 @@ class CapturedTree:
         return SeenOthers(opened, ended)
 
     def _owners_of(self, pid: int) -> Owners | None:
-        """What is known of who has owners there; None of a process that was never looked at."""
+        """The known owners of a process's files' signals; None of a process that was never looked at."""
         known = self._first if pid == self._first.pid else self._known.get(pid)
         return known.onlooker.owners if known else None
 
@@ -468,7 +468,7 @@ def _is_same(known: CapturedProcess) -> bool:
 
 @contextlib.contextmanager
 def _gone_if_ended(pid: int) -> Iterator[None]:
-    """Whatever goes wrong with a process that has ended goes wrong because of that."""
+    """Turn any error about a process that has ended into its end."""
     try:
         yield
     except (CheckpointError, FileNotFoundError, ProcessLookupError) as error:

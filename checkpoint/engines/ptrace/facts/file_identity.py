@@ -133,7 +133,7 @@ class Identities:
     def _living_name(self, line: MapsLine) -> str:
         """The name by which shared memory of a file is told, where it is not the one by which it was mapped; "" for all others.
 
-        A private mapping of what was deleted is told by its pages alone.
+        A private mapping of a deleted file is told by its pages alone.
         """
         is_gone = line.name.endswith(DELETED)
         if not line.shared or not line.name.startswith("/") or not (is_gone or line.name.startswith(MEMORY_PLACE)):

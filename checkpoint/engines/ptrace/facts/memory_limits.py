@@ -49,9 +49,9 @@ def free() -> int:
 
 
 def held(pid: int) -> int:
-    """Bytes of a process's private memory, whoever has it in common since a fork; 0 of one that has ended.
+    """Bytes of a process's private memory, pages shared since a fork included; 0 of a process that has ended.
 
-    Shared memory is copied once, whoever has mapped it.
+    Shared memory is copied once, for all processes that map it.
     """
     try:
         return _added(_COPIED, procfs.read_text(pid, "status"))

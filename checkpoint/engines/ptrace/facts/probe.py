@@ -50,7 +50,7 @@ def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: boo
         verb: what the user asked for, as a refusal says it.
 
     Raises:
-        ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
+        ProbeError: there is no such process, it is no program, another process traces it, or we may not look.
     """
     try:
         around = surroundings or surroundings_of(pid, None)
@@ -118,7 +118,7 @@ def _with_detached(kin: Iterable[int], surroundings: Surroundings) -> tuple[Surr
 
 
 def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, ...], shared_descriptions.OpenedByAll]:
-    """The processes of a component that live, and what they have open; again where some came or went meanwhile.
+    """The living processes of a component and their open files; looked up again where some came or went meanwhile.
 
     Args:
         first: by which that of ``pid`` is looked at; it stands for it.
@@ -132,7 +132,7 @@ def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, .
         if kin == _kin(pid, first, is_guarded=is_guarded) and not young:
             break
         time.sleep(LOOK_PAUSE_S)
-    about_to = young - (stubborn or set())  # they will be what they are to be when somebody stops them
+    about_to = young - (stubborn or set())  # a capture that stops them later finds their new programs
     return tuple(one for one in kin if one not in about_to), {one: held for one, held in opened.items() if one not in about_to}
 
 
@@ -194,7 +194,7 @@ def _others_findings(
 
 
 def _against(pid: int, opened: shared_descriptions.OpenedByAll, detaches: bool) -> tuple[str, ...]:
-    """What stands against a process besides the first, but for what it has open."""
+    """Reasons against a process besides the first, without those of its open files."""
     try:
         reasons = list(refusals.refuse_process(pid, procfs.status(pid), tuple(opened), detaches_memory=detaches))
         mapped = _Mapped.by(pid)
@@ -251,10 +251,10 @@ def _require_permission(pid: int, status: Status) -> None:
 
 
 def _await_execution(pid: int) -> None:
-    """Until the program is there that a process is just becoming: who starts one is let go on by execve(2) before it has a vdso,
-    arguments or variables, the last of which the kernel notes last. A program whose file comes slowly is looked at as it is.
+    """Wait until a process has the program that it executes. execve(2) lets the starter go on before that program has a vdso,
+    arguments or variables; the kernel notes the variables last. A program whose file comes slowly is looked at as it is.
 
-    Source: create_elf_tables() in fs/binfmt_elf.c; begin_new_exec() in fs/exec.c closes what is to be closed long before.
+    Source: create_elf_tables() in fs/binfmt_elf.c; begin_new_exec() in fs/exec.c closes descriptors (close-on-exec) long before.
     """
     deadline = time.monotonic() + EXECUTION_S
     while not (stat := procfs.stat(pid)).env_end and stat.state not in "ZX" and time.monotonic() < deadline:
@@ -270,7 +270,7 @@ def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept
 
 
 def _root_findings(pid: int) -> Iterator[Finding]:
-    """What whoever brings it back must be allowed to do."""
+    """Rights that a restore of it needs."""
     if (root := procfs.read_link(pid, "root")) != "/":
         text = f"its root directory is {root}: to enter that again takes CAP_SYS_CHROOT (an agent of root, and a program of root)"
         yield Finding("process", "root", NOTED, text)

@@ -178,10 +178,10 @@ def _compare(
 
 
 def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tuple[str, ...]:
-    """What this machine lacks of what a program needs that still runs elsewhere, one sentence each.
+    """What this machine lacks for a program that still runs on another one, one sentence each.
 
-    What it writes to may change until it comes: of that only whether it is there is looked at, and who else writes to it. Not
-    asked is whether a vdso without its content can be led to ours (`require` does).
+    Files that the program writes may change until it comes: of those we look only whether they are there, and which other
+    processes write to them. Whether a vdso without its content can be led to ours is left to `require`.
 
     Args:
         outline: of its newest snapshot, which may be a delta.

@@ -210,7 +210,7 @@ class _Part(Struct, frozen=True):
 
 
 def _alike(told: Sequence[Told], taken: Words, mapped: Mapped) -> _Part:
-    """What is common in mappings of one sort."""
+    """The pages that mappings of one sort have in common."""
     known = _Known(np.empty(0, np.uint64), np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.bool_))
     plain = {index: page_set.difference(page_set.extents(vmas), taken) for index, vmas in mapped.items()}
     equal = {index: _compared(known, told, index, plain[index]) for index in mapped}
@@ -240,7 +240,7 @@ def _within(one: Told, some: Words) -> NDArray[np.intp]:
 
 
 def _compared(known: _Known, told: Sequence[Told], index: int, plain: Words) -> Words:
-    """Where a process has what is known, by address; what nobody has had before is known from then on."""
+    """Where a process has known pages, by address; pages at new addresses are known from then on."""
     rows = _within(told[index], plain)
     addresses = told[index].addresses[rows]
     _, theirs, ours = np.intersect1d(known.addresses, addresses, assume_unique=True, return_indices=True)

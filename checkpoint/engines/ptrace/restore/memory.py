@@ -357,7 +357,7 @@ def fill_from(
     Memory without a file is zero by itself: pages of zeros are left out there, where the source may tell some.
 
     Raises:
-        FormatError, ChainError: its pages are not what they were; some were written.
+        FormatError, ChainError: its pages have changed; some were written.
     """
     filled = _filled(outline, legacy, untouched)
     zero = page_set.extents(vma for vma in outline.vmas if vma.file is None) if source.tells_zeros else NONE
@@ -369,7 +369,7 @@ def fill_from(
 
 
 def _without_zeros(row: Words, content: Buffer, zero: Words) -> tuple[Words, Buffer]:
-    """What is left of pages and their bytes without pages of zeros where there are zeros already."""
+    """The pages and their bytes, without pages of zeros where there are zeros already."""
     if not len(zero):
         return row, content
     is_zero = page_set.zero_pages(content, abi.PAGE_SIZE)
@@ -385,7 +385,7 @@ def _filled(snapshot: Snapshot, legacy: Legacy, untouched: Words) -> Words:
     """Where pages are written.
 
     Droppable memory begins empty, as its program must expect at any time: seeds of random numbers lie there (vgetrandom), which
-    two lives must not have in common. What is mapped shared and may not be written to has what its file has.
+    two lives must not have in common. A shared mapping that may not be written to has the content of its file.
     """
     mapped = page_set.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and not _keeps_its_own(vma))
     return page_set.difference(page_set.difference(mapped, legacy.there), untouched)

@@ -502,7 +502,7 @@ class ProcessRestore:
             self._take_place(one, thread)
 
     def _ours(self) -> Words:
-        """What is to be unmapped at the end: not this kernel's vdso, where that stays in the refuge beside the area."""
+        """The ranges to unmap at the end: not this kernel's vdso, where that stays in the refuge beside the area."""
         base, size = self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE
         all_of_it = np.array([[base, base + size]], np.uint64)
         if not self._own_functions:

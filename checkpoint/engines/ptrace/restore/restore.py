@@ -43,7 +43,7 @@ class RestoredProgram(Struct):
     Attributes:
         threads: all of its first process; they stand still for us until `resume`.
         others: those of its other processes.
-        arriving: its connections, of which nobody hears until then.
+        arriving: its connections; their other ends hear nothing until then.
     """
 
     threads: Threads

@@ -92,7 +92,7 @@ class TreeRestore:
         self._terminals: dict[int, pseudo_terminals.Controlling] = {}
 
     def end(self) -> None:
-        """Kill all processes; one that was born here is reaped for its parent, who may have ended before."""
+        """Kill all processes; one that was born here is reaped for its parent, which may have ended before."""
         for restoring in self._restoring[1:]:
             restoring.end()
         for tracee in reversed(self._born.values()):
@@ -307,14 +307,14 @@ class TreeRestore:
                 del self._born[pid]
 
     def _stand_in(self, mother: Tracee, base: int) -> tuple[Tracee, int]:
-        """Somebody of any pid, and that: whoever is born or restored beside us may have taken some."""
+        """A stand-in of any pid, and that pid: processes that are born or restored beside us may have taken some."""
         for pid in self._spare:
             with contextlib.suppress(threads.IdInUseError):
                 return threads.spawn_process(mother, self._registers, base, pid, 0, self._born_with), pid
         raise RestoreError(f"cannot restore {self._state.component}: no pid is left for a stand-in of one that has ended")
 
     def _take_terminal(self, pid: int) -> None:
-        """Give a session its controlling terminal, which all who are born into it from now on have as well."""
+        """Give a session its controlling terminal; all processes that are born into it from now on have it as well."""
         if found := self._terminals.get(pid):
             with self._opened(pid, found) as slave:
                 self._call(pid, f"take the controlling terminal of session {pid}", "ioctl", slave, termios.TIOCSCTTY, 0)
@@ -409,7 +409,7 @@ def _places(begin: int, sizes: object) -> Iterator[int]:
 
 
 def first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
-    """What is told of each open file that several processes have, or that leads from one to another."""
+    """The resource of each open file that several processes have, or that leads from one to another."""
     found: dict[int, Resource] = {}
     for view in views:
         for held in view.resources:
@@ -420,7 +420,7 @@ def first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
 
 
 def _at(held: Resource, number: int) -> Resource:
-    """The same, to be made at one number only; who owns its signals, and what it watches, is said by its process."""
+    """The same, to be made at one number only; its process tells the owner of its signals, and what it watches."""
     facts = {name: fact for name, fact in held.facts.items() if name not in ("signal", "owner", "locks", "description")}
     if held.kind == epoll.KIND:
         facts["watched"] = []

@@ -31,7 +31,7 @@ class Vessel(Struct, frozen=True):
 
     Attributes:
         inner_pid: its PID as it sees it itself.
-        credentials: who it runs as.
+        credentials: the user that it runs as.
         affinity: processors that it may use.
         hard_limits: by RLIMIT number; -1 is infinity.
     """

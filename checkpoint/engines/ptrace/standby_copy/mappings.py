@@ -176,7 +176,7 @@ def backing(vma: Vma) -> Backing:
 
 
 def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
-    """What is mapped no longer, or as something else; and what is mapped afresh."""
+    """Ranges that are not mapped any more, or as something else; and ranges that are mapped afresh."""
     before, after = _by_backing(old), _by_backing(new)
     kept = NO_PAGES
     for key, extents in after.items():
@@ -207,7 +207,7 @@ def _pieces(vma: Vma, wanted: Words) -> list[Vma]:
 def _protections(
     old: Sequence[Vma], held: Carried, new: Sequence[Vma], carried: Carried, fresh: Words
 ) -> Iterable[tuple[int, int, int]]:
-    """Where what stays mapped needs another protection than it has, and what is mapped as a part needs that of its whole."""
+    """Where a kept mapping needs another protection than it has, and a mapped part needs that of its whole."""
     starts = [vma.start for vma in old]
     had = [first_protection(vma, held) for vma in old]
     for vma in new:

@@ -60,8 +60,8 @@ TIME_NAMESPACE: Final = "/proc/self/ns/time"
 """There is none on a kernel without CONFIG_TIME_NS."""
 
 AHEAD_NS: Final = 60_000_000_000
-"""How far the clocks of a copy may be ahead of where the program's have got to, before it is laid again: nobody knows how long a
-checkpoint was on its way."""
+"""How far the clocks of a copy may be ahead of where the program's have got to, before it is laid again: it is not known how long
+a checkpoint was on its way."""
 
 
 @contextmanager
@@ -126,7 +126,7 @@ class ReadyCopy(ProcessRestore):
 
     @property
     def state(self) -> Snapshot:
-        """What it stands at, without its pages."""
+        """The state that it stands at, without its pages."""
         return self._state
 
     @property
@@ -136,7 +136,7 @@ class ReadyCopy(ProcessRestore):
 
     @property
     def vessel(self) -> Vessel:
-        """What it was when it was laid."""
+        """The state with which it was laid."""
         return self._vessel
 
     @property
@@ -300,7 +300,7 @@ class ReadyCopy(ProcessRestore):
             raise RestoreError(f"the ready copy of {self._state.component} is torn: build it again from the chain")
 
     def _require_same_birth(self, delta: Snapshot) -> None:
-        """What was fixed when the vessel was born and laid out."""
+        """The facts that were fixed when the vessel was born and laid out."""
         ours, theirs = self._state, delta
         fixed = (
             ("its pid", ours.process.pid == theirs.process.pid),
@@ -369,7 +369,7 @@ class ReadyCopy(ProcessRestore):
         return tuple(path for path, key in self._known.items() if path not in opened and _look_of(path) == key)
 
     def _open_with_our_rights(self, table: CallTable, brought: Brought) -> dict[str, int]:
-        """Open what was brought along, in a place of ours, though the vessel may look with its user's eyes already."""
+        """Open files that were brought along, in a place of ours; the vessel may have its user's rights already."""
         if not brought.run and not brought.opened:
             return {}
         self._brought = brought
@@ -379,10 +379,10 @@ class ReadyCopy(ProcessRestore):
     def _is_open(self, path: str) -> bool:
         return any(held.facts.get("path") == path and _object_of(held.facts) in self._objects for held in self._state.resources)
 
-    # --- What is kept of the program ---
+    # --- Parts of the program that are kept ---
 
     def rows_at(self, addresses: Words) -> Rows:
-        """What it holds at these addresses.
+        """Its bytes at these addresses.
 
         Raises:
             ChainError: there is no page.

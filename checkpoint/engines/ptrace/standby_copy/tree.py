@@ -60,7 +60,7 @@ PUNCH_HOLE: Final = 1 | 2
 """FALLOC_FL_KEEP_SIZE, FALLOC_FL_PUNCH_HOLE."""
 
 SIZE_KEPT_S: Final = 5.0
-"""How long what it takes is believed: who asks the kernel what is shared has it walk through all page tables."""
+"""How long a figure of its memory is believed: asking the kernel for shared memory makes it walk through all page tables."""
 
 
 class MemberCopy(ReadyCopy):
@@ -146,7 +146,7 @@ class FamilyCopy(TreeRestore):
 
     @property
     def state(self) -> Snapshot:
-        """What it stands at, without its pages."""
+        """The state that it stands at, without its pages."""
         return self._state
 
     @property
@@ -321,7 +321,7 @@ class FamilyCopy(TreeRestore):
 
 
 def _shape_of(state: Snapshot) -> tuple[object, ...]:
-    """Who is there, as far as it was fixed when they were born."""
+    """The processes, as far as they were fixed at birth."""
     first = state.process
     members = tuple(
         (
