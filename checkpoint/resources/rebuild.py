@@ -72,7 +72,7 @@ AT_EMPTY_PATH: Final = 0x1000
 OWN_ATTRIBUTES: Final = ("user.", "system.posix_acl_")
 """How attributes begin that belong to a file as its content does. Source: xattr(7)."""
 ENTRIES_SIZE: Final = 1024
-"""Bytes that hold the first entries of a directory, whatever their names."""
+"""Bytes that hold the first entries of a directory, however long their names are."""
 STREAMS: Final = (0, 1, 2)
 MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     eventfd.KIND: eventfd.rebuild,
@@ -339,7 +339,7 @@ def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     path, flags = str(facts["path"]), number_of(facts["flags"])
     brought = rebuilding.objects.get((number_of(facts.get("device", 0)), number_of(facts.get("inode", 0))))
     if brought is not None and not flags & O_PATH:
-        path = f"/proc/self/fd/{brought}"  # what was brought along in its place
+        path = f"/proc/self/fd/{brought}"  # the file that was brought along in its place
     descriptor = table.open(path, flags & (O_PATH | os.O_NOFOLLOW | os.O_DIRECTORY if flags & O_PATH else REOPENED_FLAGS))
     if held.kind == "files" and not flags & O_PATH:
         options = rebuilding.options

@@ -171,7 +171,7 @@ ORPHAN_LIMIT: Final = 64 << 20
 """Bytes of one mapping of a deleted file that are carried: every freeze reads them all, a millisecond for 4 MiB."""
 
 KERNEL_PLACES: Final = ("/proc/", "/sys/")
-"""Where nobody can make a directory."""
+"""Places where no program can make a directory."""
 
 _KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
 """Mappings that the kernel gives every process: they move, see `checkpoint.engines.ptrace.restore.memory`."""
@@ -186,7 +186,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Name what nobody else took."""
+    """Refuse, by name, an open file that no other kind took."""
     return f"{held.name} is {_called(held)}, which {_ADVICE}"
 
 
@@ -313,7 +313,7 @@ def refuse_process(
 
     Args:
         kin: all processes of its component, if there are several.
-        files_kept: somebody keeps its program file by content, so that it need not be there any more.
+        files_kept: a store keeps its program file by content, so that it need not be there any more.
         detaches_memory: shared memory that others have mapped, too, becomes its own copy.
         lines: its mappings, where they are known.
     """
@@ -383,7 +383,7 @@ def _refuse_namespaces(pid: int) -> Iterator[str]:
 
 
 def _has_other_for_children(pid: int, kind: str) -> bool:
-    """Whether those whom it gives birth to live in another namespace than it; the link leads nowhere before the first one.
+    """Whether its children live in another namespace than it; the link leads nowhere before the first child.
 
     Source: exit_task_namespaces() in do_exit(): of a process that ends, long before it is told, no link but those of ``pid`` and
     ``user`` leads anywhere.

@@ -63,7 +63,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     refused,
     refusals,
 )
-"""The last one refuses whatever no other took."""
+"""The last one refuses everything that no other took."""
 
 _OBSERVED: Final[Mapping[str, Observer]] = {
     timerfd.TARGET: timerfd.observe,
@@ -141,4 +141,4 @@ def findings_of_all(resources: Sequence[Resource], surroundings: Surroundings, *
 
 
 OF_ALL: Final = frozenset(kind.KIND for kind in (tcp, inet, unix, netlink, packet, regular, pidfd))
-"""Kinds of `findings_of_all`: what is noted of these may be otherwise at the next capture."""
+"""Kinds of `findings_of_all`: the notes about these may differ at the next capture."""

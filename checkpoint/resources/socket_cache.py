@@ -44,10 +44,10 @@ class _Known(Struct):
         asking: None until the program runs again.
         groups: multicast groups of the machine that it was asked about.
         settings, state: what it answered; ``state`` None where that says nothing of the next time.
-        listed: what the kernel's lists say of it.
-        facts: what that means.
+        listed: the entries of the kernel's lists about it.
+        facts: the meaning of those answers.
         seen: the open file, and the same with all that was observed.
-        again: what is told of it where it answers as before; None if that must be worked out.
+        again: the resource to tell where it answers as before; None if that must be worked out.
     """
 
     inode: int
@@ -66,9 +66,9 @@ class _Alike(Struct):
 
     Attributes:
         places: of their descriptors among those that are asked at a time.
-        heard: what all of them answered at the last look; b"" where one of them had something new to say, or could not be asked.
-        again: what is told of them where they answer as before, by their descriptors.
-        listed: those of whom the kernel's lists say something.
+        heard: the answers of all at the last look; b"" where one of them had something new to say, or could not be asked.
+        again: the resources to tell where they answer as before, by their descriptors.
+        listed: those that the kernel's lists name.
     """
 
     asking: Asking
@@ -99,7 +99,7 @@ class _AtATime(Struct, frozen=True):
 
 
 class _Round(Struct, frozen=True):
-    """Who is asked, as long as the open files are the very same.
+    """The sockets to ask, as long as the open files are the very same.
 
     Attributes:
         opened: all open files.
@@ -127,7 +127,7 @@ class _Answer(Struct, frozen=True):
 
 
 class Recollection:
-    """What is known of the sockets of one process that is looked at again and again."""
+    """The known facts of the sockets of one process that is looked at again and again."""
 
     def __init__(self) -> None:
         self._known: dict[int, _Known] = {}
@@ -198,7 +198,7 @@ class Recollection:
         return changed
 
     def _round_of(self, opened: Opened) -> _Round:
-        """Whom to ask now; what was told of them is worked out anew, for it may have followed from others."""
+        """The sockets to ask now. Their resources are worked out anew, for they may have followed from other sockets."""
         held = [one for one in opened if sockets.is_socket(one.first) and not one.is_echo]
         asked = tuple((one, known) for one in held if (known := self._asked_of(one, opened)) is not None)
         for _, known in asked:
@@ -301,7 +301,7 @@ def _recalled(one: OpenFile, known: _Known, told: Told, opened: Opened) -> _Answ
     if facts["family"] == socket.AF_UNIX:
         try:
             facts = unix.again(one, facts, opened)
-        except OSError:  # whoever looks into it says why
+        except OSError:  # the next look into it reports the cause
             return _Answer(settings, state, listed)
     if known.seen is None or known.seen[0] is not one or facts is not known.seen[1].observed:
         known.seen = one, replace(one, observed=facts)

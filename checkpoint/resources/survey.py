@@ -42,7 +42,7 @@ def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
 
 
 class Kept:
-    """What is kept of a process that is looked at again and again, so that only what has changed is read anew."""
+    """Facts kept of a process that is looked at again and again, so that only changes are read anew."""
 
     def __init__(self, pid: int) -> None:
         self.texts = KeptTexts(pid)
@@ -157,7 +157,7 @@ def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollec
 
 
 def _looked_into(held: OpenFile, opened: Opened, noted: Noted | None) -> OpenFile:
-    """A socket as it is observed now; as it was where it cannot be, of which whoever asks next is told."""
+    """A socket as it is observed now; as it was where that fails: the next question about it reports the cause."""
     if not held.is_echo and sockets.is_socket(held.first):
         with contextlib.suppress(CaptureError):
             return replace(held, observed=registry.observe_socket(held, opened, noted=noted))
@@ -172,10 +172,10 @@ def _may_be_half(held: OpenFile) -> bool:
 def glance(pid: int, kin: Kin = ALONE) -> tuple[OpenFile, ...]:
     """Read every descriptor of a process that runs on: enough to tell what is refused.
 
-    What it closes between two of our looks is neither there nor gone: then all is looked at again.
+    A file that it closes between two of our looks is neither there nor gone: then all is looked at again.
 
     Args:
-        kin: what is known of the other processes of its component.
+        kin: the known facts of the other processes of its component.
     """
     found = _glanced(pid, kin)
     for _ in range(GLANCES_MORE):

@@ -316,7 +316,7 @@ class Threads:
                 self._glance(now - began, ended)
 
     def _hear_reports(self, ended: set[int]) -> list[int]:
-        """Hear of all in one go; answers with those to ask singly: lost ones, and the first one, whose end its parent must note."""
+        """Hear of all in one go; answers with those to ask singly: lost ones, and the first, whose end its parent must note."""
         others = [tid for tid in self._moving if tid != self.pid]
         singly = [self.pid] if self.pid in self._moving else []
         for tid, report in zip(others, self._together.reports(others), strict=True):

@@ -100,7 +100,7 @@ class Name(NamedTuple):
 
     @property
     def key(self) -> Key:
-        """What it is a name of."""
+        """Device and inode of the file that it names."""
         return self.about.st_dev, self.about.st_ino
 
     @property
@@ -214,15 +214,15 @@ class CarriedTrees(Struct):
             mapped: inodes of the files that it has mapped to be shared.
 
         Raises:
-            CaptureError: too much changed a moment ago; or somebody else changes the tree meanwhile.
+            CaptureError: too much changed a moment ago; or another program changes the tree meanwhile.
         """
         return self._look(frozenset(mapped), frozen=True)
 
     def _look(self, mapped: frozenset[int], *, frozen: bool) -> Seen:
-        """See everything. What is read is remembered, whether or not it becomes a snapshot.
+        """See everything. Remembers all that it reads, whether or not it becomes a snapshot.
 
         Raises:
-            CaptureError: what was there a moment ago has gone.
+            CaptureError: a file that was there a moment ago has gone.
         """
         with seeing_as(self.eyes):
             try:

@@ -47,7 +47,7 @@ Pieces = Mapping[int, list[tuple[int, memoryview]]]
 
 
 class Laid(Struct, frozen=True):
-    """What was laid down.
+    """The result of laying down files.
 
     Attributes:
         notes: a sentence for each difference.
@@ -62,7 +62,7 @@ def lay_down_for(state: Snapshot, pid: int, *, own_eyes: bool) -> Laid:
     """Put all carried files of a base where they belong, before its program runs; see `lay_down`.
 
     Args:
-        pid: what is to become the program, or ourselves.
+        pid: the process that is to become the program, or our own.
         own_eyes: with the rights of the program's own user, not with ours.
     """
     if not carried_files.paths_of(state):
@@ -285,7 +285,7 @@ class _Laying(Struct):
                 os.rmdir(self._kept)
                 os.rmdir(os.path.dirname(self._kept))
         self.clear()
-        with contextlib.suppress(OSError):  # somebody else has put something there
+        with contextlib.suppress(OSError):  # another program has put something there
             for folder in reversed(self._made):
                 os.rmdir(folder)
         return ()
@@ -316,7 +316,7 @@ class _Laying(Struct):
         return os.path.join(path_of(self._held), "new")
 
     def _make_folders(self, folder: str) -> None:
-        """What is missing above the path."""
+        """Make the directories that are missing above the path."""
         missing = []
         while not os.path.lexists(folder):
             missing.append(folder)
@@ -326,7 +326,7 @@ class _Laying(Struct):
             self._made.append(one)
 
     def _make_aside(self, place: str) -> None:
-        """Nobody else can change what is in it. Who may write beside it can let its name lead elsewhere, so that is not used."""
+        """Make a folder that only we can change. A user who may write beside it can redirect its name, so we do not use that."""
         self._aside = tempfile.mkdtemp(prefix=os.fsdecode(carried_files.OWN_PREFIX) + "new-", dir=place)
         self._held = os.open(self._aside, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         if not _is_own(path_of(self._held)) or os.listdir(path_of(self._held)):
@@ -435,7 +435,7 @@ class _Laying(Struct):
 
 
 def _is_own(folder: str) -> bool:
-    """Whether it is no link and nobody else's, who would have us remove, or could see, what is in it."""
+    """Whether it is no link and ours alone: another owner would have us remove, or could see, its content."""
     about = os.stat(folder) if folder.startswith(DESCRIPTORS) else os.lstat(folder)
     return stat.S_ISDIR(about.st_mode) and about.st_uid == own_uid() and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 

@@ -24,7 +24,7 @@ class _Move(NamedTuple):
 
 
 class Moves(Struct):
-    """What was moved, in order."""
+    """The moves that were made, in order."""
 
     _made: list[_Move] = field(default_factory=list)
 

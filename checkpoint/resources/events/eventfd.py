@@ -46,7 +46,7 @@ def is_told(one: Descriptor) -> bool:
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Of which kind one is that the kernel does not tell of; everybody who has it stands still.
+    """The kind of one, where the kernel does not tell it. All processes that have it stand still.
 
     Raises:
         CaptureError: it cannot be asked.

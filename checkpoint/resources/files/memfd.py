@@ -152,7 +152,7 @@ def make(table: CallTable, name: str, mode: int, size: int) -> int:
 
 
 def make_whole(table: CallTable, held: Resource) -> int:
-    """Make one that nobody has mapped, filled and sealed."""
+    """Make one that no process has mapped, filled and sealed."""
     facts = held.facts
     made = make(table, str(facts["name"]), number_of(facts["mode"]), number_of(facts["size"]))
     _fill(table, held, made)

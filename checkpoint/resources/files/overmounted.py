@@ -83,7 +83,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Nothing is refused here: what has no handle is a file as others are, which no path leads to."""
+    """Refuse nothing here: a file without a handle counts as any other file to which no path leads."""
     return None
 
 

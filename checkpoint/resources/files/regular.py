@@ -288,7 +288,7 @@ def digest_at(path: str, version: tuple[int, int, int, int]) -> bytes:
     try:
         return _digest(path, version)
     except (OSError, _ChangedError):
-        return b""  # whoever may trace may usually read; where not, size and name must do
+        return b""  # a tracer may usually read; where not, size and name must do
 
 
 class _ChangedError(Exception):

@@ -61,7 +61,7 @@ CAPABILITIES: Final = (
 _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(deleted\))$", re.MULTILINE)
 """Device and inode number, and the name."""
 FOREBEARS: Final = 8
-"""Of a process that are looked at: who is born while a component is looked at has few."""
+"""Ancestors of a process that are looked at: a process that is born while we look at its component has few."""
 NAMES_TOLD: Final = 2
 """Of several pieces of one middleware, in one sentence."""
 
@@ -142,7 +142,7 @@ def _by_maker(found: Iterable[Mapped]) -> Iterable[list[Mapped]]:
 
 
 def _called(pieces: list[Mapped]) -> str:
-    """Which they are, and who else has them."""
+    """Their names, and the process that maps them too."""
     names = ", ".join(one.name for one in pieces[:NAMES_TOLD])
     more = f" and {len(pieces) - NAMES_TOLD} more" if len(pieces) > NAMES_TOLD else ""
     return f"the shared memory {names}{more} is mapped by {_who(pieces[0].pid)} too"
@@ -199,7 +199,7 @@ def refuse_partial(one: Descriptor, objects: Mapping[Object, int]) -> str | None
 
 
 def describe(objects: Iterable[tuple[Object, str]]) -> tuple[Resource, ...]:
-    """That these become the program's own copy, for whoever restores it.
+    """Tell a restore that these become the program's own copy.
 
     Args:
         objects: with their names.
@@ -223,7 +223,7 @@ def _names(fact: Fact) -> list[str]:
     return [str(name).removesuffix(DELETED) for name in fact]
 
 
-# --- Who has mapped what -------------------------------------------------------------------------------------------------
+# --- Which processes map which objects ----------------------------------------------------------------------------------
 
 
 def _belongs(other: int, kin: Collection[int]) -> bool:
@@ -260,7 +260,7 @@ def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:
 
 @lru_cache(maxsize=1)
 def _mappers(asker: int, second: int) -> dict[bytes, list[int]]:
-    """Who has mapped which object: processes by device and inode number.
+    """The processes that map each object, by device and inode number.
 
     Args:
         asker: a process of the component about which it is asked: each looks for itself.

@@ -144,10 +144,10 @@ def _wanted(held: Resource) -> Segment:
 
 
 def _left_behind(wanted: Segment, here: Iterable[Segment]) -> Segment | None:
-    """The very segment, that nobody has attached any more: the program left it here when it died.
+    """The very segment that the program left here when it died, if no process has it attached any more.
 
-    Whoever else may use one like it would share the program's memory. One without a key is known by when it was made: of
-    this machine's there is no other with the same id at the same time.
+    A program that uses another segment like it would share the program's memory. A segment without a key is known by when it
+    was made: of this machine's there is no other with the same id at the same time.
     """
 
     def is_it(one: Segment) -> bool:

@@ -172,7 +172,7 @@ def put_back(state: Snapshot, pids: Sequence[int], owner: int | None) -> tuple[s
 
     Args:
         pids: of its processes as `Snapshot.processes` orders them.
-        owner: the user id to whom the groups must belong that are not below the usual place; None: to anybody.
+        owner: the user id that must own the groups that are not below the usual place; None: any user may.
     """
     wanted = [(pid, place) for one, pid in zip(state.processes, pids, strict=True) for place in _places(one.resources)]
     notes = [note for one, pid in zip(state.processes, pids, strict=True) for note in _thread_notes(one.resources, pid)]

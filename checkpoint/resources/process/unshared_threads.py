@@ -105,7 +105,7 @@ class ThreadTables:
         self._told: dict[int, _Told] = {}
 
     def prepare(self) -> None:
-        """Look before the freeze who has anything."""
+        """Look before the freeze which threads have anything."""
         self._known = _all_own(self._pid)
 
     def look(self) -> None:
@@ -125,7 +125,7 @@ class ThreadTables:
             self._told[tid] = _Told(fact, tuple(reasons))
 
     def describe(self) -> tuple[Resource, ...]:
-        """What was seen.
+        """The result of the look.
 
         Raises:
             CaptureError: one of them has just taken leave of the first thread, or what it had could not be kept.

@@ -191,7 +191,7 @@ def _bound(address: Sequence[Fact]) -> list[Fact]:
 
 
 def _peer(held: OpenFile, looked: socket.socket, listings: Listings) -> list[Fact]:
-    """Whom it is, or was, connected with."""
+    """The address with which it is, or was, connected."""
     with contextlib.suppress(OSError):
         return list(looked.getpeername())
     if looked.type == socket.SOCK_STREAM:

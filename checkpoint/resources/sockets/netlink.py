@@ -127,7 +127,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Iterable[Resource]) -> Iterator[Finding]:
-    """What is not known to come back."""
+    """Notes about state that may not come back."""
     for one in held:
         if one.kind == KIND and one.facts["protocol"] == GENERIC:
             text = f"what a driver keeps for the generic netlink socket {one.name} is forgotten when the program comes back"
@@ -140,7 +140,7 @@ def findings(held: Iterable[Resource]) -> Iterator[Finding]:
 def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Disguise) -> dict[int, int]:
     """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot.
 
-    What may be said by one depends on who opened it, too, not only on who says it.
+    The rights of a message depend on the process that opened the socket, too, not only on its sender.
 
     Source: netlink_ns_capable() in net/netlink/af_netlink.c.
     """

@@ -56,10 +56,10 @@ def socket_at(path: str) -> os.stat_result | None:
 
 
 def by_number(outlook: str, path: str, file: BoundFile | None) -> tuple[str, os.stat_result | None]:
-    """Where a file lies, and what is told of it; None if it has no name here.
+    """Where a file lies, and its stat(2); None if it has no name here.
 
-    An ordinary user may not ask a socket for its file, but for the number of that. Where it is nowhere beside the name that it
-    was bound to, nobody tells him whether it has another one far away or none.
+    An ordinary user may not ask a socket for its file, but for the number of that. Where the file is nowhere beside the name
+    that it was bound to, the kernel does not tell him whether it has another name far away or none.
 
     Args:
         path: the name that it was bound to; it counts where the number says nothing: on a file system that tells others.

@@ -182,7 +182,7 @@ class _Plain(socket.socket):
 
 @contextlib.contextmanager
 def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
-    """A socket of another process, for the body; what is set on it is set there, too.
+    """A socket of another process, for the body; options set on it are set there, too.
 
     Raises:
         OSError: it was closed meanwhile.

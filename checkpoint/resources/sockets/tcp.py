@@ -244,7 +244,7 @@ def note(held: Resource) -> str | None:
 
 
 def named(held: Resource) -> str:
-    """A connection, for a sentence: its descriptor, and with whom it is."""
+    """A connection, for a sentence: its descriptor, and the address of its peer."""
     peer = held.facts["peer"]
     return f"{held.name} with {in_words(peer)}" if isinstance(peer, list) and peer else held.name
 
@@ -262,10 +262,10 @@ def established(held: Iterable[Resource]) -> int:
 
 
 def summary(held: Sequence[Resource]) -> tuple[str, ...]:
-    """What a restore of a whole program resets, as a sentence for its status: with whom, and what to do.
+    """The connections that a restore of a whole program resets, as a sentence for its status: their peers, and what to do.
 
     Args:
-        held: what all of its processes have.
+        held: the resources of all its processes.
     """
     others = pairs(held)
     ended = {
@@ -322,7 +322,7 @@ def _reads_the_end(held: Resource) -> bool:
 
 
 def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
-    """Make all of them at numbers from ``first`` on, before anybody listens: the descriptor of each, by the socket's number."""
+    """Make all of them at numbers from ``first`` on, before any listens: the descriptor of each, by the socket's number."""
     return _Work(table, held, first).run() if held else {}
 
 
@@ -451,7 +451,7 @@ def _set(table: CallTable, made: int, option: int, value: int) -> None:
 
 
 def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) -> None:
-    """Once those who listen do: options, what waits, and which side has ended."""
+    """Once the listeners listen: set options, send waiting bytes, and end sides that had ended."""
     others = pairs(held)
     for one in held:
         number, other = made[_number(one, "socket")], others.get(_number(one, "socket"))

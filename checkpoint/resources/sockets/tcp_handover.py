@@ -65,7 +65,7 @@ class Departing(Struct, frozen=True):
 
     Attributes:
         silent: those that are taken along.
-        facts: what is to be added to each resource, by the socket's number.
+        facts: additional facts for each resource, by the socket's number.
     """
 
     silent: tuple[Connection, ...] = ()
@@ -159,9 +159,9 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
 
 
 def heard_again(opened: Iterable[OpenFile]) -> None:
-    """What somebody silenced who died over it, and left the program running, is heard again."""
+    """Let connections be heard again that a keeper had silenced before it died and left the program running."""
     found = list(_with_others(opened))
-    with contextlib.suppress(OSError):  # then nobody could have silenced them either
+    with contextlib.suppress(OSError):  # then no keeper could have silenced them either
         for one in found:
             with copy_of(one.pid, one.first.number) as descriptor, _borrowed(descriptor) as looked:
                 tcp_repair.leave_behind(looked)
@@ -188,7 +188,7 @@ class Arriving:
     """Connections that a program takes up again: made once it has its descriptors, and heard from when it goes on.
 
     Attributes:
-        notes: what is to be done for them, and what was reset.
+        notes: steps to take for them, and connections that were reset.
         established: connections that were open at the capture.
     """
 
@@ -208,7 +208,7 @@ class Arriving:
         self._made: list[tuple[socket.socket, _Arrival, int]] = []
 
     def connect(self, pids: Sequence[int]) -> None:
-        """Turn the sockets that the processes were given into their connections. Nobody hears of them yet.
+        """Turn the sockets that the processes were given into their connections. Their peers hear nothing yet.
 
         Args:
             pids: of the component's processes, as `checkpoint.snapshot.process_tree.views` orders them.
@@ -244,7 +244,7 @@ class Arriving:
                 made.close()
         except OSError as error:
             raise RestoreError(f"cannot resume TCP connections: {error.strerror}") from error
-        with contextlib.suppress(OSError):  # then nobody could have silenced them either
+        with contextlib.suppress(OSError):  # then no keeper could have silenced them either
             packet_drop.lift(self._ended)
 
 
@@ -260,10 +260,10 @@ def arriving(state: Snapshot, *, wanted: bool, all_of_them: bool = False) -> tup
 
     Args:
         wanted: nothing has run since the capture; else none is.
-        all_of_them: refuse if one cannot; what has been silent stays silent, so that another restore may succeed.
+        all_of_them: refuse if one cannot; silent connections stay silent, so that another restore may succeed.
 
     Returns:
-        Those, which are silent from now on; and the snapshot, with the reason in the place of what cannot be taken up.
+        Those, which are silent from now on; and the snapshot, with the reason in the place of each that cannot be taken up.
 
     Raises:
         MismatchError: one cannot, and all were to be.
@@ -353,7 +353,7 @@ def _ends(held: Resource) -> tuple[tcp_repair.Address, tcp_repair.Address]:
 
 
 def _try(one: _Arrival) -> None:
-    """Make it and take it away again, which nobody hears of. Whoever had it on this machine may be about to end.
+    """Make it and take it away again; its peer hears nothing. The process that had it on this machine may be about to end.
 
     Raises:
         CannotCarryError: this machine cannot have it.

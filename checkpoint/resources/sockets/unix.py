@@ -94,7 +94,7 @@ _EXITING: Final = (
     (".X11-unix", "clients of Xlib do so"),
     ("wayland-", "most clients of Wayland do so"),
 )
-"""What is known of clients, by a part of the name of their server."""
+"""The known behaviour of clients, by a part of the name of their server."""
 
 
 def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
