@@ -262,7 +262,7 @@ class Session(Protocol):
         ...
 
     notes: tuple[str, ...]
-    """What is not as it could be: a fallback that was taken, something that will differ."""
+    """Sentences about a fallback that was taken, or a difference to come."""
 
     def capture(self, order: CaptureOrder) -> Snapshot:
         """Take one snapshot; the program runs on, also when that fails.
@@ -280,7 +280,7 @@ class Session(Protocol):
         ...
 
     def acknowledge(self, position: Position) -> None:
-        """A standby holds everything up to ``position``: what was written before it may be forgotten."""
+        """A standby holds everything up to ``position``: the session may forget the pages written before it."""
         ...
 
     def open_file(self, path: str, digest: bytes) -> int:

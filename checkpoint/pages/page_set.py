@@ -42,7 +42,7 @@ DIGESTED = 1024
 
 
 def extents(runs: Iterable[PageRun | PageCopy | Vma]) -> Words:
-    """The set that runs or mappings cover, whatever their order and overlap."""
+    """The set that runs or mappings cover, in any order and overlap."""
     edges = [edge for run in runs if run.start < run.end for edge in (run.start, run.end)]
     told = np.array(edges, dtype=np.uint64).reshape(-1, 2)
     if len(told) < 2 or (told[1:, 0] > told[:-1, 1]).all():

@@ -45,7 +45,7 @@ def are_worth_it(differences: Rows) -> Flags:
 
 
 def tellable(delta: Snapshot) -> Words:
-    """The pages of a delta that may be told as differences: what was there before is there still, and no copy is of them.
+    """The pages of a delta that may be told as differences: their earlier content is there still, and no copy is of them.
 
     Returns:
         Their addresses, in order.

@@ -13,7 +13,7 @@ from checkpoint.arch import levels as arch
 from checkpoint.arch import stubs
 
 VARIABLE: Final = "FAILOVER_PORTABLE"
-"""Holds the level, for whoever looks at the program later."""
+"""Holds the level, for later looks at the program."""
 TUNABLES: Final = "GLIBC_TUNABLES"
 HWCAPS: Final = "glibc.cpu.hwcaps"
 LEVELS: Final = arch.LEVELS

@@ -140,7 +140,7 @@ class SegmentReader:
 
     @contextmanager
     def _held(self, bank: int) -> Iterator[bool]:
-        """Hold a bank so that nobody writes it; False if it is being written."""
+        """Hold a bank so that the program does not write it; False if it is being written."""
         try:
             fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, lock_of(fcntl.F_RDLCK, bank))
         except BlockingIOError:

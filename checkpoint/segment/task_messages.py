@@ -69,7 +69,7 @@ class Begin(Struct, frozen=True):
     Attributes:
         component: its name.
         epoch: of the primacy under which it runs: the fencing token.
-        pipes: inode numbers of its standard output and error: whoever finds others there has redirected them.
+        pipes: inode numbers of its standard output and error: a program that finds others there has redirected them.
     """
 
     component: str

@@ -134,7 +134,7 @@ def every_path(state: Snapshot) -> tuple[str, ...]:
 
 
 def without(state: Snapshot) -> Snapshot:
-    """The snapshot of the program alone: what is left is what its process holds."""
+    """The snapshot of the program alone: the rest is what its process holds."""
     if not paths_of(state) and not any(vma.kind is VmaKind.CARRIED_FILE for vma in state.vmas):
         return state
     runs = tuple(run for run in state.runs if run.start < FIRST_ADDRESS)

@@ -172,7 +172,7 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
 
 
 def read_header(source: Source) -> Header:
-    """Read and verify the header alone: cheap, whatever the size of the file.
+    """Read and verify the header alone: cheap, for a file of any size.
 
     Raises:
         FormatError: no header of ours; the rest of the file is not looked at.

@@ -106,7 +106,7 @@ def _need(file: FileIdentity) -> Need:
 
 
 def _is_run(vma: Vma) -> bool:
-    """Whether it is mapped from a file with a name, and only to be read: what is written to the file is another matter."""
+    """Whether it is mapped from a file with a name, and only to be read: files that the program writes do not count here."""
     file = vma.file
     if vma.kind is not VmaKind.FILE or file is None or file.deleted or not stat.S_ISREG(file.mode):
         return False

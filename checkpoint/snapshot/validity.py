@@ -125,7 +125,7 @@ def _check_members(snapshot: Snapshot, page_size: int) -> None:
 
 
 def _check_descent(parents: Mapping[int, int]) -> None:
-    """Nobody is an ancestor of its own: whoever is followed upwards comes to the first process, or to nobody."""
+    """No process is an ancestor of its own: the way up from each ends at the first process, or at a parent that is not listed."""
     settled: set[int] = set()
     for pid in parents:
         line: set[int] = set()

@@ -42,7 +42,7 @@ class StoredBase:
     Attributes:
         outline: what they amount to, without its bytes.
         reader: of the base's file; ``preamble``: its own; ``base_pages``: those that it tells.
-        chain: what was read: the base without its bytes, and the deltas.
+        chain: the files as read: the base without its bytes, and the deltas.
         origins: where its pages come from; None where there are no deltas.
 
     Raises:
@@ -83,7 +83,7 @@ class StoredBase:
     # All pages
 
     def within(self, wanted: Words) -> StoredBase:
-        """Itself: what is left out could not be proved."""
+        """Itself: pages that are left out could not be proved."""
         return self
 
     def each(self, take: Taker, threads: int) -> None:

@@ -1,6 +1,6 @@
 """Cache digests of files that have not changed, so that they need not be read again.
 
-Source: inode(7): ctime is the kernel's own, and every write, also one through a mapping, sets it; only a user who sets the clock
+Source: inode(7): ctime is the kernel's own, and every write, also one through a mapping, sets it; only a user that sets the clock
 could keep it unchanged.
 """
 

@@ -11,7 +11,7 @@ from typing import Final
 
 FILE_MODE = 0o600
 FOLDER_MODE = 0o700
-"""Memory is secret: nobody else reads a snapshot."""
+"""Memory is secret: no other user may read a snapshot."""
 
 COPY_SIZE = 1 << 20
 """Bytes copied at a time."""

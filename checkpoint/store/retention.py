@@ -67,7 +67,7 @@ class History:
             self._olds[folder.name] = tuple(sorted(found, key=lambda old: old.stored_s))
 
     def of(self, folder: str) -> tuple[Old, ...]:
-        """What is kept of the component with this folder, oldest first."""
+        """The snapshots kept of the component with this folder, oldest first."""
         return self._olds.get(folder, ())
 
     @property

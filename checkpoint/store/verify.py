@@ -78,7 +78,7 @@ class Proofs:
         hot.resize(self._budget.share(_user(component), hot.wanted, min(hot.size, hot.limit)))
 
     def _unproved(self, base: Snapshot) -> Proved:
-        """Before a chain's base. What was known until now may go: its memory is used again."""
+        """Begin before a chain's base. The known pages may go: their memory is used again."""
         known = self._proved.pop(base.component, None)
         page_size = base.machine.page_size
         fits = known is not None and known.table.page_size == page_size

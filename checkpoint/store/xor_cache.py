@@ -26,10 +26,10 @@ WHOLE_MAX: Final = 256
 
 
 class Step(Struct, frozen=True, eq=False):
-    """What one snapshot does to the pages of its parent.
+    """The changes of one snapshot to the pages of its parent.
 
     Attributes:
-        kept: what is mapped now.
+        kept: ranges that are mapped now.
         gone: pages whose earlier content counts no more: cleared ones, and all that it tells.
         addresses: of those whose content is kept here, in order; ``rows``: that content.
         count: of all that it tells.
@@ -96,7 +96,7 @@ class HotPages:
         self.position, self._pages = None, PageMap.empty()
 
     def resize(self, limit: int) -> None:
-        """Have another limit from now on; what was told longest ago goes, where it is less."""
+        """Have another limit from now on; where it is less, the pages told longest ago go."""
         page_size = self._slots.shape[1]
         self.limit, self._slot_limit = limit, limit // page_size
         if len(self._slots) <= self._slot_limit:
