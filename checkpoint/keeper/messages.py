@@ -159,7 +159,7 @@ def memfd_holding(content: bytes | memoryview, name: str) -> int:
 
 
 def seal(descriptor: int) -> None:
-    """Close a memory file to every change, for everybody and for good."""
+    """Close a memory file to every change, for all processes and for good."""
     seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
 

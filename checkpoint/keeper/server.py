@@ -127,7 +127,7 @@ class Keeper:
     def serve(self) -> None:
         """Answer until the peer hangs up; then let go."""
         try:
-            with waking() as await_readable:  # who is held and killed meanwhile waits for us
+            with waking() as await_readable:  # a program that is held and killed meanwhile waits for us
                 while True:
                     for _ in range(COLLECTED_AFTER):
                         await_readable(self._link.fileno())
@@ -274,7 +274,7 @@ class Keeper:
                 raise RestoreError(f"cannot build a ready copy in pid {request.pid}: this keeper follows a process already")
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
             with untrusted.facts(f"build a ready copy of {request.component}"):
-                is_whole = _has_several_processes(descriptors)  # who came or went within the chain is not followed
+                is_whole = _has_several_processes(descriptors)  # a process that came or went within the chain is not followed
                 if is_whole:
                     self._copy = self._tracer.lay(request.pid, folded(descriptors), options)
                 else:

@@ -148,7 +148,7 @@ def _chosen_by(about: os.stat_result, path: str) -> Author:
             folder = os.stat(place)
             if folder.st_mode & WRITABLE_BY_OTHERS and not folder.st_mode & stat.S_ISVTX:
                 raise _unknown(
-                    path, f"every user who may write to {place} could have put another file there", f"chmod go-w {place}"
+                    path, f"every user with write access to {place} could have put another file there", f"chmod go-w {place}"
                 )
             shared = shared or (place if folder.st_mode & WRITABLE_BY_OTHERS else "")
             choosers.setdefault(folder.st_uid, place)

@@ -47,7 +47,7 @@ class PageBudget:
         """How many bytes one may hold from now on.
 
         Args:
-            wanted: bytes that it would hold if it had room; 0: not known yet, then it gets the free rest, and takes none from others.
+            wanted: bytes that it would hold if it had room; 0: not known yet, then it gets the free rest and none from others.
             held: bytes that it holds.
         """
         with self._lock:

@@ -32,7 +32,7 @@ LISTENING: Final = 10
 
 
 class BoundFile(Struct, frozen=True):
-    """The file that a socket was bound to, as everybody may ask for it: it has this number still when it has no name.
+    """The file that a socket was bound to, as any user may ask for it: it has this number still when it has no name.
 
     Attributes:
         number: the lower 32 bits of its inode's.

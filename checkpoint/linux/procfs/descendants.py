@@ -140,7 +140,7 @@ class Kinship:
         return [pid for pid in self._of_reaper.read([self._reaper]) if pid != self._pid]
 
     def others(self) -> list[int]:
-        """Everybody besides the first process, parents before children, zombies included."""
+        """All processes besides the first one, parents before children, zombies included."""
         found = list(self._walk([*children(self._pid), *(self._orphans() if self._reaper else ())], ()))
         self._has_strays = False
         while strays := self._strays(found):

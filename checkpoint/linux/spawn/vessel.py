@@ -148,7 +148,7 @@ def discard(born: Born) -> None:
 
 
 class _Lines(Struct, frozen=True):
-    """Our end of the pipe on which everybody at a birth reports; the reports end when the last of them has executed or ended."""
+    """Our end of the pipe on which all children at a birth report; it ends when the last of them has executed or ended."""
 
     descriptor: int
 
@@ -333,7 +333,7 @@ def _grow_up(
         os.setsid()
     _take_stdio(birth.stdio)
     if birth.own_session and os.isatty(0):
-        with contextlib.suppress(PermissionError):  # it belongs to the session of a user who restores by hand, and stays so
+        with contextlib.suppress(PermissionError):  # it belongs to the session of a user that restores by hand, and stays so
             fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     _forget_signals()
     namespaces.close_others_on_exec(3)

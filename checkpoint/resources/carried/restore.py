@@ -299,7 +299,7 @@ class _Laying(Struct):
             self._held = -1
 
     def called(self, path: str) -> str:
-        """What a path of ours is called by everybody."""
+        """The name that all programs use for a path of ours."""
         return path.replace(path_of(self._held), self._aside) if self._held >= 0 else path
 
     def _remove_aside(self) -> None:

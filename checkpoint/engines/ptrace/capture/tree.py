@@ -186,7 +186,7 @@ def _going_on(seen: SeenProcess, continued: Collection[int]) -> tuple[Resource, 
     """That a process goes on, of which its parent has not been told.
 
     Args:
-        continued: the children of whom that is known, as the component sees them.
+        continued: the children of which that is known, as the component sees them.
     """
     is_stopped = job_control.stop_of(seen.unopened) is not None
     return (job_control.going_on(),) if seen.status.pids[-1] in continued and not is_stopped else ()
@@ -334,7 +334,7 @@ class CapturedTree:
             MovedError: one of them does not stop.
         """
         first = self._first.threads
-        followed = self._standing or self._known  # one may have become an orphan since, whom a glance does not find
+        followed = self._standing or self._known  # one may have become an orphan since: a glance does not find it
         if not followed and not self._kin.has_others([first.pid, *(tracee.pid for tracee in first.others)]):
             return False
         ended = set(self._ended)
@@ -373,7 +373,7 @@ class CapturedTree:
         return True
 
     def thaw(self) -> None:
-        """Let everybody go."""
+        """Let all processes go."""
         standing, self._standing = self._standing, {}
         self._ended = []
         for threads in standing.values():

@@ -252,7 +252,7 @@ class _Plan(Struct):
             self._bear_orphan(orphan)
         self._give_all()
         for person in self.others:
-            assert person.pid in self.session, "everybody has a parent, or none that lives"
+            assert person.pid in self.session, "each process has a parent, or none that lives"
         self._group()
         for pid, parent in reversed(self.standins.items()):
             self.steps.append(End(parent, pid))
@@ -394,7 +394,7 @@ class _Plan(Struct):
     # At places
 
     def made_at(self, places: Places) -> list[Step]:
-        """As `made`, with everybody born at a place, and given to its parent when all are born.
+        """As `made`, with every process born at a place, and given to its parent when all are born.
 
         Raises:
             NoWayError: a place is of no use: its number is taken, or the process shares something with its parent.
@@ -452,7 +452,7 @@ class _Plan(Struct):
     # Groups
 
     def _group(self) -> None:
-        """Everybody to its group, whose leader makes it first."""
+        """Put each process into its group; the group's leader makes it first."""
         ours = {self.first.pid: self.session[self.first.pid], **self.session}
         waiting = []
         left = {person.pgid for person in self.others} & {one.pid for one in self.others if one.pgid != one.pid}

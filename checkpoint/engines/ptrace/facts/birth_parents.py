@@ -105,7 +105,7 @@ class _Search:
         return self._first.pid if session == self._first.session else session
 
     def _is_tree(self, places: Places) -> bool:
-        """Whether the first process is above everybody."""
+        """Whether the first process is above all others."""
         for pid in places:
             if not any(above == self._first.pid for above in itertools.islice(self._above(places, pid), len(places) + 1)):
                 return False

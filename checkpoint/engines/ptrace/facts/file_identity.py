@@ -92,7 +92,7 @@ class Identities:
         living = self._living_name(line)
         is_shared_huge = is_told and line.name.startswith(HUGE_NAME)
         is_file = not is_shared_huge and line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")
-        if is_shared_huge:  # by relatives, who can have it as ordinary memory alone
+        if is_shared_huge:  # by relatives, which can have it as ordinary memory alone
             flags = tuple(flag for flag in flags if flag not in (vm_flags.HUGE, vm_flags.GIGANTIC))
         return Vma(
             start=line.start,

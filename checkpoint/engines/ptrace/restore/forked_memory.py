@@ -83,7 +83,7 @@ class Inheritance(Struct, frozen=True):
     Attributes:
         regions: where the vessel has it mapped, as far as it is anonymous.
         of_files: the same of files.
-        sources: of whom the pages are: their numbers among his, and their addresses.
+        sources: the process that each page is of: the pages' numbers among its own, and their addresses.
         legacies: of each process.
     """
 

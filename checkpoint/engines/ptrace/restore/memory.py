@@ -254,7 +254,7 @@ def make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
     file = vmas[0].file
     assert file is not None
     size, mode = file.size, file.mode & 0o7777
-    if not file.mode:  # an ordinary user captured it, who is not told its size: what is mapped counts
+    if not file.mode:  # an ordinary user captured it, and could not ask its size: the mapped size counts
         size, mode = max(vma.offset + vma.size for vma in vmas), OWNERS_ALONE
     if file.path.startswith(memfd.PREFIX):
         return memfd.make(table, file.path.removeprefix(memfd.PREFIX), mode, size)

@@ -513,7 +513,7 @@ class ProcessRestore:
         return VdsoCalls(self._tracee, self._start_registers, self._vdso, self._vdso_size)
 
     def _queue_traps(self, calls: VdsoCalls, place: int) -> None:
-        """Queue each SIGTRAP that was pending, by whom it waits for; blocked, it disturbs none of the calls to come.
+        """Queue each pending SIGTRAP, from the thread that it waits for; blocked, it disturbs none of the calls to come.
 
         Args:
             place: of ours still, for a siginfo.
