@@ -13,7 +13,7 @@ from msgspec import Struct
 
 
 class Verdict(StrEnum):
-    """What becomes of a kind."""
+    """The result for a kind."""
 
     PRESERVED = "preserved"
     BY_RULE = "by rule"
@@ -21,7 +21,7 @@ class Verdict(StrEnum):
 
 
 class Area(StrEnum):
-    """What a kind is a part of, in the order of the table."""
+    """The area that a kind belongs to, in the order of the table."""
 
     PROCESS = "the process"
     THREADS = "threads"

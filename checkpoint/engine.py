@@ -53,7 +53,7 @@ class Finding(Struct, frozen=True):
 
 
 class Report(Struct, frozen=True):
-    """What a capture of one process would preserve, found without touching it.
+    """The things that a capture of one process would preserve, found without touching it.
 
     Attributes:
         command: its arguments, joined by blanks.
@@ -79,7 +79,7 @@ class Report(Struct, frozen=True):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What will differ, one sentence each."""
+        """Differences to come, one sentence each."""
         return tuple(finding.text for finding in self.findings if finding.verdict == NOTED)
 
 
@@ -119,7 +119,7 @@ NOTHING_CARRIED: Final = Carry()
 
 
 class Terms(Struct, frozen=True):
-    """What an operator has ruled of what one component holds, for one robot.
+    """The operator's rules for the things that one component holds, for one robot.
 
     Attributes:
         carry: its files that travel with it.
@@ -197,7 +197,7 @@ def contradiction(carry: Iterable[str], shared: tuple[str, ...]) -> str:
 
 
 class CaptureOrder(Struct, frozen=True):
-    """What the next snapshot is to be.
+    """An order for the next snapshot.
 
     Attributes:
         base: make a base, also after an acknowledgement. A delta needs False here and an acknowledged position.
@@ -407,7 +407,7 @@ class Engine(Protocol):
         ...
 
     def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = ...) -> tuple[str, ...]:
-        """What this machine lacks of what a program needs that runs elsewhere, one sentence each; without touching anything.
+        """What this machine lacks for a program that runs on another one, one sentence each; without touching anything.
 
         Args:
             outline: of its newest snapshot (`checkpoint.snapshot.format.read_outline`).

@@ -19,7 +19,7 @@ Fact = int | str | bytes | bool | float | None | list["Fact"] | dict[str, "Fact"
 
 
 class VmaKind(enum.StrEnum):
-    """What backs a mapping, which decides how it comes back."""
+    """The backing of a mapping, which decides how it comes back."""
 
     ANONYMOUS = "anonymous"
     HEAP = "heap"
@@ -115,7 +115,7 @@ class Vma(Struct, frozen=True):
 
 
 class SignalAction(Struct, frozen=True):
-    """What one signal does (rt_sigaction(2)): the kernel's own four words."""
+    """The action of one signal (rt_sigaction(2)): the kernel's own four words."""
 
     signal: int
     handler: int
@@ -232,7 +232,7 @@ class MemoryLayout(Struct, frozen=True):
 
 
 class ProcessState(Struct, frozen=True):
-    """What belongs to the process as a whole.
+    """The state that belongs to the process as a whole.
 
     Attributes:
         pid: as the program itself sees it (innermost PID namespace).
@@ -277,7 +277,7 @@ class Resource(Struct, frozen=True):
 
     Attributes:
         kind: the file's name there: "files", "devices", "streams" …
-        name: what holds it: for descriptors the number, as "fd 7".
+        name: its holder: for descriptors the number, as "fd 7".
         facts: documented in that file; unknown facts of a newer writer are refused, not ignored.
     """
 

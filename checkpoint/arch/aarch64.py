@@ -80,7 +80,7 @@ OUTSIDE_OF_CALLS: Final[tuple[tuple[int, int], ...]] = ()
 STEPPING: Final[tuple[tuple[int, int], ...]] = ()
 """No program steps through itself: only the kernel can set that bit."""
 LOST_IN_A_CALL: Final = ("mark",)
-"""What every system call changes, besides its result: nothing but what is no register, see `recalled`."""
+"""Registers that every system call changes, besides its result: none; the mark is no register, see `recalled`."""
 ARGUMENTS: Final = ("x0", "x1", "x2", "x3", "x4", "x5")
 ENDED_ARGUMENTS: Final = ("first", *ARGUMENTS[1:])
 """Where the arguments of a call are that has ended: a result has taken the place of the first one, see `recalled`."""
@@ -118,7 +118,7 @@ UNKEPT_OUTPUT_SIZE: Final = 16
 
 
 def unkept(output: int) -> tuple[Unkept, ...]:
-    """What of this processor a process may have switched for itself, and no restore gives back.
+    """The switches of this processor that a process may have set for itself, and no restore gives back.
 
     Args:
         output: address of `UNKEPT_OUTPUT_SIZE` bytes that the calls may write to.
@@ -153,7 +153,7 @@ RESTART_BLOCK: Final = -516
 REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "clock_nanosleep": (2, 3)}
 """Which argument points to the time asked for, and which to where the kernel has written what remains of it."""
 ERESTARTNOHAND: Final = -514
-"""What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
+"""A stopped call returns this when it shall be made again, unless a signal handler comes first: that makes it EINTR."""
 FORGETS_CALLS: Final = True
 """Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.trace.syscall_reentry`."""
 
@@ -266,7 +266,7 @@ def call_number_before(code: bytes) -> int | None:
 # Code of a borrowed page (see `checkpoint.linux.trace.remote_syscalls`)
 
 CLOBBERED: Final = ("x0", "x1", "x2", "x3", "x4", "x5", "x8", "x9", "sp", "pstate")
-"""What the calls change, or the code between them: ours to give back, in this order in the table."""
+"""Registers that the calls change, or the code between them: we give them back, in this order in the table."""
 LARGE_DESK_SIZE: Final = 32768
 SMALL_DESK_SIZE: Final = 1024
 """Bytes of a desk's code, and of its table without the frame: for 200 of the longest calls, and for four."""

@@ -1,8 +1,8 @@
 """Feature levels of aarch64 for fleets with different processors, and the variables that limit libraries to a level.
 
-Data only. The levels cannot limit a library that asks the processor itself (getauxval) and has no variable for it. What the C
-library and the compiler's run-time choose in this way stays chosen for the life of the program (`_CHOSEN_BY_ALL`); a level cannot
-exclude it.
+Data only. The levels cannot limit a library that asks the processor itself (getauxval) and has no variable for it. The C
+library and the compiler's run-time choose features in this way for the life of the program (`_CHOSEN_BY_ALL`); a level cannot
+exclude them.
 
 Source: Arm Architecture Reference Manual; numpy's "CPU dispatcher"; OpenBLAS, driver/others/dynamic_arm64.c; OPENSSL_armcap;
 libgcc, config/aarch64/lse-init.c; glibc, sysdeps/aarch64/multiarch/memcpy.c.
@@ -15,7 +15,7 @@ from typing import Final
 V8: Final = "armv8-a"
 LEVELS: Final = (V8,)
 DEFAULT: Final = V8
-"""What every 64-bit ARM processor has."""
+"""The features that every 64-bit ARM processor has."""
 
 _CHOSEN_BY_ALL: Final = frozenset(["atomics", "mops"])
 """By the atomic operations of all code that gcc has compiled, and by memcpy(3)."""

@@ -45,7 +45,7 @@ UNKEPT: Final = {"sme": "scalable matrices (SME: arm64.nosme)"}
 """Features of which a thread has registers that are not kept, and that a call of ours would clear: what a message calls each,
 with the parameter that has the kernel leave it alone. Source: Documentation/arch/arm64/sme.rst; kernel-parameters.txt."""
 PERMISSIONS: Final[tuple[tuple[str, str, tuple[int, ...]], ...]] = ()
-"""What a process asks for before it may use some of it: feature, call, arguments. Nothing."""
+"""Features that a process must ask for before it may use them: feature, call, arguments. None."""
 
 
 _HEAD: Final = struct.Struct("<IIHHHH")

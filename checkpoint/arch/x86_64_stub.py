@@ -335,7 +335,7 @@ def at_call(registers: bytes, instruction: int, number: int, arguments: tuple[in
 
 
 def call_result(registers: bytes) -> int:
-    """What a system call returned: a negative error number, or its value."""
+    """The result of a system call: a negative error number, or its value."""
     value = x86_64.decode_registers(registers)[x86_64.RESULT]
     return value - (1 << 64) if value >> 63 else value
 

@@ -44,7 +44,7 @@ FIRST_EXTENDED: Final = 2
 """Components 0 and 1 lie in the legacy region."""
 PKRU: Final = 9
 PKRU_OF_LINUX: Final = 0x55555554
-"""What every thread begins with: nothing but key 0. Source: arch/x86/mm/pkeys.c, init_pkru_value."""
+"""The value with which every thread begins: only key 0 is allowed. Source: arch/x86/mm/pkeys.c, init_pkru_value."""
 HIGHEST: Final = 62
 AMX: Final = (17, 18)
 """Only for a process that has asked for it, and 8 KiB a thread: kept while its tiles are released, as between computations."""
@@ -53,7 +53,7 @@ LOST_IN_CALLS: Final[int | None] = None
 UNKEPT: Final[dict[str, str]] = {}
 """Features of which a thread has registers that are not kept: none. All that XSAVE knows is kept."""
 PERMISSIONS: Final = (("amx_tile", "arch_prctl", (0x1023, 18)),)
-"""What a process asks for before it may use some of it: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
+"""Features that a process must ask for first: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
 
 Source: Documentation/arch/x86/xstate.rst.
 """
@@ -139,7 +139,7 @@ def _extended_in_use(xstate: bytes, layout: Layout) -> Iterator[Component]:
 
 
 def _name_of(number: int) -> str:
-    """What a message calls it."""
+    """Its name in messages."""
     return COMPONENTS.get(number, f"component {number}")
 
 

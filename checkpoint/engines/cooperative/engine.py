@@ -155,7 +155,7 @@ class GuardedTask:
         return self._session
 
     def _follow_files(self) -> CarriedTrees | None:
-        """What follows the carried files, if there are any.
+        """Follow the carried files, if there are any.
 
         Raises:
             UnsupportedError: they cannot be carried.

@@ -163,7 +163,7 @@ class CooperativeSession:
             is_held: it stands still already.
 
         Raises:
-            UnsupportedError: what is to be carried cannot be.
+            UnsupportedError: a file cannot be carried.
             CaptureError: it could not be made to stand still, or the files change all the same.
         """
         since = parent.commit if parent else 0

@@ -10,9 +10,9 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 
 FIRST_REST_NS: Final = 1_000_000
-"""What a freeze takes besides copying, before one was seen."""
+"""The time of a freeze besides copying, until one is measured."""
 FIRST_PAGE_NS: Final = 2_000
-"""What copying a page takes, before it was seen."""
+"""The time to copy a page, until it is measured."""
 TELLING_COUNT: Final = 64
 """Pages from which on their copying tells what one of them takes."""
 WEIGHT: Final = 0.2

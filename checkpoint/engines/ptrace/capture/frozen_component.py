@@ -1,4 +1,4 @@
-"""What one freeze of a component brought home."""
+"""The result of one freeze of a component."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Frozen(Struct, frozen=True):
 
     Attributes:
         first: of the first process.
-        others: what was seen of the others; None where there are none.
+        others: the looks at the others; None where there are none.
         freeze_us: how long the program stood still; of several times, which a capture that is made again has, the longest.
         seen: its carried files.
         departing: its connections, where it may stand still for good.

@@ -83,7 +83,7 @@ class Standing(Struct, frozen=True, dict=True):
 
     @functools.cached_property
     def told(self) -> Told:
-        """What it said about itself."""
+        """Its own answers about itself."""
         return rearmed(self.inquiry.read(self.answers), self.place.every_pending(), self.waiting)
 
     @functools.cached_property
@@ -101,8 +101,8 @@ class Onlooker:
     """Asks one process, again and again; the questions stay the same while its signals and timers do.
 
     Attributes:
-        rights: of threads that may what the first may not, or the other way round.
-        tables: what threads have for themselves.
+        rights: those of threads whose rights differ from the first thread's.
+        tables: descriptors and directories that threads have for themselves.
     """
 
     def __init__(self, threads: Threads, entered: Entered, devices: tuple[DeviceRule, ...]) -> None:
@@ -141,7 +141,7 @@ class Onlooker:
             return with_contents(opened, self._borrowed.noted, self._devices, self._recollection)
 
     def close(self) -> None:
-        """Close what is kept open of it."""
+        """Close the files that are kept open about it."""
         self._kept.texts.close()
         self._files.close()
         self._others.close()
@@ -161,7 +161,7 @@ class Onlooker:
                 self.overlooked(opened)
                 with_contents(opened, None, self._devices)
             self._kept.texts.forget()
-            if self._threads.is_one_of_many:  # what all of them have open is read for all of them, not by what stays open
+            if self._threads.is_one_of_many:  # open files of several processes are read for all at once, not through kept files
                 self._kept.texts.close()
         self._recollection.prepare()
         self._others.prepare()
@@ -202,7 +202,7 @@ class Onlooker:
         """Everything else. Its system calls are made inside the process: the memory has been taken before.
 
         Args:
-            opened: what it has open, if that is known already.
+            opened: its open files, if they are known already.
         """
         tracee = self._tracee
         self.tables.look()

@@ -44,7 +44,7 @@ class Read:
 
     @property
     def reading(self) -> Reading:
-        """What the kernel told."""
+        """The kernel's answers."""
         return self.unread.reading
 
     @property
@@ -96,7 +96,7 @@ class ThreadStanding(Struct, frozen=True, dict=True):
 
     @property
     def reading(self) -> Reading:
-        """What the kernel told of it."""
+        """The kernel's answers about it."""
         return self.place.reading
 
     def settle(self) -> None:
@@ -214,7 +214,7 @@ class ThreadOnlooker:
         self._asked: tuple[ThreadStanding, ...] = ()
 
     def close(self) -> None:
-        """Close what is kept open of them."""
+        """Close the files that are kept open about them."""
         self._keep_only(())
 
     def _keep_only(self, tids: Collection[int]) -> None:
@@ -280,7 +280,7 @@ class ThreadOnlooker:
         """Where they stand.
 
         Args:
-            readings: what the kernel told of each.
+            readings: the kernel's answers about each.
             modes: of seccomp(2), by thread, of those that were confined before the freeze.
             of_first: that of the first thread, which may have given its filters to all.
 

@@ -18,7 +18,7 @@ from checkpoint.pages.page_set import PageMap, Words
 
 
 class Unacknowledged(Struct, frozen=True):
-    """What one scan found, kept until a position that holds it is acknowledged."""
+    """The findings of one scan, kept until a position that holds them is acknowledged."""
 
     position: Position | None
     written: Words
@@ -101,7 +101,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
 
 
 def since(scans: Sequence[Unacknowledged], mapped: Words, *, is_base: bool) -> tuple[Words, Words]:
-    """What these scans have named, in order, the last of which alone may be without position: written and cleared."""
+    """The pages that these scans have named, written and cleared. They are in order; only the last may be without position."""
     if is_base:
         scans = [one for one in scans[-1:] if one.position is None]
     if not scans:

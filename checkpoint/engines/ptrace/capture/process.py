@@ -49,7 +49,7 @@ RAN_ON_MAX: Final = 3
 
 
 class Look(Struct, frozen=True):
-    """Everything that one freeze brought home of one process; nothing in it needs the process any more."""
+    """Everything that one freeze has read of one process; nothing in it needs the process any more."""
 
     standing: Standing
     taken: Taken
@@ -215,9 +215,9 @@ class CapturedProcess:
         return copied
 
     def rehearse(self) -> None:
-        """Ask, as far as that changes nothing, what `look` is going to ask, and forget the answers.
+        """Ask the questions of `look` that change nothing, and forget the answers.
 
-        What the processor has at hand, of our code, of the kernel's and of the page tables, it need not fetch while the program
+        So the processor has our code, the kernel's and the page tables in its caches, and need not fetch them while the program
         stands still; between two captures it has done other things.
         """
         with contextlib.suppress(CheckpointError, OSError):  # `look` reports the cause

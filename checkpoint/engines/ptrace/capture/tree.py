@@ -82,11 +82,11 @@ class SeenProcess(Struct, frozen=True):
 
 
 class SeenOthers(Struct):
-    """What one freeze brought home of all processes besides the first.
+    """The result of one freeze, of all processes besides the first.
 
     Attributes:
-        opened: what every process has open, the first one's included.
-        taken: what was seen of each.
+        opened: the open files of every process, the first one's included.
+        taken: the look at each.
         later: those that are still to be described, by `describe`.
     """
 
@@ -127,7 +127,7 @@ class SeenOthers(Struct):
         return self.taken
 
     def resources(self) -> tuple[Resource, ...]:
-        """What all of them have open."""
+        """The open files of all of them."""
         return tuple(held for seen in self.processes for held in seen.held.resources)
 
     def _inner(self, first: Look) -> dict[int, int]:
@@ -312,7 +312,7 @@ class CapturedTree:
         """As `MemoryCapture.copy_running`, with as many pages left of each of them.
 
         Args:
-            again: what was copied for a freeze that came to nothing is carried on.
+            again: go on with the copy that was made for a failed freeze.
         """
         before, self._copied = self._copied if again else {}, {}
         for pid, process in tuple(self._known.items()):
@@ -405,7 +405,7 @@ class CapturedTree:
         """Everything that needs them to stand still.
 
         Args:
-            first: what was seen of the first process.
+            first: the look at the first process.
             surroundings: of that.
         """
         outside = standard_streams.of_first(first.standing.opened, surroundings)
@@ -546,7 +546,7 @@ def _told_of(process: CapturedProcess, look: Look, around: Surroundings, stopped
 
 
 def _joint(look: Look, seen: SeenOthers) -> tuple[Resource, ...]:
-    """What one shares with its parent, which is one of them."""
+    """The things that one shares with its parent, if that is one of them."""
     status = look.standing.status
     return shared_with_parent.describe(status.pids[0], status.ppid) if status.ppid in seen.pids else ()
 

@@ -123,7 +123,7 @@ Step = Birth | NewSession | Join | End | Reaper
 
 
 class Person(Struct, frozen=True):
-    """What matters of a process here; pids are as the component sees them."""
+    """The facts of a process that matter here; pids are as the component sees them."""
 
     pid: int
     ppid: int

@@ -26,7 +26,7 @@ ATTEMPTS_MIN: Final = 50
 
 
 class Wanted(Struct, frozen=True):
-    """What a process must be when all are born.
+    """The state that a process must have when all are born.
 
     Attributes:
         parent: 0: none of them.

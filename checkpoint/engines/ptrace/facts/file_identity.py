@@ -249,7 +249,7 @@ def _mapped_twice(lines: Iterable[MapsLine]) -> frozenset[int]:
 
 
 def _of_shared(line: MapsLine) -> FileIdentity:
-    """What tells anonymous shared memory (MAP_SHARED) from other such memory."""
+    """The identity that tells anonymous shared memory (MAP_SHARED) from other such memory."""
     return FileIdentity(line.name.removesuffix(DELETED), line.device, line.inode, deleted=True)
 
 

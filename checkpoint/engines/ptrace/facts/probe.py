@@ -144,7 +144,7 @@ def _has_still_to_execute(pid: int) -> bool:
 
 
 def _opened(kin: tuple[int, ...]) -> shared_descriptions.OpenedByAll:
-    """What each of these has open; one that ends meanwhile is left out, but for the first."""
+    """The open files of each of these; one that ends meanwhile is left out, but for the first."""
     if len(kin) == 1:
         return {kin[0]: Opened(glance(kin[0]))}
     known = Kin(terminals=pseudo_terminals.masters([held for pid in kin for held in _gathered(pid)]))
@@ -172,7 +172,7 @@ def _kin(pid: int, first: int, *, is_guarded: bool) -> tuple[int, ...]:
 
 
 def _looked(opened: shared_descriptions.OpenedByAll, first: int, surroundings: Surroundings) -> dict[int, Held]:
-    """What each process has open, sorted into the kinds."""
+    """The open files of each process, sorted into the kinds."""
     around = replace(
         surroundings, pipes={**standard_streams.of_first(opened[first], surroundings), **surroundings.pipes}, is_first=False
     )
@@ -182,7 +182,7 @@ def _looked(opened: shared_descriptions.OpenedByAll, first: int, surroundings: S
 def _others_findings(
     opened: shared_descriptions.OpenedByAll, process: int, first: int, looked: Mapping[int, Held], *, detaches: bool
 ) -> Iterator[Finding]:
-    """What stands against the processes besides the first; one that ends meanwhile does not."""
+    """Reasons against the processes besides the first; none against one that ends meanwhile."""
     if first != process and len(opened) > 1:
         yield Finding("process", "threads", REFUSED, refused_threads.OF_SEVERAL)
     for pid, held in looked.items():
@@ -225,7 +225,7 @@ def _births_refused(first: int) -> tuple[str, ...]:
 
 
 def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS, *, may_repeat: bool = True) -> Surroundings:
-    """What the kinds of resources must know about a process, its guard and its operator's rules.
+    """The facts about a process, its guard and its operator's rules that the kinds of resources must know.
 
     Raises:
         ProbeError: that is no process.
@@ -277,7 +277,7 @@ def _root_findings(pid: int) -> Iterator[Finding]:
 
 
 def _processor_findings(pid: int) -> Iterator[Finding]:
-    """What another robot's processor must have."""
+    """The features that another robot's processor must have."""
     level = cpu_baseline.level_in(procfs.read_bytes(pid, "environ"))
     if level:
         yield Finding("process", "processor", KEPT, f"started for {level}: it can resume on such processors")
@@ -287,7 +287,7 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
 
 
 class _Mapped(Struct, frozen=True):
-    """What a process has mapped.
+    """The mappings of a process.
 
     Attributes:
         flags: VmFlags by start, without those that our own write protection sets.

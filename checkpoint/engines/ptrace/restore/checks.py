@@ -121,8 +121,8 @@ class Brought(Struct, frozen=True):
     """Contents that are opened in place of this machine's own files, by the paths that the program knows.
 
     Attributes:
-        run: the executable, and what is mapped.
-        opened: what is open for reading.
+        run: the executable, and mapped files.
+        opened: files that are open for reading.
     """
 
     run: Mapping[str, str] = field(default_factory=dict)
@@ -130,10 +130,11 @@ class Brought(Struct, frozen=True):
 
 
 def require(state: Snapshot, options: RestoreOptions, *vessel_pids: int) -> tuple[Brought, ...]:
-    """Refuse a snapshot that cannot come back here; answers with what must come from elsewhere than its own path, by process.
+    """Refuse a snapshot that cannot come back here; answers with the files not to take from their own path, by process.
 
     Args:
-        vessel_pids: what is to become the program; they, we and our forebears may hold files that the program writes to.
+        vessel_pids: the processes that are to become the program; they, we and our ancestors may hold files that the program
+            writes to.
 
     Raises:
         MismatchError: with one reason for each difference.
@@ -276,7 +277,7 @@ def own_kernel_pages() -> list[procfs.MapsLine]:
 
 
 def missing_directories(state: Snapshot) -> tuple[str, ...]:
-    """What must be made so that the program's working directory is there, the outermost first; nothing where that cannot be."""
+    """The directories to make for the program's working directory, the outermost first; none where that is impossible."""
     directory = Path(state.process.working_directory)
     missing = [one for one in (directory, *directory.parents) if not os.path.lexists(one)]
     is_plain = directory.is_absolute() and ".." not in directory.parts and not procfs.is_gone(str(directory))

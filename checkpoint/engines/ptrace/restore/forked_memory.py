@@ -39,7 +39,7 @@ NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
 
 
 class Legacy(Struct, frozen=True):
-    """What one process is born with.
+    """The memory that one process is born with.
 
     Attributes:
         kept: where it stays mapped.
@@ -78,7 +78,7 @@ class Told(Struct, frozen=True):
 
 
 class Inheritance(Struct, frozen=True):
-    """What all of them are born with.
+    """The memory that all of them are born with.
 
     Attributes:
         regions: where the vessel has it mapped, as far as it is anonymous.
@@ -142,7 +142,7 @@ def of(
     elsewhere: Collection[str] = (),
     sources: Sequence[MemberPages | None] = (),
 ) -> Inheritance:
-    """What these processes have in common.
+    """The memory that these processes have in common.
 
     Args:
         taken: where the vessel has something mapped.

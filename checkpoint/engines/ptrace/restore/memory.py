@@ -134,7 +134,7 @@ def map_program(
 
     Args:
         brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
-        present: what needs no mapping of its own.
+        present: memory that needs no mapping of its own.
         untouched: pages of objects without a name that private mappings show as they are.
     """
     carried, inherited, anonymous = Carried(runs), present.objects, present.anonymous

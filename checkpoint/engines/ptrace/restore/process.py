@@ -94,7 +94,7 @@ REFUGE_SIZE: Final = 1 << 20
 
 
 class Estate(Struct, frozen=True):
-    """What a process of a component of several finds when it is born, and shares with others (`tree`).
+    """The things that a process of a component of several finds at its birth, and shares with others (`tree`).
 
     Attributes:
         base, size: the stretch of addresses that is ours in all of them; the stub lies at its beginning.
@@ -119,7 +119,7 @@ def options_for(state: Snapshot) -> int:
 
 
 class LaterTables(Struct, frozen=True):
-    """What comes after the pages: descriptors, marks, signals; what comes after the threads' birth; and each thread's own."""
+    """The calls after the pages: descriptors, marks, signals; those after the threads' birth; and each thread's own."""
 
     state: CallTable
     rights: CallTable
@@ -139,7 +139,7 @@ class ProcessRestore:
     Args:
         state: of this process alone.
         estate: None for a component of one process.
-        legacy: what it has in common with others.
+        legacy: the memory that it has in common with others.
         source: of its pages, where ``state`` has them without their bytes.
     """
 
@@ -392,11 +392,11 @@ class ProcessRestore:
         return table
 
     def _make_directories(self, table: CallTable) -> None:
-        """What leads to its working directory."""
+        """Make the directories that lead to its working directory."""
         process_state.make_directories(table, checks.missing_directories(self._state))
 
     def _open_brought(self, table: CallTable) -> dict[str, int]:
-        """Open what was brought along: descriptors of what is run, by path; what is only read joins the nameless objects."""
+        """Open files that were brought along: descriptors of those to run, by path; those only read join the nameless objects."""
         flags = os.O_RDONLY | os.O_CLOEXEC
         run = {path: table.open(content, flags) for path, content in self._brought.run.items()}
         for held in self._state.resources:
@@ -437,7 +437,7 @@ class ProcessRestore:
         self.notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects, vessel.pid, given)
 
     def _rights_table(self, table: CallTable, vessel: Vessel) -> CallTable:
-        """What comes after the birth of the threads, which takes a right."""
+        """The calls after the birth of the threads, since that birth takes a right."""
         state, thread, elapsed_ns = self._state, self._thread, self._options.elapsed_ns
         process = state.process
         mlockall.rebuild(table, state.resources)  # which takes a right, or a limit
@@ -457,7 +457,7 @@ class ProcessRestore:
         return table
 
     def _thread_table(self, table: CallTable, thread: ThreadState, vessel: Vessel) -> CallTable:
-        """What each thread must say for itself; its notes about rights are those of the first."""
+        """The calls that each thread must make for itself; its notes about rights are those of the first."""
         process = self._state.process
         credentials = snapshot_credentials.of_thread(self._state.resources, thread.tid, process.credentials)
         process_state.thread_marks(table, thread)

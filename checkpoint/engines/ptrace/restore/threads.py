@@ -34,7 +34,7 @@ CLONE_SIGHAND: Final = 0x800
 CLONE_THREAD: Final = 0x10000
 CLONE_SYSVSEM: Final = 0x40000
 FLAGS: Final = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD | CLONE_SYSVSEM
-"""What pthread_create(3) shares; what it sets (thread-local storage, addresses for its id) comes with registers and table."""
+"""Things that pthread_create(3) shares; those that it sets (thread-local storage, id addresses) come with registers and table."""
 
 ANY_ID: Final = 0
 PTRACE_EVENT_FORK: Final = 1

@@ -113,7 +113,7 @@ class TreeRestore:
         return [self._born[one.process.pid].pid for one in self._state.processes]
 
     def notes(self) -> tuple[str, ...]:
-        """What differs, each once."""
+        """The differences, each once."""
         return tuple(dict.fromkeys(note for notes in (self._notes, *(one.notes for one in self._restoring)) for note in notes))
 
     def run(self) -> None:
@@ -177,13 +177,13 @@ class TreeRestore:
             (reason,),
         )
 
-    # What they share
+    # Things that they share
 
     def _make_estate(self, vessel: Vessel, resources: dict[int, Resource]) -> Estate:
-        """Make what they share in the first vessel.
+        """Make the things that they share in the first vessel.
 
         Args:
-            resources: what is told of each open file that is shared, by its number.
+            resources: the resource of each open file that is shared, by its number.
         """
         mappings, views = procfs.parse_maps(procfs.read_text(self._first.pid, "maps")), self._views
         vmas = [vma for view in views for vma in view.vmas]
@@ -232,7 +232,7 @@ class TreeRestore:
         return estate
 
     def _numbers(self, resources: Collection[int], count: int) -> Iterator[int]:
-        """Descriptors for what is shared: above all that any process wants, and that are open while it is made.
+        """Descriptors for shared things: above all that any process wants, and that are open while it is made.
 
         Args:
             count: of objects that are mapped.
@@ -266,7 +266,7 @@ class TreeRestore:
         self._notes += rebuild.rebuild_all(table, bag, self._options, vessel.inner_pid, made, vessel.pid)
 
     def _open_brought(self, table: CallTable, resources: dict[int, Resource]) -> dict[memory.Object, int]:
-        """Open what was brought along of files that several processes have open for reading."""
+        """Open files that were brought along and that several processes have open for reading."""
         contents = {path: content for one in self._brought for path, content in one.opened.items()}
         found: dict[memory.Object, int] = {}
         for held in resources.values():

@@ -186,7 +186,7 @@ def stands_in(registers: bytes, image: Vma) -> bool:
 
 
 def jumps(state: Snapshot, content_at: ContentAt, own: int, functions: Sequence[Function]) -> list[tuple[int, bytes]]:
-    """What to write where in the image that the program was born with: to each function, how this kernel does the same.
+    """The bytes to write into the image that the program was born with: each function jumps to this kernel's own.
 
     Args:
         own: where this kernel's image lies.

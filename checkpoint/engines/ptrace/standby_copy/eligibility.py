@@ -61,7 +61,7 @@ def _of_process(state: Snapshot, *, is_kin: bool) -> Iterator[str]:
 
 
 def _of_kin(state: Snapshot) -> Iterator[str]:
-    """What must come before the births of others, and may be another one at the takeover."""
+    """Reasons by state that must be set before others are born, and may have changed at the takeover."""
     if shared_with_parent.flags_of(state.resources) & shared_with_parent.CLONE_FILES:
         yield "processes of it share a table of descriptors"
     if job_control.stop_of(state.resources):

@@ -85,11 +85,11 @@ def ended_on_error(copy: Copy, what: str) -> Iterator[None]:
 
 
 class Plan(Struct, frozen=True):
-    """What a delta does to the copy of one process, worked out before any of it is done.
+    """The changes of a delta to the copy of one process, worked out before any of them is made.
 
     Attributes:
         delta: tells its pages whole.
-        rescued: pages that must outlive that they are mapped afresh, and what they hold.
+        rescued: pages that keep their content although they are mapped afresh, and that content.
     """
 
     delta: Snapshot
@@ -202,7 +202,7 @@ class ReadyCopy(ProcessRestore):
         self.torn = False
 
     def planned(self, delta: Snapshot) -> Plan:
-        """What a delta does to it, of which nothing is done yet.
+        """The changes of a delta to it; none is made yet.
 
         Args:
             delta: of this process, and tells its pages whole.
@@ -347,7 +347,7 @@ class ReadyCopy(ProcessRestore):
     # --- Files ---
 
     def _checked(self, state: Snapshot) -> Brought:
-        """Where what is mapped comes from; remembers how the files looked.
+        """The files that its mappings come from; remembers how they looked.
 
         Raises:
             MismatchError: this machine lacks some.
@@ -400,7 +400,7 @@ class ReadyCopy(ProcessRestore):
         self.position = snapshot.position
 
     def _remember_sections(self) -> None:
-        """What registering rseq will forget: the critical sections in which threads stand."""
+        """Remember the critical sections in which threads stand, because registering rseq clears them."""
         self._sections.clear()
         for thread in self._state.threads:
             if thread.rseq is not None:
@@ -409,7 +409,7 @@ class ReadyCopy(ProcessRestore):
 
 
 def paths_open_in(state: Snapshot) -> frozenset[str]:
-    """What any of its processes has open, by name."""
+    """The names of the files that any of its processes has open."""
     return frozenset(str(held.facts.get("path", "")) for one in state.processes for held in one.resources)
 
 
@@ -420,7 +420,7 @@ def _monotonic_offset_ns(pid: int) -> int:
 
 
 def _look_of(path: str) -> tuple[int, ...]:
-    """What changes with a file's content; nothing where it is not there."""
+    """Facts that change with a file's content; () where it is not there."""
     try:
         about = os.stat(path)
     except OSError:

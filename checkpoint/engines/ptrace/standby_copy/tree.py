@@ -82,7 +82,7 @@ class MemberCopy(ReadyCopy):
 
     @property
     def descriptors(self) -> frozenset[int]:
-        """What is open in the common table, by what this one knows."""
+        """The open descriptors of the common table, as far as this one knows."""
         return frozenset(self._descriptors)
 
     @property
@@ -103,11 +103,11 @@ class MemberCopy(ReadyCopy):
         self._map_and_fill(tuple(line for line in mappings if not self._is_estate(line)))
 
     def know_open(self, descriptors: Iterable[int]) -> None:
-        """What is open in the common table now."""
+        """Learn the descriptors that are open in the common table now."""
         self._descriptors = set(descriptors)
 
     def own_table(self, others: Iterable[MemberCopy]) -> None:
-        """Part with the common table of descriptors, and close what others have in it."""
+        """Part with the common table of descriptors, and close those that others have in it."""
         table = CallTable(self._stub.base)
         table.call("have a table of descriptors alone", "unshare", shared_with_parent.CLONE_FILES)
         for other in others:
