@@ -318,7 +318,7 @@ class Compare(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         contents, terms, own_eyes: see `checkpoint.engine.RestoreOptions`.
-        known: what the last `Compared` told, so that only files that have changed are read again.
+        known: the files of the last `Compared`, so that only files that have changed are read again.
         running: the program runs here, as this pid: tell only which of its files others hold open for writing; 0: it does not.
         components: see `checkpoint.engine.Engine.contested`.
     """
@@ -374,7 +374,7 @@ class Release(msgspec.Struct, frozen=True, tag=True):
 
 
 class Probed(msgspec.Struct, frozen=True, tag=True):
-    """What a capture would preserve."""
+    """The things that a capture would preserve."""
 
     report: Report
 
@@ -462,7 +462,7 @@ UNPROTECTED: Final = "it runs, unprotected"
 
 
 class Compared(msgspec.Struct, frozen=True, tag=True):
-    """What is lacking here, one sentence each; and the files that were read for that."""
+    """The things that this machine lacks, one sentence each; and the files that were read for that."""
 
     lacks: tuple[str, ...] = ()
     known: tuple[KnownDigest, ...] = ()
@@ -498,7 +498,7 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
 
 
 def failed(error: CheckpointError) -> Failed:
-    """What a keeper answers when a request failed.
+    """The answer of a keeper when a request failed.
 
     The receiver knows only the classes of ``checkpoint.errors``. So the answer names the nearest of those: a `MovedError` is told
     as the `CaptureError` that it is.

@@ -206,7 +206,7 @@ class Keeper:
         return answer, made.descriptors
 
     def _lasting_notes(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """What the restore lost and the program still lacks; it has its connections again once it has opened as many."""
+        """Notes about losses of the restore that last. Lost connections count until the program has opened as many."""
         if any(note.startswith(RESET_NOTE) for note in self._lasting):
             count = tcp.established(held for told in snapshot.processes for held in told.resources)
             if count >= self._connections:
@@ -448,7 +448,7 @@ def _commit_at(session: Session, position: Position) -> tuple[int, int]:
 
 
 def _unchanged(session: Session, request: messages.Capture) -> messages.Unchanged | None:
-    """What is said in place of a delta with nothing in it; a base, and the last delta of a handover, are always made."""
+    """The answer in place of an empty delta; a base, and the last delta of a handover, are always made."""
     task = None if request.base or request.hold else _as_task(session)
     position = task.unchanged() if task else None
     return messages.Unchanged(position, *_commit_at(session, position)) if position else None

@@ -73,7 +73,7 @@ class Burial:
 
 
 class _Plot:
-    """What the thread knows: not its `Burial`, or that could never go."""
+    """The data of the thread. It does not hold its `Burial`, or that could never go."""
 
     def __init__(self, timer: int) -> None:
         self.timer = timer
@@ -86,7 +86,7 @@ class _Plot:
         abi.set_timerfd(self.timer, 1)
 
     def bury(self) -> None:
-        """Take note of the dead whenever the timer goes off; that is closed at the end."""
+        """Take note of ended threads whenever the timer goes off; the timer is closed at the end."""
         try:
             while not self._is_over:
                 os.read(self.timer, 8)

@@ -97,7 +97,7 @@ def _standing() -> Standing:
 
 
 class _Board:
-    """What the two threads share; the second holds on to it, and not to its `SecondThread`, or that could never go.
+    """The memory that the two threads share. The second holds on to it, and not to its `SecondThread`, or that could never go.
 
     Attributes:
         words: of `SECOND_LOOP`.

@@ -24,7 +24,7 @@ DEFAULT: Final = arch.DEFAULT
 def environment(given: Mapping[str, str], level: str) -> dict[str, str]:
     """Variables of a program that is to move between processors of a level and above.
 
-    What is set already stays; of the C library's tunables, which are many in one, ours come besides.
+    Variables that are set already stay. The C library's tunables are many in one variable: ours are added to them.
     """
     tunables = [one for one in given.get(TUNABLES, "").split(":") if one]
     others = [one for one in tunables if not one.startswith(f"{HWCAPS}=")]

@@ -40,7 +40,7 @@ class Memory(Protocol):
 
 
 def assignment(epoch: int) -> bytes:
-    """What a program is born with."""
+    """The variable that a program is born with."""
     return _ASSIGNMENT + digits(epoch)
 
 

@@ -111,7 +111,7 @@ class OpenFile(Struct, frozen=True, eq=False):
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Its name in reports."""
         return self.first.name
 
     @property
@@ -121,16 +121,16 @@ class OpenFile(Struct, frozen=True, eq=False):
 
 
 class Surroundings(Struct, frozen=True):
-    """What the kinds must know about the process's guard.
+    """The facts about the process's guard that the kinds must know.
 
     Attributes:
         pipes: "pipe:[123]" or a terminal's path → stream 0, 1 or 2: of a component under a guard, or what its first process has.
-        devices: what the operator wants to become of devices.
+        devices: the operator's rules for devices.
         connections: TCP connections with others go along where it is handed over.
         is_first: it is about the first process of a component.
         detached: by device and inode number, the shared memory that becomes the program's own copy, and how much of it, from its
             beginning on, the component has mapped; None where the operator's rules say that such a program is refused.
-        terms: what else the operator has ruled.
+        terms: the operator's other rules.
         may_repeat: the program may go on from an older state than its last output, as after a takeover: unlike a restore of what
             stood still for good.
     """
@@ -145,7 +145,7 @@ class Surroundings(Struct, frozen=True):
 
 
 class Held(Struct, frozen=True):
-    """What a process's descriptors are."""
+    """The resources behind a process's descriptors, and the findings about them."""
 
     resources: tuple[Resource, ...]
     findings: tuple[Finding, ...]
@@ -157,7 +157,7 @@ class Held(Struct, frozen=True):
 
 
 class Recalled(Struct, frozen=True):
-    """What a socket answers as it did at the last look.
+    """The facts of a socket that answers as at the last look.
 
     Attributes:
         settings: facts that follow from what the program has set.

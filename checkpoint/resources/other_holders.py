@@ -129,7 +129,7 @@ def _require_private(pid: int, number: int, target: str) -> None:
 
 
 class _Census:
-    """What all processes but ours have open: (process, number) by the kernel's name for it."""
+    """The open files of all processes but ours: (process, number) by the kernel's name for each."""
 
     def __init__(self) -> None:
         self._taken_ns = 0

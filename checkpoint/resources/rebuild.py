@@ -248,7 +248,7 @@ def _prepare_sockets(
 
 
 def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) -> None:
-    """What refers to other descriptors: all of them are there now."""
+    """Set what refers to other descriptors: all of them are there now."""
     marked = frozenset(one.number for one in wanted if one.close_on_exec)
     for one in wanted:
         if one.resource.kind == epoll.KIND and holders[id(one.resource)] == one.number:
@@ -434,7 +434,7 @@ def _fill(table: CallTable, made: int, held: Resource) -> None:
 
 
 def _written_pieces(begin: int, content: bytes) -> Iterator[tuple[int, bytes]]:
-    """What of a part of a file is not zero, in whole pages, and where: the rest becomes holes."""
+    """The pieces of a part of a file that are not zero, in whole pages, and their places: the rest becomes holes."""
     filled = [start for start in range(0, len(content), PAGE_SIZE) if content[start : start + PAGE_SIZE].strip(b"\0")]
     for _, run in groupby(enumerate(filled), key=lambda one: one[1] - one[0] * PAGE_SIZE):
         starts = [start for _, start in run]

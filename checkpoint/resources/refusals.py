@@ -85,8 +85,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "mapped files that were replaced or deleted since the program started",
-        "the old files are carried, up to 64 MiB each, and compared at every checkpoint; what is written to an old file "
-        "still shows in its mappings",
+        "the old files are carried, up to 64 MiB each, and compared at every checkpoint; writes to an old file "
+        "still show in its mappings",
         "KiB of the old one are carried",
     ),
     refused(
@@ -141,7 +141,7 @@ ANONYMOUS_INODES: Final[Mapping[str, str]] = {
     "userfaultfd": "a userfaultfd",
     "perf_event": "a perf event",
 }
-"""What /proc calls a descriptor without a path → what people call it."""
+"""/proc's name for a descriptor without a path → the usual name."""
 
 _MAPPINGS: Final = (
     (re.compile(r"anon_inode:\[io_uring\]"), "the rings of an io_uring"),
@@ -166,7 +166,7 @@ _VM_FLAGS: Final[Mapping[str, str]] = {
 """VmFlags of proc_pid_smaps(5) that no fresh mapping can be given."""
 
 HUGE_NAME: Final = "/anon_hugepage"
-"""What the kernel calls memory of huge pages that has no file."""
+"""The kernel's name for memory of huge pages that has no file."""
 ORPHAN_LIMIT: Final = 64 << 20
 """Bytes of one mapping of a deleted file that are carried: every freeze reads them all, a millisecond for 4 MiB."""
 
@@ -348,7 +348,7 @@ def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
 
 
 def _refuse_memory(lines: Sequence[MapsLine]) -> Iterator[str]:
-    """What our own calls inside it need."""
+    """Why our own calls inside it are impossible."""
     if all(line.name != _VDSO for line in lines):
         yield "it has no vdso (it unmapped it, or the kernel was started with vdso=0), by which a capture enters it"
 

@@ -24,7 +24,7 @@ Observer = Callable[[OpenFile, Opened], Mapping[str, Fact]]
 
 
 class Kind(Protocol):
-    """What every file of this room has; for an open file of another kind both answer None."""
+    """The contract of a module for one kind; for an open file of another kind both answer None."""
 
     KIND: str
 
@@ -75,7 +75,7 @@ _OBSERVED: Final[Mapping[str, Observer]] = {
 
 
 def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None:
-    """What asks an open file for what only a process that stands still can tell.
+    """The function that asks an open file for facts that only a process that stands still can tell.
 
     Args:
         noted: see `sockets.queue_of`; None for a process that runs.
@@ -124,7 +124,7 @@ def _observe_internet_socket(
 
 
 def findings_of_all(resources: Sequence[Resource], surroundings: Surroundings, *, standing: bool) -> tuple[Finding, ...]:
-    """What can be told only of all resources of all processes of a component together.
+    """Findings about all resources of all processes of a component together.
 
     Args:
         standing: they all stood still.

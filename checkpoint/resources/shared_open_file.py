@@ -29,5 +29,5 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """What can be shared is said by the first of them."""
+    """Refuse nothing here: the first process that has it does."""
     return None

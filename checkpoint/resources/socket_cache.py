@@ -181,10 +181,10 @@ class Recollection:
         return self._are_plain.of(*opened, make=lambda: all(map(is_plain, opened)))
 
     def recall(self, opened: Opened) -> dict[int, _Answer]:
-        """Ask every socket that was there last time; ``opened`` is told what is as it was. The process stands still.
+        """Ask every socket that was there last time; ``opened`` learns the unchanged ones. The process stands still.
 
         Returns:
-            What those answered that have something new to say, for `remember`.
+            The answers of those that have something new to say, for `remember`.
         """
         if self._round is None or not self._round.holds(opened):
             self._round = self._round_of(opened)
@@ -286,7 +286,7 @@ def _recall_alike(
 
 
 def _recalled(one: OpenFile, known: _Known, told: Told, opened: Opened) -> _Answer | None:
-    """What a socket answers, unless that is known."""
+    """The answer of a socket, unless it is known."""
     settings, state = told
     listed = _listed(one, known.facts, opened)
     if known.again is not None and told == (known.settings, known.state) and listed == known.listed:
@@ -338,7 +338,7 @@ def _may_join(facts: Mapping[str, Fact]) -> bool:
 
 
 def _listed(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> object:
-    """What only the kernel's lists say of a socket."""
+    """The facts about a socket that only the kernel's lists tell."""
     if not _is_listed(facts):
         return 0
     if facts["family"] == socket.AF_UNIX:

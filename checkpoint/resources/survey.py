@@ -208,9 +208,9 @@ def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
 
 
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
-    """Sort one process's open files into the kinds: what comes back, and what does not.
+    """Sort one process's open files into the kinds: those that come back, and those that do not.
 
-    What can be told only of all processes of a component together is told by `registry.findings_of_all`.
+    `registry.findings_of_all` tells the findings about all processes of a component together.
     """
     resources, findings = [], []
     for held in opened:

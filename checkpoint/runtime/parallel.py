@@ -28,7 +28,7 @@ def thread_count() -> int:
 
 
 def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Generator[B, None, None]:
-    """What ``work`` answers for each piece, in their order; one thread is our own alone.
+    """The answer of ``work`` for each piece, in their order; one thread is our own alone.
 
     An error of a piece is raised in its place, and so is one of the iterable: after the answers of all pieces before it.
     No thread is left when the generator is exhausted, closed or has raised. Each has the precedence that ours has at the first

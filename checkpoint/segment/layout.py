@@ -88,7 +88,7 @@ class Region(Struct, frozen=True):
 
 
 class Layout(Struct, frozen=True):
-    """What lies where in a segment; everything else follows from these.
+    """The places in a segment; everything else follows from these.
 
     Attributes:
         lineage: 16 bytes; the numbers of commits and versions can be compared between segments of one lineage.
@@ -185,9 +185,9 @@ def address_of(place: int) -> int:
 
 
 class Pending(enum.Enum):
-    """What a commit says of its output that had no room in its pipes: part of it lies in the program's buffers still.
+    """The mark of a commit whose output had no room in its pipes: part of it lies in the program's buffers still.
 
-    How much that is is not known. A reader that carries output passes such a commit over; a later one tells it all.
+    The size of that part is not known. A reader that carries output passes such a commit over; a later one tells it all.
     """
 
     PENDING = 2
@@ -203,7 +203,7 @@ Outputs = tuple[int, int] | Pending | None
 
 
 class Committed(Struct, frozen=True, eq=False):
-    """What a program committed, whole or since an earlier commit.
+    """The state that a program committed, whole or since an earlier commit.
 
     Attributes:
         number: of the commit; the first is 1.

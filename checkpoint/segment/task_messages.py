@@ -122,7 +122,7 @@ def _begin_body(begin: Begin) -> bytes:
 
 
 def from_program(packet: bytes) -> FromProgram:
-    """What a program says.
+    """Decode a message of a program.
 
     Raises:
         TaskPacketError: it is no such packet; says why.
@@ -135,7 +135,7 @@ def from_program(packet: bytes) -> FromProgram:
 
 
 def from_guard(packet: bytes) -> FromGuard:
-    """What a guard says.
+    """Decode a message of a guard.
 
     Raises:
         TaskPacketError: it is no such packet; says why.

@@ -41,7 +41,7 @@ from checkpoint.segment.layout import (
 Bytes: TypeAlias = "NDArray[np.uint8]"
 
 NAME: Final = "failover-segment"
-"""What /proc/PID/fd and /proc/PID/maps call it."""
+"""Its name in /proc/PID/fd and /proc/PID/maps."""
 
 HANDED_NAME: Final = "failover-handed"
 """…and one that is handed to a program to go on from: it must not be taken for the one that its commits go to."""
@@ -68,7 +68,7 @@ _fcntl.restype = ctypes.c_int
 
 
 class Source(Struct, frozen=True, eq=False):
-    """What one region holds now.
+    """The content of one region now.
 
     Attributes:
         content: its bytes from the beginning; it may be shorter than the region, whose rest is zeros then. Few bytes are

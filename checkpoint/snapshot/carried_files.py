@@ -197,7 +197,7 @@ def _listed_at(one: Fact, here: Callable[[str], str]) -> Fact:
 
 
 def pieces(state: Snapshot) -> Mapping[int, list[tuple[int, memoryview]]]:
-    """What a base holds of each stretch: (offset in the file, bytes in whole pages), in order."""
+    """A base's content of each stretch: (offset in the file, bytes in whole pages), in order."""
     found: dict[int, list[tuple[int, memoryview]]] = {}
     content, position = memoryview(state.contents).cast("B"), 0
     for run in state.runs:

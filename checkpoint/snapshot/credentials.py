@@ -83,7 +83,7 @@ def _bounded(one: Process, owner: Owner) -> Process:
 
 
 def excess(state: Snapshot | State, owner: Owner) -> tuple[str, ...]:
-    """What a snapshot asks for that is not an owner's, each with its figure; nothing if it asks for no more than the owner has.
+    """The rights that a snapshot asks for beyond those of an owner, each with its figure; none if the owner has them all.
 
     Raises:
         FormatError: it is told in another way than we know.
@@ -104,7 +104,7 @@ def refusal(asked: Iterable[str], owner: Owner) -> str:
 
 
 def beyond(state: Snapshot | State, owner: Owner) -> Iterator[str]:
-    """What only root can give: users, groups, capabilities, securebits, filters and root directories. As `excess`."""
+    """Rights that only root can give: users, groups, capabilities, securebits, filters and root directories. As `excess`."""
     for theirs in everybodys(state):
         yield from above(theirs, owner)
     if could_gain(state):

@@ -67,7 +67,7 @@ def encode(snapshot: Snapshot, file: Sink, *, threads: int = 1) -> int:
 
 
 def begin(snapshot: Snapshot, contents_size: int) -> tuple[Preamble, bytes]:
-    """What stands before the frames: the preamble, and all sections as they are stored.
+    """The bytes before the frames: the preamble, and all sections as they are stored.
 
     Raises:
         FormatError: a section, or all pages together, are larger than the format allows.

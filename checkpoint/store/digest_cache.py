@@ -25,7 +25,7 @@ DigestOf = Callable[[str], bytes]
 
 
 class FileVersion(Struct, frozen=True):
-    """What changes when a file does."""
+    """Facts that change when a file does."""
 
     device: int
     inode: int

@@ -90,7 +90,7 @@ class Folding:
 
     def _require_sum(self) -> None:
         for index in page_set.distinct(np.flatnonzero(self._gone).astype(np.uint64) // np.uint64(self._count)).tolist():
-            self._rows_of_base(index)  # what went of it is seen now, if it was not before
+            self._rows_of_base(index)  # notes the pages that went, if they were not noted before
         before = chain.by_itself(self._stored.chain[0])
         after = page_set.add_to_sum(before.page_sum, np.concatenate(self._added), np.concatenate(self._removed))
         chain.check_sum(self._outline, after)

@@ -80,7 +80,7 @@ class _Layer(Struct, frozen=True, eq=False):
     rows: Rows
 
     def lasting(self, sources: PageMap) -> _Layer:
-        """What of it no later snapshot has set or taken away."""
+        """The part of it that no later snapshot has set or taken away."""
         found, places = page_set.found_among(sources.addresses, self.addresses)
         found[found] = sources.words[places, 0] < np.uint64(self.index)
         return _Layer(self.index, self.addresses[found], self.places[found], self.rows)

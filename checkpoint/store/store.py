@@ -65,7 +65,7 @@ A = TypeVar("A")
 
 
 class Kept(Struct, frozen=True):
-    """What the store has of one component, for people.
+    """The store's content for one component, for people.
 
     Attributes:
         positions: that the rules may go back to; ``olds``: whole checkpoints besides, kept for people.
@@ -380,7 +380,7 @@ class Store:
             return self._read(component, entries, lambda: self._write_base(folded, folding.write))
 
     def _read(self, component: str, entries: tuple[Entry, ...], act: Callable[[], A]) -> A | None:
-        """What an act answers that reads a chain's base, or None when a file had to be set out of use."""
+        """The answer of an act that reads a chain's base, or None when a file had to be set out of use."""
         try:
             return act()
         except FormatError as error:

@@ -63,7 +63,7 @@ class Step(Struct, frozen=True, eq=False):
 
 
 class HotPages:
-    """What the state at one position holds at the pages that were told last.
+    """The content of the pages that were told last, in the state at one position.
 
     Invariant: ``_pages`` says of each page in which slot its content is, and when it was told; no two share a slot.
 

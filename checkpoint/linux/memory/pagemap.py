@@ -51,7 +51,7 @@ WRITTEN: Final = Question(0, abi.PAGE_IS_WRITTEN, 0, abi.PAGE_IS_WRITTEN)
 
 
 class _Orders:
-    """One question about several ranges in one go. What stays the same from one time to the next is not filled in anew.
+    """One question about several ranges in one go. Unchanged parts are not filled in anew the next time.
 
     Attributes:
         starts, ends: of the ranges.
@@ -173,7 +173,7 @@ class PageScanner:
         With exactly this mask the kernel takes its fast path.
 
         Raises:
-            MappingLostError: a mapping is not protected (any more); what was found until then is lost.
+            MappingLostError: a mapping is not protected (any more); the pages found until then are lost.
         """
         return pages_joined(self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)[:, :2])
 
@@ -186,8 +186,8 @@ class PageScanner:
         """As `written`, of a process that runs and may unmap anything under our hands.
 
         Returns:
-            What was written, and the ranges in which a mapping was not protected (any more): a part of such a range may have been
-            protected again without being told.
+            The written pages, and the ranges in which a mapping was not protected (any more): a part of such a range may have
+            been protected again without being told.
         """
         refused: list[list[int]] = []
         found = pages_joined(self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING, refused)[:, :2])

@@ -69,7 +69,7 @@ class Memory:
 
         Raises:
             ProcessGoneError: the process has ended.
-            CaptureError: one of them is not mapped or not readable; what was read until then is in the buffer.
+            CaptureError: one of them is not mapped or not readable; the bytes read until then are in the buffer.
         """
         self._transfer(abi.process_vm_readv, "read", ranges, address_of(buffer))
 

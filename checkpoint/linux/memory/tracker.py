@@ -26,7 +26,7 @@ NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]
 
 
 class Scan(Struct, frozen=True, eq=False):
-    """What happened since the last scan.
+    """The changes since the last scan.
 
     Attributes:
         written: pages to be read: written, or of unknown history.
@@ -127,7 +127,7 @@ MEMORY_PLACE: Final = "/dev/shm/"
 
 
 ANONYMOUS: Final = f"/dev/zero{procfs.DELETED}"
-"""What the kernel calls shared memory without a file."""
+"""The kernel's name for shared memory without a file."""
 
 
 def is_shared_anonymous(line: MapsLine) -> bool:

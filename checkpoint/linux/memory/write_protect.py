@@ -272,7 +272,7 @@ class PagemapTracker:
         return self._own(everywhere) if is_running else existing
 
     def _protect_windows(self, lines: Sequence[MapsLine], existing: Words) -> None:
-        """Protect what is worth it and is not protected yet: what was written there since the scan began must stay known.
+        """Protect windows that are worth it and not protected yet: writes there since the scan began must stay known.
 
         Where a mapping has gone meanwhile nothing is protected, and the next scan finds out.
         """
@@ -341,7 +341,7 @@ class PagemapTracker:
         return real, page_set.union(copied, page_set.intersection(found.swapped, readable))
 
     def _own(self, extents: Words) -> Words:
-        """What exists where holes may be protected by now, which look as if they were swapped out."""
+        """The pages that exist where holes may be protected by now: such holes look like swapped-out pages."""
         real, looked_at = self._existing(extents, NONE)
         return page_set.intersection(page_set.union(real, looked_at), extents)  # it is also told of small gaps between them
 

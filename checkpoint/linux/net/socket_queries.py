@@ -115,7 +115,7 @@ class Questions(Struct, frozen=True, eq=False):
         moved: where those are, 1 or 0.
         image: what the memory holds before.
         ends: where the parts end.
-        buffers, info, polled: offsets of what is not compared as a whole, from `ends[STATE]` on; ``info`` -1 for none.
+        buffers, info, polled: offsets of answers that are not compared as a whole, from `ends[STATE]` on; ``info`` -1 for none.
     """
 
     words: NDArray[np.uint64]
@@ -154,7 +154,7 @@ def questions(subject: Subject) -> Questions:
 
 
 def _ask_state(plan: _Plan, subject: Subject) -> int:
-    """What changes by itself; answers the offset of struct tcp_info."""
+    """Plan the questions about state that changes by itself; answers the offset of struct tcp_info."""
     info = -1
     if subject.family in _INTERNET:
         plan.name("getsockname")
@@ -359,7 +359,7 @@ class Asking:
         return b"".join((self._sheet.memory[:count].tobytes(), joined.tobytes(), buffers))
 
     def told(self, heard: bytes) -> list[Told]:
-        """Of each what the program has set, and what has become of it otherwise, of what was heard last."""
+        """Of each, from the last answers: its settings, and its state."""
         (end, size, _), more, buffers = self._questions.ends, self._more, self._questions.buffers
         each = buffers.stop - buffers.start
         of_buffers = len(heard) - each * len(self._chosen)
@@ -375,12 +375,12 @@ class Asking:
 
 
 def events(state: bytes) -> int:
-    """What poll(2) said."""
+    """The events of poll(2)."""
     return int.from_bytes(state[-2:], "little")
 
 
 def sized(fresh: Mapping[tuple[int, int], bytes]) -> tuple[Option, ...]:
-    """Options as `Subject` takes them, of what a fresh socket answers: a number stays one, and what is empty may be long."""
+    """Options as `Subject` takes them, from a fresh socket's answers: a number stays one, and an empty option may become long."""
     return tuple(
         (int(level), int(number), NUMBER_SIZE if 0 < len(value) <= NUMBER_SIZE else OPTION_SIZE)
         for (level, number), value in fresh.items()

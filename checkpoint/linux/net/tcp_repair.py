@@ -286,7 +286,7 @@ def fill(made: socket.socket, kept: Kept) -> None:
 
 
 def _agreed(kept: Kept) -> Iterator[bytes]:
-    """What the ends told each other when they were connected. Source: struct tcp_repair_opt."""
+    """The options on which the ends agreed when they connected. Source: struct tcp_repair_opt."""
     option = struct.Struct("<II")
     if kept.options & _WITH_SACK:
         yield option.pack(_OPTION_SACK, 0)

@@ -58,7 +58,7 @@ def remove_orphan(ends: Sequence[End]) -> None:
 
 
 def _answer(asked: socket.socket, order: int, address: End, peer: End) -> bytes:
-    """What the kernel says of one connection: a struct inet_diag_msg, or b"" for an error or a mere acknowledgement."""
+    """The kernel's answer about one connection: a struct inet_diag_msg, or b"" for an error or a mere acknowledgement."""
     hosts = [ip_address(end[0].partition("%")[0]) for end in (address, peer)]
     family = socket.AF_INET if hosts[0].version == 4 else socket.AF_INET6
     request = _REQUEST.pack(family, socket.IPPROTO_TCP, 0, _ANY_STATE)

@@ -72,7 +72,7 @@ class UnixSocket(Struct, frozen=True):
 
 
 def answer_about(inode: int) -> bytes:
-    """What the kernel says of one unix socket of our network namespace, for `parsed`; b"" where it does not tell."""
+    """The kernel's answer about one unix socket of our network namespace, for `parsed`; b"" where it does not tell."""
     with contextlib.suppress(OSError), sock_diag.opened() as asked:
         asked.send(sock_diag.message(_REQUEST.pack(socket.AF_UNIX, 0, 0, _ANY_STATE, inode, _SHOW, _NO_COOKIE, _NO_COOKIE)))
         packed = asked.recv(1 << 16)
@@ -91,7 +91,7 @@ def answers() -> dict[int, bytes]:
 
 
 def parsed(answer: bytes) -> UnixSocket | None:
-    """What an answer says; None for none."""
+    """The content of an answer; None for none."""
     if not answer:
         return None
     _, socket_type, state, _, _, _ = _ANSWER.unpack_from(answer)

@@ -49,17 +49,17 @@ class Descriptor(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Its name in reports."""
         return f"fd {self.number}"
 
     @property
     def fields(self) -> Mapping[str, str]:
-        """What fdinfo says, the first of several lines of one key."""
+        """The fields of fdinfo, the first of several lines of one key."""
         return parse_fields(self.text)
 
     @property
     def text(self) -> str:
-        """What fdinfo says."""
+        """The text of fdinfo."""
         return os.fsdecode(self.told)
 
 
@@ -76,7 +76,7 @@ class Standing(Struct, frozen=True):
 
 
 def head_of(told: bytes) -> re.Match[bytes] | None:
-    """What the first lines of fdinfo say: offset, flags, and of Linux 5.14 mnt_id and inode, which name an open file's file."""
+    """The first lines of fdinfo: offset, flags, and of Linux 5.14 mnt_id and inode, which name an open file's file."""
     return _HEAD.match(told)
 
 

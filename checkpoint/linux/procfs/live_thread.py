@@ -26,7 +26,7 @@ PIDFD_THREAD: Final = os.O_EXCL
 SPOKESMEN_MAX: Final = 8
 """How many threads may end, one after the other, by which a process is looked at in one look."""
 _NOT_A_PROCESS: Final = (errno.EINVAL, errno.ENOENT)
-"""What pidfd_open(2) answers to a thread that is not the first one."""
+"""The errors of pidfd_open(2) for a thread that is not the first one."""
 
 
 def spokesman_of(pid: int) -> int:
@@ -45,10 +45,10 @@ def spokesman_of(pid: int) -> int:
 
 
 def told_by_spokesman(pid: int, question: Callable[[int], Answer]) -> Answer:
-    """What a process answers that is looked at by the id of its spokesman; asked again where that ends meanwhile.
+    """The answer of a process that is looked at by the id of its spokesman; asked again where that ends meanwhile.
 
     Raises:
-        CheckpointError: what the question does.
+        CheckpointError: the question raises it.
         ProbeError: one spokesman ends after the other.
     """
     for _ in range(SPOKESMEN_MAX):

@@ -127,7 +127,7 @@ class _Question:
 
 
 def _words_of(line: MapsLine) -> tuple[int, ...]:
-    """What the kernel answers about one mapping."""
+    """The kernel's answer about one mapping."""
     device = os.major(line.device) | os.minor(line.device) << 32
     access = line.protection | SHARED * line.shared
     return line.start, line.end, access, 0, line.offset, line.inode, device

@@ -19,7 +19,7 @@ from checkpoint.errors import MapsFormatError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi
 
 DELETED: Final = " (deleted)"
-"""What the kernel adds to the path of what no name leads to any more."""
+"""The kernel adds this to the path of a file to which no name leads any more."""
 READ_SIZE: Final = 1 << 15
 """Bytes asked for at once: more than the kernel gives of most files, and less than what is allocated page by page."""
 
@@ -52,7 +52,7 @@ def opened(pid: int, name: str) -> int:
 
 @contextlib.contextmanager
 def _explained(pid: int, name: str) -> Iterator[None]:
-    """What the system says about a file of /proc, in our own words."""
+    """Turn the system's errors about a file of /proc into our own words."""
     path = f"/proc/{pid}/{name}"
     try:
         yield
@@ -377,7 +377,7 @@ def swapped_size(pid: int) -> int:
 
 
 def pid_max() -> int:
-    """What every pid is smaller than."""
+    """The limit: every pid is smaller."""
     with open("/proc/sys/kernel/pid_max") as file:
         return int(file.read())
 

@@ -25,7 +25,7 @@ GIGANTIC: Final = "gb"
 SEALED: Final = "sl"
 DROPPABLE: Final = "dp"
 MAY_WRITE: Final = "mw"
-"""Its protection may be changed to allow writing: what is mapped was open for that. Kept of shared mappings of files only."""
+"""Its protection may be changed to allow writing: its file was open for that. Kept of shared mappings of files only."""
 LOCKED, LOCKED_ON_FAULT = "lo", "lf"
 WATCHED: Final = frozenset(("um", "uw"))
 """A userfaultfd watches it, or write-protects it: ours, or one of the program's own."""

@@ -99,7 +99,7 @@ def _instructions(code: bytes) -> Iterator[int]:
 
 @functools.cache
 def features() -> tuple[str, ...]:
-    """What /proc/cpuinfo says that the processor has, in alphabetical order."""
+    """The features of the processor by /proc/cpuinfo, in alphabetical order."""
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith(cpu.FEATURES_LINE):
             return tuple(sorted(line.partition(":")[2].split()))

@@ -25,7 +25,7 @@ STEP: Final = 16
 
 
 class Report(Struct, frozen=True):
-    """What wait4(2) told of one thread.
+    """The answer of wait4(2) about one thread.
 
     Attributes:
         status: its wait status, of which note was taken by this; None: there is none.

@@ -31,7 +31,7 @@ _NUMBER: Final = struct.Struct("<i")
 _WORDS: Final = 9
 """Of /proc/PID/syscall for one that waits in a call: number, six arguments, stack and instruction pointer."""
 EPOLL: Final = "anon_inode:[eventpoll]"
-"""What a descriptor of epoll_create(2) is called in /proc/PID/fd."""
+"""The name of a descriptor of epoll_create(2) in /proc/PID/fd."""
 
 
 def look(tracee: Tracee) -> None:

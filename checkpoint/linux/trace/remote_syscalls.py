@@ -127,7 +127,7 @@ class BorrowedPages:
             self._memory.write(self._note, bytes(NOTE.size))
 
     def take_note(self) -> tuple[int, int] | None:
-        """What an earlier tracer had written down and could not put back: a descriptor and a number; it is forgotten here."""
+        """The note of an earlier tracer about a value that it could not put back: a descriptor and a number. Erases the note."""
         descriptor, value = NOTE.unpack(self._memory.read(self._note, NOTE.size))
         if not descriptor:
             return None
@@ -265,7 +265,7 @@ class Errand:
     """Threads at the desks: on their way there, at work, or asked to stop.
 
     Attributes:
-        answers: what they brought back.
+        answers: the results of their calls.
         asked: for each, whether it takes the request to stop; None: none was asked.
     """
 

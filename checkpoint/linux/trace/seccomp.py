@@ -38,7 +38,7 @@ ASKS_ANOTHER: Final = 0x7FC00000
 """SECCOMP_RET_USER_NOTIF."""
 CAP_SYS_ADMIN: Final = 21
 WHOLE_MACHINE: Final = ["0", "0", "4294967295"]
-"""What uid_map says in the first user namespace (user_namespaces(7))."""
+"""The words of uid_map in the first user namespace (user_namespaces(7))."""
 
 
 class Filter(Struct, frozen=True):
@@ -54,7 +54,7 @@ class Filter(Struct, frozen=True):
 
 
 class Confinement(Struct, frozen=True):
-    """What one thread is confined to; the filters are told oldest first."""
+    """The confinement of one thread; the filters are told oldest first."""
 
     is_strict: bool = False
     filters: tuple[Filter, ...] = ()

@@ -122,7 +122,7 @@ class Desk:
         return self._guest is not None and self._guest.is_here()
 
     def _lay_lost(self, lost: bytes) -> None:
-        """What the kernel is to give back by the code's own frame besides, unless it stands there."""
+        """Write the registers that the kernel is to give back by the code's own frame, unless they stand there."""
         if lost != self._lost:
             place, content = arch.frame_of_lost(self._places.frame, lost)
             if content:

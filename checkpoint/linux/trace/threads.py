@@ -110,7 +110,7 @@ class Threads:
         patience_ns: how long they may take to stop; None: as long as is usual.
 
     Args:
-        mend: what is done to each thread that is let go as it was found, of which nothing else was asked.
+        mend: is called for each thread that is let go as it was found, of which nothing else was asked.
         process: where it is not the leader's.
     """
 

@@ -347,7 +347,7 @@ class Tracee:
         return b"".join(self._getregset("read vector registers of", kind, self._xstate, size) for kind, size in STATE_SETS)
 
     def lost_in_calls(self) -> bytes:
-        """What calls of ours would take from its registers, for `give_back_lost`; empty: nothing."""
+        """The registers that calls of ours would take from it, for `give_back_lost`; empty: none."""
         if not LOST_SIZE or extended.LOST_IN_CALLS is None:
             return b""
         content = self._getregset("read vector registers of", extended.LOST_IN_CALLS, self._xstate, LOST_SIZE)

@@ -110,7 +110,7 @@ class Name(NamedTuple):
 
 
 class Seen(Struct, frozen=True):
-    """What one look brought home.
+    """The result of one look.
 
     Attributes:
         names: of each path, a directory before what is in it.
@@ -124,7 +124,7 @@ class Seen(Struct, frozen=True):
 
 
 class Parcel(Struct, frozen=True):
-    """What a snapshot says of carried files.
+    """A snapshot's part about carried files.
 
     Attributes:
         addresses, content: of the pages that it carries.
@@ -290,7 +290,7 @@ class CarriedTrees(Struct):
         return os.path.join(self.paths[name.tree], os.fsdecode(name.name)).rstrip("/")
 
     def _path_of(self, error: OSError) -> str:
-        """What the process itself calls it."""
+        """The process's own name for it."""
         return os.fsdecode(error.filename or b"").removeprefix(f"/proc/self/fd/{self._root}")
 
     def _unreadable(self, error: OSError) -> str:
@@ -352,10 +352,10 @@ class CarriedTrees(Struct):
         finally:
             os.close(file)
 
-    # What a snapshot says, while the program runs on
+    # The snapshot's part, while the program runs on
 
     def reasons(self, seen: Seen) -> tuple[str, ...]:
-        """Why what was seen cannot be carried."""
+        """Why the files of a look cannot be carried."""
         reasons = list(seen.unreadable)
         devices = {name.tree: name.about.st_dev for name in seen.names if not name.name}
         for name in seen.names:
@@ -389,7 +389,7 @@ class CarriedTrees(Struct):
         return ""
 
     def parcel(self, seen: Seen, parent: Position | None) -> Parcel:
-        """What the next snapshot says of a look, relative to a position (None: to nothing)."""
+        """The next snapshot's part about a look, relative to a position (None: to nothing)."""
         trees = self._trees(seen)
         contents = tuple(sorted(self._known.values(), key=lambda content: content.place))
         if self._now_of != contents:
@@ -405,7 +405,7 @@ class CarriedTrees(Struct):
         return Parcel(resources, mappings, sources.addresses, content, page_set.page_runs(cleared))
 
     def _trees(self, seen: Seen) -> tuple[Tree, ...]:
-        """What a look saw, as a snapshot tells it; files that have gone are forgotten."""
+        """The files of a look, as a snapshot tells them; files that have gone are forgotten."""
         standing = {name.key for name in seen.names if name.kind == stat.S_IFREG}
         self._known = {key: content for key, content in self._known.items() if key in standing}
         self._place_of = {(name.tree, name.name): self._known[name.key].place for name in seen.names if name.kind == stat.S_IFREG}
@@ -429,7 +429,7 @@ class CarriedTrees(Struct):
         return replace(entry, size=about.st_size, place=content.place, attributes=content.attributes)
 
     def _changes(self, acknowledged: PageMap) -> tuple[Words, Words]:
-        """What differs from what a standby has, and from the last snapshot, by whose sum the next one is reckoned."""
+        """The differences from the standby's state, and from the last snapshot, whose sum is the base of the next sum."""
         written, cleared = NONE, NONE
         for before in {id(one): one for one in (acknowledged, self._newest)}.values():
             if before is not self._now:
@@ -447,7 +447,7 @@ class CarriedTrees(Struct):
 
 
 def followed(pid: int, terms: Terms) -> CarriedTrees | None:
-    """What follows the carried files of a process; None where it has none.
+    """An object that follows the carried files of a process; None where it has none.
 
     Raises:
         ProcessGoneError, CaptureError: it has ended.

@@ -152,7 +152,7 @@ def _outermost(trees: Sequence[Tree]) -> list[Tree]:
 
 
 def _names_at(tree: Tree, path: str) -> set[bytes]:
-    """What a tree has at a path and below it."""
+    """The names of a tree at a path and below it."""
     names = {os.fsencode(_at(tree.path, entry)) for entry in tree.entries}
     return {name for name in names if (name + b"/").startswith(os.fsencode(path) + b"/")}
 

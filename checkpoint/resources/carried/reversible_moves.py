@@ -14,7 +14,7 @@ RENAME_NOREPLACE: Final = 1
 RENAME_EXCHANGE: Final = 2
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _CANNOT: Final = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
-"""What a file system or kernel says that does not know the flag."""
+"""The errors of a file system or kernel that does not know the flag."""
 
 
 class _Move(NamedTuple):

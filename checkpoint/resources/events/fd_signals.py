@@ -47,7 +47,7 @@ THE_PROCESS: Final = 1
 ITS_FIRST_THREAD: Final = 2
 _OWNERS: Final = {F_OWNER_PID: THE_PROCESS, F_OWNER_TID: ITS_FIRST_THREAD}
 SETTABLE: Final = os.O_APPEND | os.O_ASYNC | os.O_DIRECT | os.O_NOATIME | os.O_NONBLOCK
-"""What F_SETFL changes; it ignores the rest."""
+"""The flags that F_SETFL changes; it ignores the rest."""
 
 
 def describe(held: OpenFile) -> dict[str, Fact]:

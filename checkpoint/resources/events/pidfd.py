@@ -45,7 +45,7 @@ CAPABILITIES: Final = (
 
 TARGET: Final = "anon_inode:[pidfd]"
 NOBODY: Final = -1
-"""What fdinfo tells of a process that has ended, and has been waited for."""
+"""The pid that fdinfo tells of a process that has ended, and has been waited for."""
 
 
 def is_of_ended(one: Descriptor) -> bool:

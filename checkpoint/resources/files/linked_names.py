@@ -45,7 +45,7 @@ def name_of(path: str, file: File, pids: Sequence[int], mapped_on: int = 0) -> s
 
 
 def _names_held(pid: int, file: File, mapped_on: int) -> Iterator[str]:
-    """What a process calls the file, as far as that leads to it."""
+    """The process's names of the file, as far as they lead to it."""
     outlook = procfs.outlook(pid)
     for name, is_it in (*_names_mapped(pid, file, mapped_on), *_names_opened(pid, file)):
         if not name.endswith(DELETED) and name.startswith("/") and is_it(f"{outlook}{name}"):

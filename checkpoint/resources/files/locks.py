@@ -67,7 +67,8 @@ def describe(held: OpenFile, kinds: Collection[str] = (*KINDS, LEASE)) -> dict[s
 
 
 def _lease(held: OpenFile, state: str, mode: str) -> tuple[int, int]:
-    """What a lease is, and what it is to become: the latter is told, and a shared one has only what is open for reading."""
+    """The kind of a lease now, and the one that it is to become. The kernel tells the latter; only a file that is open for
+    reading has a shared one."""
     target = _TYPES[mode]
     if state != "BREAKING":
         return target, target

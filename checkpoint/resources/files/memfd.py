@@ -50,7 +50,7 @@ CAPABILITIES: Final = (
 
 PREFIX: Final = "/memfd:"
 ANONYMOUS: Final = "/dev/zero (deleted)"
-"""What the kernel calls shared memory without a file."""
+"""The kernel's name for shared memory without a file."""
 CONTENT_LIMIT: Final = 16 << 20
 """Bytes of one that a snapshot carries: it is copied while the program stands still."""
 HUGE: Final = 2 << 20

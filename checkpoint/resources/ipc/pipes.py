@@ -181,7 +181,7 @@ def copy_of_content(pipe: int, capacity: int) -> bytes:
 
 
 def peek(pipe: int) -> bytes:
-    """What waits in a pipe, by its reading end; it stays there. Nothing where it cannot be looked into, as a terminal cannot."""
+    """The bytes that wait in a pipe, by its reading end; they stay there. b"" where we cannot look into it, as in a terminal."""
     try:
         capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
         return b"".join(_teed(pipe, capacity, capacity))

@@ -125,7 +125,7 @@ def refuse(pid: int, lines: Iterable[MapsLine], kin: Collection[int] = ()) -> It
 
 
 def detached(found: Iterable[Mapped]) -> Iterator[str]:
-    """What the rule ``detach`` makes of it, for an operator."""
+    """The effect of the rule ``detach``, for an operator."""
     for pieces in _by_maker(found):
         yield (
             f'{_called(pieces)}. By the rule shared_memory = "detach" the program resumes with a copy of its own: others no '
@@ -209,7 +209,7 @@ def describe(objects: Iterable[tuple[Object, str]]) -> tuple[Resource, ...]:
 
 
 def notes(resources: Iterable[Resource]) -> tuple[str, ...]:
-    """What an operator is told of a program that was restored."""
+    """Sentences for the operator about a program that was restored."""
     told = [name for held in resources if held.kind == KIND for name in _names(held.facts["names"])]
     if not told:
         return ()

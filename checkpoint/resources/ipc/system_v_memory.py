@@ -193,7 +193,7 @@ class Segments(Struct):
                 self._passing.append(self.ids[wanted.identifier])
 
     def _emptied(self, left: Segment) -> int:
-        """What the program wrote after the snapshot goes: pages that were zero then are not in it."""
+        """Empty it of later writes of the program: pages that were zero at the snapshot are not in it."""
         try:
             system_v_ipc.wipe(left)
         except OSError as error:

@@ -67,7 +67,7 @@ def untold(why: str) -> str:
 
 
 def describe(threads: Iterable[tuple[int, Confinement]]) -> tuple[Resource, ...]:
-    """What each thread is confined to, by its id as it sees it itself."""
+    """The confinement of each thread, by its id as it sees it itself."""
     filters: dict[Filter, int] = {}
     told: list[Fact] = []
     for tid, found in threads:
@@ -92,7 +92,7 @@ def is_confined(resources: Iterable[Resource]) -> bool:
 
 
 def of_thread(resources: Iterable[Resource], tid: int) -> Confinement:
-    """What a thread is confined to."""
+    """The confinement of a thread."""
     for held in resources:
         if held.kind == KIND:
             filters, threads = held.facts["filters"], held.facts["threads"]

@@ -44,7 +44,7 @@ _KINDS: Final = ((abi.KCMP_FILES, CLONE_FILES), (abi.KCMP_FS, CLONE_FS))
 
 
 def describe(pid: int, parent: int) -> tuple[Resource, ...]:
-    """What a process shares with its parent, which is of the same component.
+    """The things that a process shares with its parent, which is of the same component.
 
     Raises:
         ProcessGoneError: one of them has ended.

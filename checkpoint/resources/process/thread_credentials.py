@@ -50,7 +50,7 @@ class Seen(Struct, frozen=True):
 
 
 class ThreadRights:
-    """What the threads of one process may, as far as it is not what the first one may."""
+    """The rights of the threads of one process that differ from the first one's."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid

@@ -69,11 +69,11 @@ SHARED_TABLE: Final = 0
 OF_TWINS: Final = "that two of its threads share, but not all, which is not kept yet"
 
 Own = frozenset[int]
-"""What of `KINDS` a thread has for itself."""
+"""Those of `KINDS` that a thread has for itself."""
 
 
 def own(pid: int, tid: int) -> Own:
-    """What a thread has for itself; of one that is about to end nothing is told.
+    """The kinds that a thread has for itself; of one that is about to end nothing is told.
 
     Raises:
         ProcessGoneError: it has ended.
@@ -83,7 +83,7 @@ def own(pid: int, tid: int) -> Own:
 
 
 def refuse(pid: int, tid: int, kinds: Own) -> Iterator[str]:
-    """Why what a thread has for itself cannot be kept."""
+    """Why a thread's own directory or descriptors cannot be kept."""
     _, reasons = _look_at(pid, tid, kinds)
     yield from reasons
     yield from _against_twins(pid, tid, kinds)
@@ -97,7 +97,7 @@ class _Told(Struct, frozen=True):
 
 
 class ThreadTables:
-    """What the threads of one process have for themselves, from capture to capture."""
+    """The directories and descriptors that threads of one process have for themselves, from capture to capture."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid

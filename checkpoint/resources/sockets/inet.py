@@ -175,7 +175,7 @@ def _list(fact: Fact) -> list[Fact]:
 
 
 def _shutdown(held: OpenFile, looked: socket.socket, opened: Opened) -> int:
-    """What of a socket for datagrams was shut down; only poll(2) tells of one that is bound to no port, and not that it sends."""
+    """The directions in which a datagram socket is shut down. Of one without a port only poll(2) tells, and not about sending."""
     poll = select.poll()
     poll.register(looked, select.POLLRDHUP)
     seen = dict(poll.poll(0)).get(looked.fileno(), 0)

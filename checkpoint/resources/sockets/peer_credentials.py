@@ -137,7 +137,7 @@ class Disguise(Struct, frozen=True):
         table.attempt(lost, "setresgid", gid, gid, SAME)
         table.attempt(lost, "setresuid", uid, uid, SAME)
         yield
-        table.attempt("", "setresuid", *self.vessel.uids[:2], SAME)  # what it has saved lets it
+        table.attempt("", "setresuid", *self.vessel.uids[:2], SAME)  # its saved ids permit it
         table.attempt("", "setresgid", *self.vessel.gids[:2], SAME)
         if self.eyes:
             table.call("set the filesystem's gid", "setfsgid", self.program.credentials.gids[3])

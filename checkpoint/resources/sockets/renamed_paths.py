@@ -29,7 +29,7 @@ def name_beside(outlook: str, path: str, may_be: Callable[[int], bool], device: 
     """The name that a file has in the directory of one that it had; "" without one.
 
     Args:
-        outlook: what leads to where the program's paths begin.
+        outlook: the path at which the program's paths begin.
         may_be: whether an inode of its file system's ``device`` is its.
     """
     directory = os.path.dirname(path)
@@ -48,7 +48,7 @@ def _is_socket_of(about: os.stat_result, device: int) -> bool:
 
 
 def socket_at(path: str) -> os.stat_result | None:
-    """What lies there, if it is a socket."""
+    """The stat(2) of a path, if it is a socket."""
     with contextlib.suppress(OSError):
         about = os.stat(path)
         return about if stat.S_ISSOCK(about.st_mode) else None

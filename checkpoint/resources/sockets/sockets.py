@@ -83,7 +83,7 @@ SO_BUF_LOCK: Final = 72
 _FORCED: Final = {socket.SO_SNDBUF: 32, socket.SO_RCVBUF: 33}
 """SO_SNDBUFFORCE and SO_RCVBUFFORCE."""
 _OF_IP: Final = (6, 7, 18, 23, 25, 26)
-"""IP_RECVOPTS, RETOPTS, PASSSEC, CHECKSUM, RECVFRAGSIZE, RECVERR_RFC4884: what comes with a datagram."""
+"""IP_RECVOPTS, RETOPTS, PASSSEC, CHECKSUM, RECVFRAGSIZE, RECVERR_RFC4884: data that come with a datagram."""
 _IP: Final = (1, 2, 4, 8, 10, 11, 12, 13, 15, 19, 20, 21, 24, 32, 33, 34, 49, 50, 51, *_OF_IP)
 """IP_TOS, TTL, OPTIONS, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL,
 BIND_ADDRESS_NO_PORT, MULTICAST_IF, MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF, LOCAL_PORT_RANGE."""
@@ -131,7 +131,7 @@ _getsockopt = ctypes.CDLL(None, use_errno=True).getsockopt
 
 
 class Form(Struct, frozen=True):
-    """What socket(2) was told."""
+    """The arguments of socket(2)."""
 
     family: int
     type: int
@@ -139,7 +139,7 @@ class Form(Struct, frozen=True):
 
 
 class Queue(Struct, frozen=True):
-    """What waits to be read.
+    """The messages that wait to be read.
 
     Attributes:
         passed: of each message the descriptors of the program that are on their way in it, `UNKNOWN` for what it has not open.
@@ -201,7 +201,7 @@ def general_facts(held: OpenFile, looked: socket.socket, opened: Opened) -> dict
     if recalled and held.lent is None:
         return dict(recalled.settings)
     form = Form(looked.family, looked.type, looked.proto)
-    about = os.fstat(looked.fileno())  # what a descriptor is told to be is what all sockets have in common
+    about = os.fstat(looked.fileno())  # its descriptor's own stat is the same for all sockets
     facts: dict[str, Fact] = {
         "socket": held.first.inode,
         "family": int(form.family),
@@ -324,7 +324,7 @@ def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
 
 
 def queue_of(looked: socket.socket, number: int, noted: Noted | None, identify: Identify = lambda _: UNKNOWN) -> Queue:
-    """What waits to be read; it stays there.
+    """The messages that wait to be read; they stay there.
 
     Only where several messages wait must the kernel be told to look behind the first (SO_PEEK_OFF). That is told to the program's
     own socket: never while the program runs, for it would look there, too.
@@ -370,7 +370,7 @@ def set_peek_offset(looked: socket.socket, offset: int) -> None:
 
 
 def readiness(looked: socket.socket) -> int:
-    """What poll(2) says of reading it."""
+    """The events of poll(2) for reading it."""
     poll = select.poll()
     poll.register(looked, select.POLLIN | select.POLLPRI)
     return next((events for _, events in poll.poll(0)), 0)
@@ -560,7 +560,7 @@ def _set_send_buffer_back(table: CallTable, held: Resource, made: int) -> None:
 
 
 SHUTDOWN_HOW: Final = {1: socket.SHUT_RD, 2: socket.SHUT_WR, 3: socket.SHUT_RDWR}
-"""What shutdown(2) is told, by what the kernel tells afterwards."""
+"""The argument of shutdown(2), by the state that the kernel tells afterwards."""
 
 
 def shut_down(table: CallTable, held: Resource, made: int) -> None:

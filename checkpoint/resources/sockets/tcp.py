@@ -118,7 +118,7 @@ _ROOM: Final = 1 << 16
 
 
 def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact], listings: Listings) -> dict[str, Fact]:
-    """What else must be known of a TCP socket that is neither fresh nor listens.
+    """The other facts of a TCP socket that is neither fresh nor listens.
 
     Args:
         facts: as `inet.observe` found them.
@@ -199,7 +199,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Sequence[Resource], surroundings: Surroundings, *, standing: bool) -> Iterator[Finding]:
-    """What can be told only of all connections together: which cannot be made again yet, and which end.
+    """Findings about all connections together: which cannot be made again yet, and which end.
 
     Args:
         standing: the program stood still, so that what is said of two ends was true at the same time.
@@ -236,7 +236,7 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
 
 
 def note(held: Resource) -> str | None:
-    """What becomes of a connection whose other end is another program's; None of one that had ended, or is asked for anew."""
+    """The end of a connection with another program, as a sentence; None of one that had ended, or is asked for anew."""
     if held.facts["state"] in (CLOSED, SYN_SENT) and not _number(held, "unread"):
         return None
     why = f" ({reason})" if isinstance(reason := held.facts.get(LEFT), str) else ""
@@ -250,7 +250,7 @@ def named(held: Resource) -> str:
 
 
 def notes(held: Sequence[Resource]) -> tuple[str, ...]:
-    """What a restore loses, one sentence each."""
+    """The connections that a restore loses, one sentence each."""
     others = pairs(held)
     ending = (one for one in held if one.kind == KIND and TAKEN not in one.facts and _number(one, "socket") not in others)
     return tuple(text for one in ending if (text := note(one)))

@@ -93,7 +93,7 @@ def depart(opened: Iterable[OpenFile]) -> Departing:
     """Silence and read the connections of a program that stands still.
 
     Args:
-        opened: what it has open, as it was observed.
+        opened: its open files, as they were observed.
     """
     wanted = {number_of(one.observed["socket"]): one for one in _with_others(opened)}
     between = {number: _connection(one.observed) for number, one in wanted.items()}
@@ -256,7 +256,7 @@ def _missing(one: _Arrival) -> str:
 
 
 def arriving(state: Snapshot, *, wanted: bool, all_of_them: bool = False) -> tuple[Arriving, Snapshot]:
-    """What of a snapshot's connections can be taken up here, tried by making each of them.
+    """The connections of a snapshot that can be taken up here, tried by making each of them.
 
     Args:
         wanted: nothing has run since the capture; else none is.

@@ -208,7 +208,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Sequence[Resource], surroundings: Surroundings) -> Iterator[Finding]:
-    """What can be told only of all sockets together: which of them end, and connections that wait to be accepted."""
+    """Findings about all sockets together: which of them end, and connections that wait to be accepted."""
     ours = [one for one in held if one.kind == KIND]
     awaited = awaited_here(ours)
     known = {number_of(one.facts["socket"]) for one in ours}
@@ -257,7 +257,7 @@ def note(one: Resource) -> str:
 
 
 def _may_exit(one: Resource) -> str:
-    """What that may do to a program that is no server."""
+    """The possible effect of that on a program that is no server."""
     peer = _name_for_people(one, "peer_name")
     if _name_for_people(one, "name") and not peer:
         return ""

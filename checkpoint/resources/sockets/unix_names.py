@@ -292,7 +292,7 @@ class Naming:
             self._bind_file(one, made)
 
     def address_of(self, one: Resource) -> bytes:
-        """What connect(2) takes to reach a socket that has a name."""
+        """The address for connect(2) to reach a socket that has a name."""
         name, opened = one.facts["name"], self._files.get(number_of(one.facts["socket"]))
         assert isinstance(name, bytes)
         return packed(name if opened is None else b"/proc/self/fd/%d\0" % opened)
