@@ -183,7 +183,7 @@ class SegmentReader:
         while target:
             count = os.preadv(self._file, [target], offset)
             if count == 0:
-                raise SegmentError(f"segment: it ends at byte {offset}, in the middle of what it should hold")
+                raise SegmentError(f"segment: it ends at byte {offset}, in the middle of its content")
             target, offset = target[count:], offset + count
 
 

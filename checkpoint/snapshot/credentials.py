@@ -108,7 +108,7 @@ def beyond(state: Snapshot | State, owner: Owner) -> Iterator[str]:
     for theirs in everybodys(state):
         yield from above(theirs, owner)
     if could_gain(state):
-        yield "a seccomp filter, and may gain rights by what it executes (no_new_privs is off)"
+        yield "a seccomp filter, and may gain rights by programs that it executes (no_new_privs is off)"
     for directory in sorted({one.process.root_directory for one in (state, *state.members)} - {"/"}):
         yield f"a root directory of its own ({directory}), by whose files it may gain rights"
 

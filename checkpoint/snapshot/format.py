@@ -320,9 +320,9 @@ def _read_outline(reader: Reader, preamble: Preamble) -> Snapshot:
         differences=table.differences,
     )
     if (expected := _version_of(snapshot)) != preamble.version:
-        raise FormatError(f"format version {preamble.version}: what it holds has version {expected}")
+        raise FormatError(f"format version {preamble.version}: its content has version {expected}")
     if canonical_state.header_of(snapshot) != header:
-        raise FormatError("header: does not describe what the other sections hold")
+        raise FormatError("header: does not describe the other sections")
     check_snapshot(snapshot, contents_size=preamble.contents_size)
     return snapshot
 

@@ -161,7 +161,7 @@ def _check_copies(snapshot: Snapshot, page_size: int) -> None:
         raise FormatError(f"copies: {_span(stray, np.intp(0))}, of which one is, is not carried")
     size = sum(copy.size for copy in snapshot.copies) + sum(run.size for run in snapshot.runs)
     if size > MAX_CONTENTS_SIZE:
-        raise FormatError(f"copies: {size} bytes with what they are of, above the limit of {MAX_CONTENTS_SIZE}")
+        raise FormatError(f"copies: {size} bytes with their sources, above the limit of {MAX_CONTENTS_SIZE}")
 
 
 def _check_differences(snapshot: Snapshot, page_size: int) -> None:

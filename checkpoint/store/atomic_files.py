@@ -108,4 +108,4 @@ def disk_trouble(tried: str) -> Iterator[None]:
         yield
     except OSError as error:
         cure = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        raise StoreError(f"cannot {tried}: {error.strerror}{cure}; what the store held is intact") from error
+        raise StoreError(f"cannot {tried}: {error.strerror}{cure}; the snapshots in the store are intact") from error

@@ -92,7 +92,7 @@ class Contents:
         Raises:
             StoreError: the disk does not let us.
         """
-        with disk_trouble(f"set the modes of what is in {self._folder}"):
+        with disk_trouble(f"set the modes of the files in {self._folder}"):
             for path in self._folder.iterdir() if self._folder.is_dir() else ():
                 if stat.S_IMODE(path.lstat().st_mode) != CONTENT_MODE and not path.name.startswith(TEMPORARY_PREFIX):
                     os.chmod(path, CONTENT_MODE)

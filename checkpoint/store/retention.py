@@ -125,7 +125,7 @@ class History:
             self._remove(folder, self.of(folder))
 
     def _remove(self, folder: str, olds: list[Old] | tuple[Old, ...]) -> None:
-        with disk_trouble(f"remove what was kept in {self._root / folder}"):
+        with disk_trouble(f"remove old snapshots in {self._root / folder}"):
             for old in olds:
                 self._files.remove(old.path)
                 self._olds[folder] = tuple(one for one in self._olds[folder] if one != old)

@@ -413,7 +413,7 @@ class Store:
         final = self._root / ASIDE_FOLDER / f"{folder_name(component)}-{file_name(header_of(folded))}"
         self._files.write(final, lambda file: format.encode(folded, file))
         begin = f"{folder_name(component)}-"
-        with disk_trouble(f"remove what was set aside of {component}"):
+        with disk_trouble(f"remove the snapshots of {component} that were set aside"):
             names = (path.name for path in final.parent.iterdir())
             ours = sorted(name for name in names if name.startswith(begin) and len(name) == len(final.name))
             for name in ours[:-ASIDE_LIMIT]:

@@ -418,7 +418,7 @@ def _sizes(state: Snapshot) -> list[tuple[int, int]]:
     pairs = [pair for pair in listed if isinstance(pair, list) and len(pair) == 2] if isinstance(listed, list) else []
     sizes = [(kind, size) for kind, size in pairs if isinstance(kind, int) and isinstance(size, int)]
     if len(sizes) != len(state.vmas) or state.machine.page_size != PAGE:
-        raise RestoreError(f"cannot restore {state.component}: its snapshot does not say what its pages mean")
+        raise RestoreError(f"cannot restore {state.component}: its snapshot does not describe its pages")
     return sizes
 
 

@@ -162,7 +162,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why it cannot be made here."""
     wanted, here = _wanted(held), system_v_ipc.segments().values()
     if wanted.key and any(one.key == wanted.key for one in here) and not _left_behind(wanted, here):
-        cure = "end what uses it, or remove it (ipcrm)"
+        cure = "end the programs that use it, or remove it (ipcrm)"
         yield f"the key {wanted.key & 0xFFFFFFFF:#x} of its System V shared memory belongs to another segment here: {cure}"
 
 

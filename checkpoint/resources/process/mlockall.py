@@ -24,7 +24,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "locked memory: mlock, also on fault, and mlockall for future mappings",
-        "locked again as far as its limit and rights allow there; otherwise a note says what is not",
+        "locked again as far as its limit and rights allow there; otherwise a note names the rest",
     ),
 )
 MCL_FUTURE: Final = 2

@@ -121,7 +121,7 @@ class ThreadTables:
             except ProcessGoneError:
                 continue
             except (ProbeError, OSError) as error:
-                raise CaptureError(f"cannot look at what thread {tid} of pid {self._pid} has open: {in_words(error)}") from error
+                raise CaptureError(f"cannot look into thread {tid} of pid {self._pid}: {in_words(error)}") from error
             self._told[tid] = _Told(fact, tuple(reasons))
 
     def describe(self) -> tuple[Resource, ...]:

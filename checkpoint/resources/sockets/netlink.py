@@ -36,8 +36,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.SOCKETS,
         "netlink sockets (routes, links, kernel events, generic netlink, diagnosis)",
-        "bound to their number again, with groups and options; the program must ask again for what a driver keeps for a "
-        "generic one",
+        "bound to their number again, with groups and options; the program must ask again for the state that a driver "
+        "keeps for a generic one",
     ),
     refused(
         Area.SOCKETS,
@@ -130,7 +130,7 @@ def findings(held: Iterable[Resource]) -> Iterator[Finding]:
     """Notes about state that may not come back."""
     for one in held:
         if one.kind == KIND and one.facts["protocol"] == GENERIC:
-            text = f"what a driver keeps for the generic netlink socket {one.name} is forgotten when the program comes back"
+            text = f"a restore loses the state that a driver keeps for the generic netlink socket {one.name}"
             yield Finding(KIND, one.name, NOTED, text)
 
 

@@ -528,7 +528,7 @@ def fill(table: CallTable, held: Resource, ways: Sequence[Way]) -> None:
     for index, (message, way) in enumerate(zip(messages, ways, strict=True)):
         rights = passed[index] if passed else []
         assert isinstance(message, bytes) and isinstance(rights, list)
-        _send(table, f"fill {held.name} with what waited in it", way, message, [number_of(one) for one in rights])
+        _send(table, f"fill {held.name} with its waiting messages", way, message, [number_of(one) for one in rights])
     for number, sending in enlarged.items():
         if sending is not None:
             _set_send_buffer_back(table, sending, number)

@@ -58,7 +58,7 @@ CAPABILITIES: Final = (
     by_rule(
         Area.SOCKETS,
         "TCP connections with others",
-        "reset: the program sees what it would see after a crash of its peer (ECONNRESET, EPOLLHUP, EPOLLERR). After an "
+        "reset: the program sees the same as after a crash of its peer (ECONNRESET, EPOLLHUP, EPOLLERR). After an "
         "end of file it reads the end of file again; a connection that it is just opening is opened anew",
         "If they are not opened anew",
     ),

@@ -343,7 +343,7 @@ def _kept(held: Resource) -> Kept:
         assert isinstance(found, dict)
         return msgspec.convert(found, Kept)
     except (AssertionError, msgspec.ValidationError) as error:
-        raise RestoreError(f"cannot restore {held.name}: what the snapshot says of its connection is none: {error}") from error
+        raise RestoreError(f"cannot restore {held.name}: the snapshot does not describe its connection: {error}") from error
 
 
 def _ends(held: Resource) -> tuple[tcp_repair.Address, tcp_repair.Address]:

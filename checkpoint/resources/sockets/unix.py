@@ -56,7 +56,7 @@ CAPABILITIES: Final = (
     by_rule(
         Area.SOCKETS,
         "unix sockets connected to another process (D-Bus, X, a logger’s stream)",
-        "the program sees what it would see if its peer had died: what it had received, then the end of file; EPIPE where it "
+        "the program sees the same as if its peer had died: the bytes that it had received, then the end of file; EPIPE where it "
         "sends. It may exit, unless it connects again; failover check says so beforehand. A socket for datagrams (/dev/log) is "
         "connected to the same name again. Connections that wait at a listener of the program end",
         "the unix socket {} with {} ends",

@@ -51,7 +51,7 @@ CAPABILITIES: Final = (
     refused(
         Area.THERE,
         "a unix socket's name that something else has, or a missing directory for it",
-        "end or remove what is there; make the directory",
+        "end the other program, or remove the file; make the directory",
         "the directory of the unix socket",
         "is something else here",
         "is another process's here",

@@ -37,7 +37,7 @@ GET_REGISTRATIONS: Final = 1 << 9
 
 NAMES: Final = {
     PR_SET_TSC: "the switch of the time stamp counter",
-    PR_MCE_KILL: "what a broken page of memory does",
+    PR_MCE_KILL: "the policy for a broken page of memory",
     PR_SET_SPECULATION_CTRL: "a limit on speculation",
     PR_SET_MEMORY_MERGE: "the merging of equal pages",
     abi.PR_SET_THP_DISABLE: "where there are no transparent huge pages",

@@ -226,7 +226,7 @@ class TreeRestore:
         self._make_nameless(table, vessel, estate, made, resources)
         inheritance.leave_files(table)
         if table.end - base > AREA_SIZE:
-            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
+            raise RestoreError(f"cannot restore: files and memory that its processes share take more than {AREA_SIZE >> 20} MiB")
         self._notes += stub.run(table)
         inheritance.put_in(self._first.memory)
         return estate

@@ -255,7 +255,7 @@ class FamilyCopy(TreeRestore):
             brought = self._open_brought(table, resources)
         self._make_nameless(table, vessel, estate, brought | dict(self._estate.objects), resources)
         if table.end - table.base > AREA_SIZE:
-            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
+            raise RestoreError(f"cannot restore: files and memory that its processes share take more than {AREA_SIZE >> 20} MiB")
         self._notes += self._stub.run(table)
         return estate
 
