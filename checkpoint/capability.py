@@ -39,10 +39,10 @@ class Capability(Struct, frozen=True):
     """One row.
 
     Attributes:
-        kind: what it is, in a few words that a reader of the table would look for.
+        kind: its name, in a few words that a reader of the table would look for.
         sentence: how it comes back, by which rule, or what to do instead.
-        said: a part of each sentence by which the code refuses or notes it, as it stands in the source: ``{}`` for what is filled
-            in.
+        said: a part of each sentence by which the code refuses or notes it, as it stands in the source: ``{}`` for each value
+            that is filled in.
     """
 
     area: Area

@@ -17,7 +17,7 @@ RULES_MAX: Final = 256
 RULES: Final = ("reopen", "hook", "optional")
 """As an operator says them."""
 KIND: Final = "attached_devices"
-"""Of resources that are kept by these rules."""
+"""The kind of resources that are kept by these rules."""
 
 
 class DeviceRule(Struct, frozen=True):

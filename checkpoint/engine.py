@@ -127,7 +127,7 @@ class Terms(Struct, frozen=True):
         connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
         refuses_connections: a connection with others, of TCP or of unix sockets, stands against a capture; else it ends where the
             program goes on without it.
-        freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
+        freeze_budget_ns: how long it may stand still for a snapshot, so that pages are copied beforehand as
             far as needed; a freeze that would take longer is given up; 0: as short as can be.
         freeze_overrun_ns: when no capture has kept to that for so long, one may take longer; 0: none may.
         owner: with whose rights its files are opened, and beyond whose rights nothing of it is captured: each capture asks again.
@@ -306,10 +306,10 @@ LASTING_NOTES: Final = (RESET_NOTE, COPY_NOTE)
 
 
 class Restored(Protocol):
-    """A program that was brought back and stands still until `resume`."""
+    """A restored program, which stands still until `resume`."""
 
     position: Position
-    """Of the snapshot that it stands at."""
+    """The position of the snapshot that it stands at."""
     notes: tuple[str, ...]
 
     @property
@@ -336,7 +336,7 @@ class Copy(Protocol):
     """A ready copy: a stopped process that has a program's mappings and memory. Calls come from the thread that laid it."""
 
     position: Position
-    """That it stands at."""
+    """The position that it stands at."""
 
     @property
     def state(self) -> Snapshot:

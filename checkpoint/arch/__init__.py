@@ -22,11 +22,11 @@ if TYPE_CHECKING:  # the others have the same names
 __all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "stubs", "why_unsupported"]
 
 KNOWN: Final = ("x86_64", "aarch64")
-"""Those that there are files for, as uname(2) calls them."""
+"""Processors with files here, as uname(2) calls them."""
 UNPROVED: Final[tuple[str, ...]] = ()
-"""Those of them on which not everything has been seen to work yet."""
+"""Processors of `KNOWN` on which some parts are not proved yet."""
 EMULATED: Final = ("aarch64",)
-"""Those of them that were seen to work under software emulation only, no machine being at hand."""
+"""Processors of `KNOWN` that were proved under software emulation only, because no machine was at hand."""
 TRY_UNPROVED: Final = "FAILOVER_TRY_UNPROVED_PROCESSOR"
 """Variable of the environment with which developers run a processor that is not proved yet; never for a program that matters."""
 SUPPORTED: Final = tuple(name for name in KNOWN if name not in UNPROVED or os.environ.get(TRY_UNPROVED))

@@ -62,7 +62,7 @@ _STAND: Final = struct.Struct("<q248xQ")
 
 
 def stand_of(content: bytes) -> tuple[int, int, int]:
-    """Of NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last is -1 always."""
+    """Read NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last is -1 always."""
     result, pointer = _STAND.unpack_from(content)
     return pointer, result, -1
 
@@ -479,7 +479,7 @@ def entry_code(
 
 
 def _entry_instructions(address: int, calls: EntryCalls, frame: int) -> bytes:
-    """Those of `entry_code`; their number does not depend on the address of the frame."""
+    """The instructions of `entry_code`; their number does not depend on the address of the frame."""
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)
     code.move(19, 0)

@@ -51,7 +51,7 @@ PERMISSIONS: Final[tuple[tuple[str, str, tuple[int, ...]], ...]] = ()
 _HEAD: Final = struct.Struct("<IIHHHH")
 """struct user_sve_header: size, greatest size, bytes of a vector, the most of these, flags, nothing."""
 _WHOLE: Final = 1
-"""Of its flags: all of the scalable vectors follow, not the vector registers alone."""
+"""A flag of it: all of the scalable vectors follow, not the vector registers alone."""
 
 
 def sets(features: Callable[[], Collection[str]], vector_size: Callable[[], int]) -> tuple[tuple[int, int], ...]:
@@ -78,7 +78,7 @@ def _scalable_size(vector_size: int) -> int:
 
 
 def scalable_registers(content: bytes) -> tuple[int, bytes]:
-    """Of a set that holds them all: bytes of a vector, and the registers."""
+    """Read a set that holds them all: bytes of a vector, and the registers."""
     vector_size = _HEAD.unpack_from(content)[2]
     return vector_size, content[_HEAD.size : _HEAD.size + _registers_size(vector_size)]
 
@@ -144,7 +144,7 @@ def key_rights(state: bytes, layout: Layout) -> int | None:
 
 
 def _content(state: bytes, one: Component) -> bytes:
-    """Of one set; less than its size where it came short."""
+    """The content of one set; less than its size where it came short."""
     return state[one.offset : one.offset + one.size]
 
 

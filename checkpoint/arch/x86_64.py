@@ -58,7 +58,7 @@ _STAND: Final = struct.Struct("<80xq32xqQ")
 
 
 def stand_of(content: bytes) -> tuple[int, int, int]:
-    """Of NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last two are signed."""
+    """Read NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last two are signed."""
     result, number, pointer = _STAND.unpack_from(content)
     return pointer, result, number
 
@@ -166,7 +166,7 @@ SOCKET_TIMEOUT: Final[Mapping[str, Timeout]] = {
 }
 """Calls that do so only at a socket that has a timeout. connect(2) is not made again: it would answer EALREADY."""
 CALL_NUMBER_BITS: Final = 32
-"""Of the register with a call's number newer kernels look at the lower half only, and keep both in `CALL_NUMBER`: the upper one
+"""Newer kernels look at the lower half of the register with a call's number only, and keep both in `CALL_NUMBER`: the upper one
 can hold a mark by which a call is known again, until its result takes that place. 0: marks lie elsewhere."""
 MARK_LIMIT: Final = 1 << 31
 """Marks are smaller: the highest bit says that the thread is in no call."""

@@ -133,7 +133,7 @@ def key_rights(xstate: bytes, layout: Layout) -> int | None:
 
 
 def _extended_in_use(xstate: bytes, layout: Layout) -> Iterator[Component]:
-    """Those that are in use and inside what was told."""
+    """The components that are in use and inside the bytes told."""
     used = in_use(xstate)
     return (one for one in layout if used >> one.number & 1 and one.offset + one.size <= len(xstate))
 

@@ -17,7 +17,7 @@ VARIABLE: Final = "FAILOVER_PORTABLE"
 TUNABLES: Final = "GLIBC_TUNABLES"
 HWCAPS: Final = "glibc.cpu.hwcaps"
 LEVELS: Final = arch.LEVELS
-"""Those of this machine's processor, the lowest first."""
+"""The levels of this machine's processor, the lowest first."""
 DEFAULT: Final = arch.DEFAULT
 
 
@@ -43,7 +43,7 @@ def level_in(environ: bytes) -> str:
 
 
 def features_used(features: tuple[str, ...], level: str) -> tuple[str, ...]:
-    """Of a processor's features those that a program may have chosen its code by."""
+    """The features of a processor by which a program may have chosen its code."""
     if not level:
         return features
     beyond = stubs.INSTRUCTION_SETS - arch.flags_of(level)

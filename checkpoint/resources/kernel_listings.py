@@ -19,7 +19,7 @@ Group = tuple[int, str]
 """A multicast group: interface and address."""
 _PEER_COLUMN: Final = 2
 _INODE_COLUMN: Final = 9
-"""Of net/raw, icmp and tcp, and of net/netlink."""
+"""Columns of net/raw, icmp and tcp, and of net/netlink."""
 
 LISTS_MAX: Final = 16
 """Lists of multicast groups that are remembered with what they mean: they are the same from one look to the next."""

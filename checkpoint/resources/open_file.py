@@ -178,7 +178,7 @@ class Opened(tuple[OpenFile, ...]):
 
     @functools.cached_property
     def recalled(self) -> dict[int, Recalled]:
-        """Of sockets that are, in part at least, as they were at the last look, by their descriptors."""
+        """Sockets that are, in part at least, as they were at the last look, by their descriptors."""
         return {}
 
     @functools.cached_property

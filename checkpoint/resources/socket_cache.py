@@ -88,7 +88,7 @@ class _AtATime(Struct, frozen=True):
 
     @classmethod
     def of(cls, some: Sequence[tuple[OpenFile, _Known]]) -> _AtATime:
-        """Those of a kind together."""
+        """Sockets at a time, those of a kind together."""
         kinds: dict[Asking, _Alike] = {}
         for place, (one, known) in enumerate(some):
             if known.asking is not None:

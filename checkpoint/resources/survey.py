@@ -129,7 +129,7 @@ def _is_plain(held: OpenFile) -> bool:
 
 
 def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollection | None = None) -> list[OpenFile]:
-    """All of them, sockets looked into, and what was found on its way in these."""
+    """All of them, sockets looked into, and the open files found on their way in these."""
     answers = recollection.recall(opened) if recollection else {}
     known = {number: one.whole for number, one in opened.recalled.items() if one.whole is not None}
     found = [

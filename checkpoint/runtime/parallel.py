@@ -65,7 +65,7 @@ def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Gener
 
 
 def in_rows(pieces: Iterable[A], count: int) -> Iterator[tuple[A, ...]]:
-    """So many pieces at a time, as `in_order` takes them where each is soon done; the last row may be shorter."""
+    """Pieces in rows of ``count``, as `in_order` takes them where each is soon done; the last row may be shorter."""
     rest = iter(pieces)
     while row := tuple(islice(rest, count)):
         yield row
@@ -80,7 +80,7 @@ class OwnBuffers:
 
     @property
     def own(self) -> memoryview:
-        """That of the calling thread."""
+        """The buffer of the calling thread."""
         if not hasattr(self._of_thread, "buffer"):
             self._of_thread.buffer = memoryview(bytearray(self._size))
         return self._of_thread.buffer  # type: ignore[no-any-return]

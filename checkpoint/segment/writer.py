@@ -118,7 +118,7 @@ class SegmentWriter:
         self._firsts = layout.first_pages()
         self._counts = [region.page_count for region in layout.regions]
         self._versions = np.zeros(layout.page_count, dtype=np.uint64)
-        """Of every page: the commit that changed it last."""
+        """For every page the commit that changed it last."""
         self._version_words = self._versions.data
         self._stamp_words = [
             memoryview(self._memory)[layout.versions_offset(bank) :][: layout.page_count * WORD].cast("Q")
@@ -294,7 +294,7 @@ class SegmentWriter:
         self._rows[0][here : here + count][held] = other._rows[other._newest][first : first + count][held]
 
     def supersede(self) -> None:
-        """Tell readers that commits go on elsewhere."""
+        """Tell readers that later commits go to another segment."""
         self._words[SUPERSEDED_OFFSET // WORD] = 1
 
     def close(self) -> None:

@@ -149,7 +149,7 @@ def without(state: Snapshot) -> Snapshot:
 
 
 def relocated(state: Snapshot, places: Mapping[str, str]) -> Snapshot:
-    """The same base with carried paths that lie elsewhere here: for what is open or mapped, and the working directory, too.
+    """The same base with carried paths that lie elsewhere here: also for open and mapped files, and the working directory.
 
     Args:
         places: by the path that the snapshot tells of, the path here. Others stay where they are.

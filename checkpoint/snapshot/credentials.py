@@ -26,7 +26,7 @@ KIND: Final = "thread_rights"
 CONFINED: Final = "seccomp"
 """The kind of resource of `checkpoint.resources.process.seccomp`."""
 LOGIN: Final = "logins"
-"""That of `checkpoint.resources.process.audit_login`."""
+"""The kind of resource of `checkpoint.resources.process.audit_login`."""
 SECBIT_KEEP_CAPS: Final = 1 << 4
 """The one of the securebits that any process may set; execve(2) takes it back."""
 SCHED_DEADLINE: Final = 6

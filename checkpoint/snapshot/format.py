@@ -88,7 +88,7 @@ def check_contents_size(size: int, limit: int = layout.MAX_CONTENTS_SIZE) -> Non
 
 
 def worth(threads: int, preamble: Preamble) -> int:
-    """So many of these threads as the frames are worth."""
+    """The number of these threads that the frames are worth."""
     return threads if preamble.frame_count >= WORTH_THREADS else 1
 
 

@@ -51,7 +51,7 @@ def facts(what: str) -> Iterator[None]:
 
 
 def sentence(what: str, error: Exception) -> str:
-    """That something cannot be done, and why: what the kernel does not do may be this machine's fault, too."""
+    """The sentence that something cannot be done, and why: a refusal of the kernel may be this machine's fault, too."""
     if isinstance(error, OSError):
         cure = "if this machine lacks nothing for that, take a new snapshot: this one asks too much"
         return f"cannot {what}: {in_words(error)}; {cure}"

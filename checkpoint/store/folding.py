@@ -76,13 +76,13 @@ class Folding:
         return writer.finish(self._preamble)
 
     def _pages_told_anew(self) -> Flags:
-        """Of the state's pages, those that a delta has told, whole or as a difference."""
+        """The pages of the state that a delta has told, whole or as a difference."""
         anew: Flags = self._origins.sources.words[:, 0] > 0
         anew[np.searchsorted(self._origins.sources.addresses, self._origins.changed)] = True
         return anew
 
     def _pages_gone(self) -> Flags:
-        """Of the base's pages, those whose content is not the state's any more."""
+        """The pages of the base whose content is not the state's any more."""
         kept = self._origins.sources.addresses[~self._told_anew]
         gone: Flags = np.ones(len(self._base_addresses), dtype=np.bool_)
         gone[np.searchsorted(self._base_addresses, kept)] = False

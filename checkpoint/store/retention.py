@@ -47,7 +47,7 @@ class Old(Struct, frozen=True):
 
 
 class History:
-    """The folder, and what is in it. May be called from any thread."""
+    """The folder, and its files. May be called from any thread."""
 
     def __init__(self, root: Path, files: WholeFiles, retention: Retention) -> None:
         """

@@ -5,7 +5,7 @@ whole and on the disk: written aside, synced, renamed, folder synced. So an ackn
 that did not arrive whole leaves only a temporary file that the next opening removes.
 
 There are two kinds of lock, taken in this order. Each component has one for the thread that changes its files, for as long as
-that takes (a base may be gigabytes). The store has one for what is known of all components, held for moments only. Readers wait
+that takes (a base may be gigabytes). The store has one for its index of all components, held for moments only. Readers wait
 for the second alone: a takeover never waits for a snapshot that is being written, proved or folded.
 """
 
@@ -57,7 +57,7 @@ ASIDE_LIMIT = 4
 LOCK_NAME = "lock"
 
 NOTICES_KEPT = 100
-"""Of what was found damaged or left over."""
+"""Notices about files that were found damaged or left over."""
 
 NOTHING_OLD = Retention()
 
@@ -219,7 +219,7 @@ class Store:
     # Keeping
 
     def make_room(self, size: int) -> None:
-        """See that the disk has room for a snapshot of so many bytes, if what is kept for people can give it."""
+        """Make room on the disk for a snapshot of so many bytes, as far as snapshots that are kept for people can give it."""
         self._history.make_room(size)
 
     def put(self, source: int, *, prove: bool = True) -> Snapshot:
@@ -329,7 +329,7 @@ class Store:
             self.prune(component, held[0])
 
     def fold(self, component: str, position: Position) -> None:
-        """Write the state at a position as a base of its own, so that what is older can go.
+        """Write the state at a position as a base of its own, so that older files can go.
 
         The long part holds no lock at all: snapshots are taken in meanwhile. Cut off anywhere, the old chain is whole.
 

@@ -160,7 +160,7 @@ class Sender:
         self._is_differing = False
         """Whether the delta that was told last has differences, and was not acknowledged."""
         self._whole = 0
-        """So many deltas are told whole from here on; ``_pause``: as many, after the next one that is not acknowledged."""
+        """The number of deltas to tell whole from here on; ``_pause``: that number after the next one without acknowledgement."""
         self._pause = 0
 
     @property

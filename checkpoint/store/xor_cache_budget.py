@@ -13,7 +13,7 @@ from typing import Final
 from msgspec import Struct
 
 PARTS: Final = 256
-"""Of the bound: shares are a number of these, for to change one is to copy it."""
+"""Parts of the bound: a share is a number of these, because a change of a share copies its pages."""
 
 
 class _User(Struct):

@@ -18,7 +18,7 @@ from checkpoint.pages.page_set import Words
 
 
 class Guards:
-    """Those of one process, from freeze to freeze.
+    """The guard pages of one process, from freeze to freeze.
 
     Args:
         look: finds the guards within a set of pages.

@@ -149,7 +149,7 @@ class PageScanner:
         return not self.unprotected(np.array([[start, end]], dtype=np.uint64))
 
     def unprotected(self, ranges: Words) -> list[tuple[int, int]]:
-        """Those ranges in which a mapping is not registered for asynchronous write protection."""
+        """The ranges in which a mapping is not registered for asynchronous write protection."""
         found = []
         for batch in _batches(ranges):
             counts = self._asked(UNREGISTERED, batch, abi.PM_SCAN_CHECK_WPASYNC).counts[: len(batch)].tolist()
@@ -233,7 +233,7 @@ class PageScanner:
         return not any(any(self._asked(question, batch, limit=1).counts[: len(batch)].tolist()) for batch in _batches(ranges))
 
     def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
-        """Regions of pages that are present or swapped out, and what is to be told of them besides."""
+        """Regions of pages that are present or swapped out, with the other categories that are asked for."""
         wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
         found = self._collect(Question(unwanted, unwanted, wanted, wanted | told), ranges)
         absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0

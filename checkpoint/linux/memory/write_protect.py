@@ -258,10 +258,10 @@ class PagemapTracker:
         return [line for line in inside if not self._scanner.is_protected(line.start, line.end)]
 
     def _fresh(self, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
-        """Register mappings and protect them: what exists in them.
+        """Register mappings and protect them; answers with the pages that exist in them.
 
         Args:
-            is_running: one that cannot be registered may be gone, and what exists is looked for once more.
+            is_running: a mapping that cannot be registered may be gone, so existing pages are looked for once more.
         """
         for line in lines:
             if not self._register(line) and not is_running:
@@ -346,7 +346,7 @@ class PagemapTracker:
         return page_set.intersection(page_set.union(real, looked_at), extents)  # it is also told of small gaps between them
 
     def _surroundings_of(self, doubtful: Words) -> Words:
-        """Of the same pages from scan to scan, as a rule: one set while the process runs, and one while it stands still."""
+        """The surroundings of pages. Scans ask for the same pages as a rule: one set while the process runs, one in a freeze."""
         key = doubtful.tobytes()
         for known, around in self._around:
             if known == key:

@@ -93,7 +93,7 @@ class Connection(Struct, frozen=True):
 
     @classmethod
     def between(cls, ours: Sequence[object], peer: Sequence[object]) -> Connection:
-        """Of two addresses as getsockname(2) and getpeername(2) tell them."""
+        """The connection of two addresses as getsockname(2) and getpeername(2) tell them."""
         return cls(*((_plain(str(end[0])), int(str(end[1]))) for end in (ours, peer)))
 
     @property

@@ -26,7 +26,7 @@ from checkpoint.runtime.lazy_numpy import NDArray
 Option = tuple[int, int, int]
 """Level, number and size of an option."""
 Told = tuple[bytes, bytes]
-"""Of a socket what the program has set, and what has become of it otherwise; the last two bytes are what poll(2) says."""
+"""A socket's settings by the program, and its other state; the last two bytes are the events of poll(2)."""
 
 OPTION_SIZE: Final = 64
 NUMBER_SIZE: Final = 8
@@ -38,8 +38,8 @@ SO_PEERNAME: Final = 28
 SO_BUF_LOCK: Final = 72
 _TCP_INFO_SIZE: Final = 216
 _TCP_INFO_TOLD: Final = ((0, 1), (24, 32), (128, 136), (144, 148), (200, 216))
-"""Of struct tcp_info: state; what a listener holds; bytes received, not sent yet, sent and sent again. The rest is times and
-estimates."""
+"""Parts of struct tcp_info: state; connections that a listener holds; bytes received, not sent yet, sent and sent again. The
+rest is times and estimates."""
 _CREDENTIALS_SIZE: Final = 12
 _MCAST_MSFILTER: Final = 48
 _POLL: Final = struct.Struct("<ihH")

@@ -25,7 +25,7 @@ _NO_COOKIE: Final = 0xFFFFFFFF
 _ANY_STATE: Final = 0xFFFFFFFF
 _NAME, _FILE, _PEER, _WAITING, _LENGTHS, _SHUTDOWN = 0, 1, 2, 3, 4, 6
 _MINOR_BITS: Final = 20
-"""Of a device number as the kernel has it. Source: linux/kdev_t.h."""
+"""Bits of the minor number in a device number of the kernel. Source: linux/kdev_t.h."""
 
 ESTABLISHED: Final = 1
 LISTENING: Final = 10

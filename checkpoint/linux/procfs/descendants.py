@@ -44,7 +44,7 @@ class Children:
         self._glance: _Glance | None = None
 
     def read(self, tids: list[int]) -> list[int]:
-        """Those that these threads have given birth to, oldest first; zombies among them."""
+        """The children of these threads, oldest first; zombies among them."""
         found: list[int] = []
         for tid in tids:
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended; its children are another one's now

@@ -139,7 +139,7 @@ class _Nameless(Struct, frozen=True):
 
 @functools.cache
 def _nameless() -> Mapping[bytes, _Nameless]:
-    """Those file systems that programs use most, by the mnt_id of fdinfo: two questions less about each of thousands of sockets.
+    """The file systems that programs use most, by the mnt_id of fdinfo: two questions less about each of thousands of sockets.
 
     None before Linux 5.14, whose fdinfo does not tell inodes. These mounts are there from the machine's start to its end.
     """

@@ -153,7 +153,7 @@ class KeptTexts:
 
     @property
     def numbers(self) -> list[int]:
-        """Those of the last look; none where the known facts did not explain all of it."""
+        """The numbers of the last look; none where the known facts did not explain all of it."""
         return self._last[0] if self._last is not None else []
 
     def as_before(self) -> tuple[Descriptor, ...] | None:

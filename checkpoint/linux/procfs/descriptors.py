@@ -37,7 +37,7 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
 
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:
-    """Those that lead there; of the others nothing more is read."""
+    """The descriptors that lead there; of the others nothing more is read."""
     numbers = [number for number in descriptor_numbers(pid) if _target(pid, number) == target]
     return tuple(found for number in numbers if (found := descriptor(pid, number)) is not None)
 

@@ -66,11 +66,11 @@ def _explained(pid: int, name: str) -> Iterator[None]:
 
 
 def denied(pid: int, sentence: str) -> ProbeError | ProcessGoneError:
-    """Why an ordinary user was not let at what /proc says of a process: it is another's, or has ended, for what is left of it is
-    root's until its parent takes note.
+    """Why an ordinary user could not read a process's files of /proc: the process is another user's, or has ended. The files of
+    an ended process are root's until its parent takes note.
 
     Args:
-        sentence: what to say of one that lives.
+        sentence: the sentence about a living process.
 
     Source: task_dump_owner() in fs/proc/base.c.
     """
@@ -100,7 +100,7 @@ class KeptFiles:
         self._files: dict[str, int] = {}
 
     def descriptor(self, name: str) -> int:
-        """Of ``/proc/PID/name``. Raises as `read_bytes`."""
+        """A descriptor of ``/proc/PID/name``. Raises as `read_bytes`."""
         file = self._files.get(name)
         if file is None:
             file = self._files[name] = opened(self._pid, name)
@@ -308,7 +308,7 @@ class Status(Struct, frozen=True):
 
 
 _ESCAPED: Final = re.compile(r"\\n|\\\\")
-"""Of a name: a line feed and a backslash. Source: proc_task_name() in fs/proc/array.c."""
+"""Escaped characters of a name: a line feed and a backslash. Source: proc_task_name() in fs/proc/array.c."""
 
 
 def _name_in(status: str) -> str:
@@ -360,7 +360,7 @@ def _five(words: tuple[int, ...]) -> tuple[int, int, int, int, int]:
 
 
 def signal_sets(text: bytes) -> tuple[int, int, int]:
-    """Of an unparsed /proc/PID/status: signals with an action of their own, pending for the thread, pending for the process."""
+    """Signals in an unparsed /proc/PID/status: with an action of their own, pending for the thread, pending for the process."""
 
     def mask(key: bytes) -> int:
         begin = text.index(key) + len(key)

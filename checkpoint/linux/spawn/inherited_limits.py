@@ -121,7 +121,7 @@ def _set_limit(number: int, soft: int, hard: int) -> None:
 
 
 def _lesser(one: int, other: int) -> int:
-    """Of two limits."""
+    """The lesser of two limits."""
     finite = [limit for limit in (one, other) if limit != resource.RLIM_INFINITY]
     return min(finite, default=resource.RLIM_INFINITY)
 

@@ -10,7 +10,7 @@ import os
 from typing import Final
 
 FIRST_LINE_SIZE: Final = 256
-"""Of a script: the kernel reads no more of it."""
+"""Bytes of a script's first line: the kernel reads no more of it."""
 
 INTERPRETERS: Final = {".py": "python3", ".sh": "sh"}
 

@@ -65,7 +65,7 @@ class _Layout:
 
 
 def _further_places() -> list[tuple[int, int, int]]:
-    """Of the further register sets: where the kernel is told where they go, where they go, and their size."""
+    """The places of the further register sets: that of the kernel's pointer, that of the set, and its size."""
     places, place = [], _Layout.further + len(FURTHER) * _IOV_SIZE
     for index, (_, size) in enumerate(FURTHER):
         places.append((_Layout.further + index * _IOV_SIZE, place, size))
@@ -252,7 +252,7 @@ class _Answers:
         return bytes(self._area.view[begin : begin + self._word(index, _REGISTERS_LENGTH)])
 
     def mask(self, index: int) -> int:
-        """Of signals."""
+        """The mask of blocked signals."""
         return self._word(index, _Layout.mask // _WORD)
 
     def rseq(self, index: int) -> Rseq | None:
@@ -347,7 +347,7 @@ class Waiting:
         )
 
     def read(self) -> tuple[bytes, ...]:
-        """Those of the thread, then those of the process. Raises as `Tracee.pending`: hardly ever there are any."""
+        """The pending signals of the thread, then of the process. Raises as `Tracee.pending`; there are seldom any."""
         self._calls.run()
         if not self._results.any():
             return ()

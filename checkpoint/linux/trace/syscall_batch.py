@@ -149,7 +149,7 @@ class Answers:
 
     @property
     def results(self) -> tuple[int, ...]:
-        """Of each call, signed: negative is an errno."""
+        """The result of each call, signed: negative is an errno."""
         return struct.unpack_from(f"<{self._count}q", self._table, self._plan.results)
 
     def at(self, address: int, size: int) -> bytes:

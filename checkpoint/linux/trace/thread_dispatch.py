@@ -25,7 +25,7 @@ REGISTERS_ROOM: Final = 512
 START, LOOK, INTERRUPT, STAND, GIVE_BACK = range(5)
 """Groups of calls, each made about all threads in one go."""
 CALLS: Final = (3, 1, 1, 2, 2)
-"""Of each group about one thread."""
+"""Calls of each group about one thread."""
 
 
 _POINTER: Final = arch.REGISTER_NAMES.index(arch.INSTRUCTION_POINTER)

@@ -137,7 +137,7 @@ class Threads:
         return self.leader.pid
 
     def _count(self) -> int:
-        """Of threads that can be stopped: a first one that has ended is counted until all have."""
+        """The number of threads that can be stopped: the kernel counts a first thread that has ended until all have."""
         return self._thread_count.read() - (self.process != self.pid)
 
     @functools.cached_property
@@ -146,7 +146,7 @@ class Threads:
 
     @property
     def others(self) -> tuple[Tracee, ...]:
-        """Those that stand still, besides the leader, oldest first."""
+        """The threads that stand still, besides the leader, oldest first."""
         first, held = self.pid, self._held
         return tuple([held[tid] for tid in sorted(held) if tid != first])
 
@@ -242,7 +242,7 @@ class Threads:
         return self._burial.watching(self._seized)
 
     def _seize_together(self, tids: list[int]) -> set[int]:
-        """Those that are seized by this. While it waits (7) all must be known whose end may have to be noted."""
+        """Seize these; answers with those seized. While it waits (7) all threads must be known whose end we may have to note."""
         self._seized.update(tid for tid in tids if tid != self.pid)
         seized = [tid for tid, is_ours in zip(tids, self._together.seize(tids), strict=True) if is_ours]
         for tid in seized:
@@ -251,7 +251,7 @@ class Threads:
         return set(seized)
 
     def _ask_together(self, tids: list[int]) -> set[int]:
-        """Those that are asked to stop by this."""
+        """Ask these to stop; answers with those asked."""
         asked = {tid for tid, was_asked in zip(tids, self._together.ask_to_stop(tids), strict=True) if was_asked}
         self._moving |= asked
         return asked

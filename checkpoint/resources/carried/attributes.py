@@ -70,7 +70,7 @@ def _own(path: str | bytes, entry: Entry, about: os.stat_result, folder: int | N
 
 @contextmanager
 def _held(place: str, top: str, name: bytes) -> Iterator[tuple[int, bytes, int]]:
-    """Hold what stands at a name open: (its folder, what it is called there, itself).
+    """Hold the file at a name open: (its folder, its name there, itself).
 
     Raises:
         OSError: it is not there, or a component of the name is a link (ENOTDIR).

@@ -105,7 +105,7 @@ class Name(NamedTuple):
 
     @property
     def kind(self) -> int:
-        """Of what kind that is, see inode(7)."""
+        """The file's kind, see inode(7)."""
         return stat.S_IFMT(self.about.st_mode)
 
 
@@ -139,7 +139,7 @@ class Parcel(Struct, frozen=True):
 
 
 NO_PARCEL: Final = Parcel((), (), np.empty(0, dtype=np.uint64), memoryview(b""), ())
-"""Of a program without carried files."""
+"""The parcel of a program without carried files."""
 
 
 class CarriedTrees(Struct):
@@ -241,7 +241,7 @@ class CarriedTrees(Struct):
         return Seen(tuple(names), links)
 
     def _refuse_link(self, path: str) -> str:
-        """Why a path means another one; at each look, for what was a folder may have become a link."""
+        """Why a path means another one; asked at each look, for a folder may have become a link."""
         top, parts = f"/proc/self/fd/{self._root}", path.strip("/").split("/")
         for count in range(1, len(parts) + 1):
             try:

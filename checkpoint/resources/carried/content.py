@@ -59,7 +59,7 @@ class Content(Struct, frozen=True, dict=True, eq=False):
 
 
 def version_of(about: os.stat_result) -> Version:
-    """Of the content of a file that looks like this."""
+    """The version of the content of a file with this stat(2)."""
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 
 

@@ -136,7 +136,7 @@ def _told(state: Snapshot, laying: _Laying) -> Iterator[None]:
 
 
 def _outermost(trees: Sequence[Tree]) -> list[Tree]:
-    """Those that no other one holds.
+    """The paths that no other one holds.
 
     Raises:
         RestoreError: two of them would have different things at one path.
@@ -357,7 +357,7 @@ class _Laying(Struct):
             self._moves.rename(os.path.join(self._new, name), os.path.join(path, name))
 
     def _make_kept(self, place: str) -> None:
-        """A new folder for what is replaced."""
+        """A new folder for replaced files."""
         above = os.path.join(place, f"{os.fsdecode(carried_files.OWN_PREFIX)}kept-{os.path.basename(self.tree.path)}")
         with contextlib.suppress(FileExistsError):
             os.mkdir(above, 0o700)

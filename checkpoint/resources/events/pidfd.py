@@ -54,7 +54,7 @@ def is_of_ended(one: Descriptor) -> bool:
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Of one that stands for a single thread of its process: that thread's id for the program, and whether epoll watches it."""
+    """Facts of a pidfd of a single thread of its process: that thread's id for the program, and whether epoll watches it."""
     tid = _target(held)
     if tid in (NOBODY, _process(held)) or not held.first.flags & os.O_EXCL:
         return {}
@@ -120,7 +120,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Sequence[Resource]) -> Iterator[Finding]:
-    """Those of threads that are on their way in a socket, too: a pidfd sent before threads are born stands for the process."""
+    """Refuse pidfds of threads that are also on their way in a socket: one sent before threads are born is of the process."""
     messages = [numbers for one in held for numbers in _list(one.facts.get("passed", []))]
     passed = {number for numbers in messages for number in _list(numbers)}
     for one in held:

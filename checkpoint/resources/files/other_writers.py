@@ -80,7 +80,7 @@ def everybody() -> list[int]:
 
 
 def arguments_of(pid: int) -> bytes:
-    """Of a process, each ended by a zero byte but the last; b"" where it has ended, or is not ours to look at."""
+    """The arguments of a process, each but the last ended by a zero byte; b"" where it has ended, or we may not look at it."""
     try:
         return procfs.read_bytes(pid, "cmdline").removesuffix(b"\0")
     except CheckpointError:

@@ -118,7 +118,7 @@ def _has_ended(held: OpenFile, number: str) -> bool:
 
 
 def _known_numbers(held: OpenFile) -> Iterator[int]:
-    """Of the other processes of its component, as it knows them; what several have open is made before these are born."""
+    """The pids of the component's other processes, as it knows them; none for a shared file, which is made before their birth."""
     return (procfs.status(pid).pids[-1] for pid in held.kin.pids if not held.description)
 
 

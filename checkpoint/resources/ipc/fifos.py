@@ -66,7 +66,7 @@ def is_fifo(one: Descriptor) -> bool:
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Its capacity, and what is in it if this is the one that tells; it stays there.
+    """Its capacity, and its content if this is the one that tells; the content stays there.
 
     Raises:
         CaptureError: it cannot be looked into.

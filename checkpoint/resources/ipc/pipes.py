@@ -232,7 +232,7 @@ def rebuild(table: CallTable, ends: Sequence[Resource], first: int) -> dict[int,
 
 
 def _fill(table: CallTable, opened: Sequence[Resource], pair: tuple[int, int]) -> None:
-    """Give a pipe its size and what is in it: every open file that reads has told the same."""
+    """Give a pipe its size and its content: every open file that reads has told the same."""
     name, capacity = opened[0].name, number_of(opened[0].facts["capacity"])
     if capacity != DEFAULT_CAPACITY:
         table.call(f"size the pipe of {name}", "fcntl", pair[0], F_SETPIPE_SZ, capacity, least=capacity)

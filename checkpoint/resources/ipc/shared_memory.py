@@ -63,7 +63,7 @@ _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(d
 FOREBEARS: Final = 8
 """Ancestors of a process that are looked at: a process that is born while we look at its component has few."""
 NAMES_TOLD: Final = 2
-"""Of several pieces of one middleware, in one sentence."""
+"""Names of several pieces of one middleware, in one sentence."""
 
 Object = tuple[int, int]
 """Device and inode number."""

@@ -88,7 +88,7 @@ class _Mounts:
                 self._places.append((kind, root, place, frozenset(options.split(","))))
 
     def directory(self, hierarchy: str, path: str) -> Path | None:
-        """Of a group, whether it exists or not; None where its hierarchy, or that part of it, is not mounted."""
+        """The directory of a group, whether it exists or not; None where its hierarchy, or that part of it, is not mounted."""
         for kind, root, place, options in self._places:
             is_meant = (
                 kind == "cgroup2" if hierarchy == UNIFIED else kind == "cgroup" and options.issuperset(hierarchy.split(","))

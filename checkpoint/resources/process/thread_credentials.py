@@ -58,7 +58,7 @@ class ThreadRights:
 
     @property
     def modes(self) -> Mapping[int, int]:
-        """Of seccomp(2), by thread id as we see it, before the freeze; of those that are confined."""
+        """The modes of seccomp(2) of confined threads before the freeze, by thread id as we see it."""
         return self._before.modes
 
     def prepare(self) -> None:

@@ -61,7 +61,7 @@ CLONE_FS: Final = 0x200
 CLONE_FILES: Final = 0x400
 SAME: Final = 0
 LESS: Final = 1
-"""Of kcmp(2)."""
+"""Results of kcmp(2)."""
 KINDS: Final = (abi.KCMP_FS, abi.KCMP_FILES)
 SHARED_TABLE: Final = 0
 """In place of a thread's descriptors: they are the first one's."""

@@ -205,7 +205,7 @@ def _peer(held: OpenFile, looked: socket.socket, listings: Listings) -> list[Fac
 
 
 def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact]]:
-    """Those of the known multicast groups that a socket has joined."""
+    """The known multicast groups that a socket has joined."""
     for interface, group in known:
         level = level_of(group)
         packed = bytearray(

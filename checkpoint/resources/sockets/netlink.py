@@ -58,7 +58,7 @@ FAMILIES: Final[Mapping[int, str]] = {
     15: "kobject_uevent",
     16: "generic",
 }
-"""Those of which a socket is no more than its number and its groups."""
+"""Families whose sockets have no more state than a number and groups."""
 GENERIC: Final = 16
 SOL_NETLINK: Final = 270
 ADD_MEMBERSHIP: Final = 1

@@ -22,7 +22,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.model import Fact
 
 ENTRIES_MAX: Final = 4096
-"""Of a directory so many are looked through for another name."""
+"""Entries of a directory that are looked through for another name."""
 
 
 def name_beside(outlook: str, path: str, may_be: Callable[[int], bool], device: int) -> str:

@@ -104,5 +104,5 @@ def refuse(held: OpenFile, kind: str, owned: Collection[str]) -> str | None:
 
 
 def describe(held: OpenFile) -> dict[str, Fact]:
-    """That it is on its way."""
+    """The fact that it is on its way."""
     return {} if held.lent is None else {"travelling": True}

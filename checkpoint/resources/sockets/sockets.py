@@ -239,10 +239,10 @@ def refuse_filter(held: OpenFile) -> str | None:
 
 
 def ends(kind: str, name: str, what: str, surroundings: Surroundings, more: str = "") -> Finding:
-    """That a connection with others ends by a restore; it stands against a capture where the operator wants that.
+    """The finding that a restore ends a connection with others; it refuses a capture where the operator wants that.
 
     Args:
-        more: what that means for the program.
+        more: the effect on the program.
     """
     if surroundings.terms.refuses_connections:
         cure = f"{AS_SOON_AS} the program has closed the connection"

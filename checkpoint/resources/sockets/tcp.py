@@ -90,7 +90,7 @@ _PEER_SPEAKS: Final = (ESTABLISHED, FIN_WAIT_1, FIN_WAIT_2)
 _PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
 
 PEERS_TOLD: Final = 3
-"""Of those whose connections are reset, in one sentence."""
+"""Peers that one sentence names, of those whose connections are reset."""
 
 TAKEN: Final = "carried"
 """Everything that must be known of a connection to take it up elsewhere."""
@@ -100,7 +100,7 @@ LEFT: Final = "left"
 """Why one is not taken along that was to be."""
 
 ON_ITS_WAY: Final = "it was on its way in a unix socket; once received, it is taken along"
-"""Of one that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
+"""Reason about a connection that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
 
 READ_ENDED: Final = 1
 FAILED: Final = 2
@@ -113,7 +113,7 @@ _SENT_AT: Final = 200
 """tcpi_bytes_received; tcpi_notsent_bytes; tcpi_bytes_sent and tcpi_bytes_retrans (Linux 4.19)."""
 
 _RESET_AT_CLOSE: Final = struct.pack("<ii", 1, 0)
-"""SO_LINGER: no time is left for what is underway, so the connection is reset."""
+"""SO_LINGER: no time is left for bytes that are underway, so the connection is reset."""
 _ROOM: Final = 1 << 16
 
 
@@ -202,7 +202,7 @@ def findings(held: Sequence[Resource], surroundings: Surroundings, *, standing: 
     """Findings about all connections together: which cannot be made again yet, and which end.
 
     Args:
-        standing: the program stood still, so that what is said of two ends was true at the same time.
+        standing: the program stood still, so that the facts of two ends were true at the same time.
     """
     others = pairs(held)
     for one in held:

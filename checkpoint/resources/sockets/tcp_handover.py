@@ -197,7 +197,11 @@ class Arriving:
     def __init__(
         self, arrivals: Iterable[_Arrival] = (), ended: Iterable[Connection] = (), state: Snapshot | None = None
     ) -> None:
-        """Of those that it takes up, and of those that have ended: this machine resets them, also where it was to be silent."""
+        """
+        Args:
+            arrivals: connections that it takes up.
+            ended: connections that have ended: this machine resets them, also where it was to be silent.
+        """
         self._arrivals = tuple(arrivals)
         self._ended = tuple(ended)
         self.notes = tuple(_missing(one) for one in self._arrivals if not inet_addresses.is_ours(_ends(one.resource)[0]))

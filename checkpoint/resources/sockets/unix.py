@@ -250,7 +250,7 @@ def _is_lost(facts: Mapping[str, Fact]) -> bool:
 
 
 def note(one: Resource) -> str:
-    """That a connection with another process ends."""
+    """The sentence that a connection with another process ends."""
     own, peer = _name_for_people(one, "name"), _name_for_people(one, "peer_name")
     where = peer or (f"a client of {own}" if own else "another process")
     return f"the unix socket {one.name} with {where} ends"

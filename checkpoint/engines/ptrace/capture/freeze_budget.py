@@ -16,7 +16,7 @@ FIRST_PAGE_NS: Final = 2_000
 TELLING_COUNT: Final = 64
 """Pages from which on their copying tells what one of them takes."""
 WEIGHT: Final = 0.2
-"""Of the newest freeze in what is expected of the next."""
+"""The weight of the newest freeze in the estimate for the next."""
 LONG_COPY_NS: Final = 200_000_000
 """Where no budget is set: a freeze whose copying would take longer is given up for some more passes while the program runs."""
 LONG_CAPTURE_NS: Final = 8_000_000_000
@@ -29,7 +29,7 @@ class OverBudgetError(CaptureError):
 
 
 class FreezeBudget:
-    """Of one component.
+    """The freeze budget of one component, with estimates of its freezes.
 
     Args:
         budget_ns: how long it may stand still for a snapshot; 0: as short as can be.

@@ -17,7 +17,7 @@ from checkpoint.resources.sockets.tcp_handover import Departing
 
 
 class Frozen(Struct, frozen=True):
-    """Everything that one freeze brought home; nothing in it needs the process any more.
+    """Everything that one freeze has read; nothing in it needs the process any more.
 
     Attributes:
         first: of the first process.
@@ -50,5 +50,5 @@ def lines_of_all(first: Look, others: SeenOthers | None) -> Iterator[MapsLine]:
 
 
 def shared_inodes(first: Look, others: SeenOthers | None) -> set[int]:
-    """Of the files that any of the processes has mapped to be shared."""
+    """The inodes of files that any of the processes has mapped to be shared."""
     return {line.inode for line in lines_of_all(first, others) if line.shared}

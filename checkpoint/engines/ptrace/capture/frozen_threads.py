@@ -119,7 +119,7 @@ class ThreadStanding(Struct, frozen=True, dict=True):
 
     @property
     def name(self) -> str:
-        """Of PR_SET_NAME."""
+        """The name that PR_SET_NAME sets."""
         return os.fsdecode((self.place.comm or self.reading.text).removesuffix(b"\n"))
 
     @functools.cached_property
@@ -134,12 +134,12 @@ class ThreadStanding(Struct, frozen=True, dict=True):
 
     @property
     def timer_slack_ns(self) -> int:
-        """Of prctl(2), PR_GET_TIMERSLACK."""
+        """The answer of prctl(2), PR_GET_TIMERSLACK."""
         return self.questions.timer_slack_in(self.answers)
 
     @property
     def death_signal(self) -> int:
-        """Of prctl(2), PR_GET_PDEATHSIG; 0 for none."""
+        """The answer of prctl(2), PR_GET_PDEATHSIG; 0 for none."""
         return self.questions.death_signal_in(self.answers)
 
 
@@ -273,7 +273,7 @@ class ThreadOnlooker:
         return self._inner_tids[life]
 
     def name_files(self) -> list[int]:
-        """Of those that stand still: what `Readings.read` is to read of them."""
+        """Files of the threads that stand still, for `Readings.read`."""
         return [self._names.get(tracee.pid, NOTHING_KEPT).file for tracee in self._threads.others]
 
     def places(self, readings: Sequence[Unread], modes: Mapping[int, int], of_first: int) -> tuple[ThreadPlace, ...]:

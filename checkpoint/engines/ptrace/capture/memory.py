@@ -63,7 +63,7 @@ PASS_LIMIT: Final = 3
 BUDGET_PASS_LIMIT: Final = 12
 """The same where the rest shall fit a budget."""
 CATCHING_UP: Final = 0.8
-"""Of what the pass before copied: a pass that copies more does not catch up."""
+"""The share of the earlier pass: a pass that copies more than this share does not catch up."""
 VDSO: Final = "[vdso]"
 UNACKNOWLEDGED_LIMIT: Final = 64
 """Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
@@ -130,7 +130,7 @@ class FreezeBuffer:
         self._wanted = 0
 
     def piece(self, size: int) -> memoryview:
-        """So many bytes of it; of new memory where the rest does not suffice."""
+        """A piece of this size; of new memory where the rest does not suffice."""
         begin = self._wanted
         self._wanted += size
         if self._wanted <= len(self._content):
@@ -213,7 +213,7 @@ class MemoryCapture:
         self._unacknowledged[-1] = Unacknowledged(position, last.written, last.cleared)
 
     def positions(self) -> set[Position | None]:
-        """Those that are, or can still be, acknowledged."""
+        """The positions that are, or can still be, acknowledged."""
         return {self.acknowledged, *(held.position for held in self._unacknowledged)}
 
     def start_over(self) -> None:

@@ -25,7 +25,7 @@ Life = tuple[int, int]
 
 
 class Confinements:
-    """Of one process."""
+    """The confinements of one process's threads."""
 
     def __init__(self, interruptions: Interruptions) -> None:
         self._interruptions = interruptions

@@ -98,7 +98,7 @@ class SeenOthers(Struct):
 
     @property
     def pids(self) -> frozenset[int]:
-        """Of all processes, the first one included, as we see them."""
+        """The pids of all processes, the first one included, as we see them."""
         return frozenset(self.opened)
 
     @property
@@ -159,7 +159,7 @@ class SeenOthers(Struct):
         )
 
     def zombies(self, first: Look) -> tuple[Zombie, ...]:
-        """Those that have ended."""
+        """The processes that have ended."""
         inner = self._inner(first)
         return tuple(
             Zombie(
@@ -183,7 +183,7 @@ class SeenOthers(Struct):
 
 
 def _going_on(seen: SeenProcess, continued: Collection[int]) -> tuple[Resource, ...]:
-    """That a process goes on, of which its parent has not been told.
+    """The resource for a process that has continued while its parent has not been told so.
 
     Args:
         continued: the children of which that is known, as the component sees them.
@@ -221,7 +221,7 @@ class CapturedTree:
             process.memory.buffer, process.memory.budget = first.memory.buffer, first.memory.budget
 
     def processes(self) -> tuple[CapturedProcess, ...]:
-        """Those that are followed."""
+        """The processes that are followed."""
         return tuple(self._known.values())
 
     def acknowledge(self, position: Position) -> None:

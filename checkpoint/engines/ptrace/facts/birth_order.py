@@ -189,7 +189,7 @@ def refuse_persons(first: Status, others: Sequence[Person], is_taken: Callable[[
 
 
 def persons(statuses: Sequence[Status]) -> list[Person]:
-    """All of these processes, but for what they are known by outside of their namespace."""
+    """All of these processes, by the numbers of their own namespace."""
     inner = {status.pids[0]: status.pids[-1] for status in statuses}
     return [Person(one.pids[-1], inner.get(one.ppid, 0), one.pgids[-1], one.sids[-1]) for one in statuses]
 
@@ -211,7 +211,7 @@ def _wanted(person: Person) -> Wanted:
 
 
 def _wanted_of(first: Person, others: Sequence[Person]) -> Iterator[Wanted]:
-    """Of all but the first, and of leaders that have ended."""
+    """The wanted states of all but the first, and of leaders that have ended."""
     yield from map(_wanted, others)
     there = {first.sid, first.pid, *(one.pid for one in others)}
     yield from (Wanted(session, 0, session) for session in sorted({one.sid for one in others} - there))
@@ -288,7 +288,7 @@ class _Plan(Struct):
         return next(iter(older), None)
 
     def _sessions_of_ancestors(self, person: Person) -> set[int]:
-        """Those that a process was born in, unless it was given to its parent later."""
+        """The sessions that a process was born in, unless it was given to its parent later."""
         found = set()
         while person.ppid in self._everybody:
             person = self._everybody[person.ppid]

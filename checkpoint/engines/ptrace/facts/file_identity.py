@@ -61,7 +61,7 @@ class Identities:
         self._without_name: dict[tuple[int, int, str], tuple[int, frozenset[int]]] = {}
         self._found = Memo[tuple[Vma, ...]]()
         self._sees_sizes = False
-        """Of a shared object that is mapped nothing tells the size but itself."""
+        """Whether sizes are read: only a mapped shared object itself tells its size."""
 
     def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
         """The mappings as the model has them.

@@ -33,7 +33,7 @@ CAPABILITIES: Final = (
 )
 
 COPIES: Final = 2
-"""Of everything, in a keeper that takes a base: as it was read, and in the order of the snapshot."""
+"""A keeper that takes a base holds everything twice: as it was read, and in the order of the snapshot."""
 
 GB: Final = 10**9
 _KIB: Final = 1024

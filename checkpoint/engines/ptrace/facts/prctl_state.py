@@ -47,7 +47,7 @@ NAMES: Final = {
 """Every switch that is kept, in the order in which they are set: the last one forbids what a restore itself does."""
 
 OF_THREADS: Final = (PR_SET_TSC, PR_MCE_KILL, PR_SET_SPECULATION_CTRL)
-"""Those that each thread has for itself. All are given what the first one has."""
+"""Switches that each thread has for itself. A restore gives all threads the first one's."""
 
 Switch = tuple[int, int, int]
 

@@ -160,7 +160,7 @@ def _compare(
     digest_of: DigestOf = digest_of_file,
     content_at: ContentAt | None = None,
 ) -> tuple[tuple[str, ...], Brought]:
-    """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it.
+    """Everything in which this machine differs from the snapshot's needs, one sentence each; and the files brought for it.
 
     Args:
         content_at: None: its memory is not known, nor whether the vdso that it was born with can be led to ours.
@@ -342,13 +342,13 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str],
 
 
 def of_mapped_files(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Why its executable, or what it maps, cannot be had here; and the contents to open for what was brought along, by path."""
+    """Why its executable, or a mapped file, cannot be had here; and the contents to open for files brought along, by path."""
     brought: dict[str, str] = {}
     return tuple(_of_files(state, options, brought, digest_of_file)), brought
 
 
 def _content(options: RestoreOptions, digest: bytes, digest_of: DigestOf) -> tuple[str, str]:
-    """The file that was brought with this digest, or "" and what is wrong with it ("" if there is none)."""
+    """The file that was brought with this digest, or "" and its fault ("" if there is no such file)."""
     if not options.contents or len(digest) != DIGEST_SIZE:
         return "", ""
     path = str(path_in(options.contents, digest))

@@ -179,7 +179,7 @@ def _files_of_several(told: Sequence[Told]) -> Iterator[tuple[FilePlace, Mapped]
 
 
 def _file_of(vma: Vma) -> FilePlace | None:
-    """Of which file a plain mapping is, and where; None: it is not of a file, or not plain."""
+    """The file and place of a plain mapping; None: it is not of a file, or not plain."""
     file = vma.file
     if vma.kind is not VmaKind.FILE or file is None or file.deleted or vma.shared or vma.guards:
         return None
@@ -202,7 +202,7 @@ def _whole(parts: Iterable[Words]) -> Words:
 
 
 class _Part(Struct, frozen=True):
-    """Of one sort of memory: see `Inheritance`; legacies by the process."""
+    """The inheritance of one sort of memory: see `Inheritance`; legacies by the process."""
 
     regions: Words
     sources: tuple[tuple[Told, NDArray[np.intp], Words], ...]

@@ -311,7 +311,7 @@ def _map(table: CallTable, vma: Vma, protection: int, descriptor: int) -> None:
 
 
 def first_protection(vma: Vma, carried: Carried) -> int:
-    """That of a mapping while its pages are written: `settle` gives it its own.
+    """The protection of a mapping while its pages are written: `settle` gives it its own.
 
     No instruction runs there by then: a processor whose caches do not see what is written among instructions (aarch64) is told
     by the kernel when a page becomes one of instructions, and not when it is written to afterwards.
@@ -412,7 +412,7 @@ def _write(memory: Memory, carried: Words, content: Buffer, filled: Words, threa
 
 
 def _cut(whole: Words, mapped: Words) -> Iterator[tuple[bool, Words]]:
-    """Pages in order, as few pieces as there are changes between what is in a set and what is not."""
+    """Pages in order, in as few pieces as there are changes between pages in a set and others."""
     if page_set.covers(mapped, whole):
         yield True, whole
         return

@@ -113,7 +113,7 @@ class Estate(Struct, frozen=True):
 
 
 def options_for(state: Snapshot) -> int:
-    """Those with which a vessel is traced; its children are traced with the same."""
+    """The options with which a vessel is traced; its children are traced with the same."""
     confined = any(seccomp.is_confined(one.resources) for one in state.processes)
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
@@ -273,7 +273,7 @@ class ProcessRestore:
         self._complete(later)
 
     def _carried(self) -> Sequence[PageRun] | Words:
-        """Of which pages there is content: what they lie in must be writable until it is there."""
+        """The pages with content: their mappings must be writable until it is there."""
         return self._state.runs
 
     def _choose_place(self, mappings: tuple[procfs.MapsLine, ...]) -> int:

@@ -30,7 +30,7 @@ _MM_MAP: Final = struct.Struct("<12Q2I")
 SS_ONSTACK: Final = 1
 
 DIRECTORY_MODE: Final = 0o755
-"""Of a working directory that is missing; the umask takes from it."""
+"""The mode of a working directory that was missing; the umask takes bits from it."""
 
 RLIM_INFINITY: Final = (1 << 64) - 1
 RAISED_LIMITS: Final = (1, 2, 7, 8, 9)

@@ -157,7 +157,7 @@ def held_of_objects(vmas: Iterable[Vma], held: Words) -> dict[Object, Words]:
 
 
 def _ours(vmas: Iterable[Vma]) -> list[Vma]:
-    """Those that a restore maps, in address order."""
+    """The mappings that a restore makes, in address order."""
     return sorted((vma for vma in vmas if vma.kind not in KERNEL_KINDS), key=lambda vma: vma.start)
 
 
