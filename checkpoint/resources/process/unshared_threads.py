@@ -121,7 +121,8 @@ class ThreadTables:
             except ProcessGoneError:
                 continue
             except (ProbeError, OSError) as error:
-                raise CaptureError(f"cannot look into thread {tid} of pid {self._pid}: {in_words(error)}") from error
+                whose = f"thread {tid} of pid {self._pid}"
+                raise CaptureError(f"cannot look at the directories and open files of {whose}: {in_words(error)}") from error
             self._told[tid] = _Told(fact, tuple(reasons))
 
     def describe(self) -> tuple[Resource, ...]:
