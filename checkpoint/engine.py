@@ -107,7 +107,7 @@ class Carry(Struct, frozen=True):
     Attributes:
         paths: of files, and of folders with all that is in them; absolute.
         size_max: bytes that they may hold together.
-        places: (path in a snapshot, path on this robot) of those that are laid down elsewhere here.
+        places: (path in a snapshot, path on this robot) of those that this robot lays down at another path.
     """
 
     paths: tuple[str, ...] = ()

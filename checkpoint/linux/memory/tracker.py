@@ -107,7 +107,7 @@ def is_private(line: MapsLine) -> bool:
 def is_orphan(line: MapsLine) -> bool:
     """Whether it is a private mapping of a file that has no name any more, as after a package was upgraded.
 
-    Its unchanged pages cannot be had from the file on the other side: all of them are carried, and compared as shared ones are.
+    The other robot has no file with its unchanged pages: all of them are carried, and compared as shared ones are.
     """
     return not line.shared and line.has_file and line.name.endswith(procfs.DELETED)
 

@@ -80,7 +80,7 @@ class InUseError(CannotCarryError):
 
 
 class Kept(Struct, frozen=True):
-    """Everything that must be known of a connection to take it up elsewhere.
+    """All facts of a connection that another machine needs to take it up.
 
     Attributes:
         state: of tcp(7).

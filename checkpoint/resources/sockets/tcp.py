@@ -93,7 +93,7 @@ PEERS_TOLD: Final = 3
 """Peers that one sentence names, of those whose connections are reset."""
 
 TAKEN: Final = "carried"
-"""Everything that must be known of a connection to take it up elsewhere."""
+"""All facts of a connection that another machine needs to take it up."""
 MAY_MOVE: Final = "may_move"
 """Present of one that is taken along where the program is handed over."""
 LEFT: Final = "left"

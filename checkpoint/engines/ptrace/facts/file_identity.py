@@ -107,7 +107,7 @@ class Identities:
         )
 
     def _is_told(self, line: MapsLine) -> bool:
-        """Whether it must be told which shared memory without a file this is: it is mapped elsewhere, too."""
+        """Whether the snapshot must tell which shared memory without a file this is: it is mapped in other places, too."""
         return line.shared and (bool(self.kin) or line.inode in self._mapped_twice)
 
     def of_mapping(self, line: MapsLine, living: str = "") -> FileIdentity:
@@ -160,7 +160,7 @@ class Identities:
         return self._pid, *sorted(self.kin - {self._pid})
 
     def _place(self, line: MapsLine) -> str:
-        """Where the very file that is mapped is read: its name may lead elsewhere by now, to what we may read and it may not."""
+        """A path to the very file that is mapped: its name may lead by now to another file, which we may read and it may not."""
         is_detached = (line.device, line.inode) in self.detached
         named = f"{procfs.outlook(self._pid)}{line.name.removesuffix(DELETED) if is_detached else line.name}"
         with contextlib.suppress(OSError):  # it is gone, or closed to us

@@ -76,7 +76,7 @@ def refuse_capture(pids: Iterable[int]) -> tuple[str, ...]:
 
 
 def refuse_restore(state: Snapshot) -> tuple[str, ...]:
-    """Why a base of several processes cannot be brought back here."""
+    """Why a base of several processes cannot be restored here."""
     if not state.copies:
         return ()
     size, room = len(memoryview(state.contents).cast("B")) + sum(copy.size for copy in state.copies), free()

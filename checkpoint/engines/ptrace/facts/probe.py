@@ -265,7 +265,7 @@ def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept
     for reason in refusals.refuse_process(pid, status, kin, files_kept=files_kept, detaches_memory=detaches):
         yield Finding("process", f"pid {pid}", REFUSED, reason)
     if status.ppid and len(status.pids) == 1:
-        text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"
+        text = "its PID is kept where it is free on the other robot: failover run gives a program a PID namespace of its own"
         yield Finding("process", f"pid {pid}", NOTED, text)
 
 

@@ -198,7 +198,7 @@ def map_anonymous(table: CallTable, sizes: Mapping[Object, int], place: int) -> 
 
 
 def is_anonymous_object(vma: Vma) -> bool:
-    """Whether it is shared memory without a file, of which it is told which: it is mapped elsewhere, too."""
+    """Whether it is shared memory without a file whose identity the snapshot tells: it is mapped in other places, too."""
     return vma.kind is VmaKind.ANONYMOUS and vma.shared and vma.file is not None
 
 

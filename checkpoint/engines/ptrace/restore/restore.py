@@ -38,7 +38,7 @@ from checkpoint.store.base_on_disk import StoredBase
 
 
 class RestoredProgram(Struct):
-    """A program that was brought back; see ``checkpoint.engine.Restored``.
+    """A restored program; see ``checkpoint.engine.Restored``.
 
     Attributes:
         threads: all of its first process; they stand still for us until `resume`.
