@@ -13,7 +13,7 @@ from checkpoint.model import Resource
 from checkpoint.sentences import near
 
 RULES_MAX: Final = 256
-"""Rules of one component: each is looked at for each device that it has open."""
+"""Rules of one component at most: we look at each rule for each device that it has open."""
 RULES: Final = ("reopen", "hook", "optional")
 """As an operator says them."""
 KIND: Final = "attached_devices"

@@ -67,7 +67,7 @@ FILES: Final = 65536
 """Descriptors that it may have, as its unit says."""
 
 COLLECTED_AFTER: Final = 128
-"""Requests after which what holds itself is looked for, and memory that is free goes back: 4 ms, every few seconds."""
+"""Requests after which we collect objects that refer to each other, and give free memory back: 4 ms, every few seconds."""
 
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
@@ -80,7 +80,7 @@ class _Encoded(msgspec.Struct, frozen=True):
     """A capture as bytes.
 
     Attributes:
-        snapshot: its pages are of no account any more.
+        snapshot: its pages are not used any more.
         size: bytes of the file; ``dirty_bytes``: of the pages in it; ``known_bytes``: of those told as differences.
         descriptors: the file, where the request brought none.
     """

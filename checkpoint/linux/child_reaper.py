@@ -22,7 +22,7 @@ from typing import Final
 from checkpoint.linux import abi
 
 PERIOD_NS: Final = 10_000_000
-"""How long seizing may take before it is looked for the dead, and how often then: usually it takes a microsecond a thread."""
+"""How long seizing may take before we look for ended threads, and how often then: usually it takes a microsecond a thread."""
 
 
 def bury(tid: int) -> bool:

@@ -151,7 +151,7 @@ class Recollection:
             if known.asking is None:
                 try:
                     subject = _subject(known.facts, known.groups)
-                except OSError:  # we have no descriptor left: it is looked into, and that says why not
+                except OSError:  # we have no descriptor left: the look into it reports the cause
                     continue
                 self._round = None
                 known.asking = wanted.get(subject) or self._askings.get(subject) or Asking(subject)
@@ -171,10 +171,10 @@ class Recollection:
             self._second = SecondThread.where_it_gains()
 
     def are_plain(self, opened: Opened, is_plain: Callable[[OpenFile], bool]) -> bool:
-        """Whether there is nothing among these to be looked into, nor was; asked once of open files that are the very same.
+        """Whether we need not look into any of these, nor had to before; asked once about open files that are the very same.
 
         Args:
-            is_plain: of one; it follows from what is told of it, which never changes.
+            is_plain: tells it of one; the answer follows from facts of it that never change.
         """
         if self._known or self._pipes:
             return False

@@ -118,7 +118,7 @@ def with_contents(
 
 
 def _is_plain(held: OpenFile) -> bool:
-    """Whether nothing is to be looked into: what its descriptors say is all that there is. It follows from them alone."""
+    """Whether we need not look into it: its descriptors tell everything. The answer follows from them alone."""
     first = held.first
     if held.is_echo or held.lent or held.observed:
         return False

@@ -205,7 +205,7 @@ class Sender:
         return told, len(contents) * page_size
 
     def _count_untaken(self) -> None:
-        """Another one is to be told: was the last one taken?"""
+        """Count the last delta as not taken, if it is not acknowledged when the next one is told."""
         if self._is_differing:
             self._is_differing = False
             self._whole, self._pause = self._pause, min(max(2 * self._pause, 1), WHOLE_MAX)

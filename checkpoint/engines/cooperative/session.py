@@ -324,7 +324,7 @@ def describe_process(pid: int) -> ProcessState:
     """The state of a program whose memory is not carried: its identity and how it was started.
 
     Args:
-        pid: by which it is looked at (`checkpoint.linux.procfs.live_thread`).
+        pid: the id by which we look at it (`checkpoint.linux.procfs.live_thread`).
 
     Raises:
         ProcessGoneError: it ended.
@@ -353,7 +353,7 @@ def open_segment(pid: int) -> SegmentReader:
     """The segment that a process commits to, found among its descriptors.
 
     Args:
-        pid: by which it is looked at (`checkpoint.linux.procfs.live_thread`).
+        pid: the id by which we look at it (`checkpoint.linux.procfs.live_thread`).
 
     Raises:
         CaptureError: it has none, or several, or is another user's.

@@ -227,7 +227,7 @@ class PageScanner:
         return Private(pages_joined(extents[present]), swapped, pages_joined(extents[written]))
 
     def are_present(self, ranges: Words) -> bool:
-        """Whether every page of a set is in memory and the process's own; cheaper than to be told which are, as `private`."""
+        """Whether every page of a set is in memory and the process's own; cheaper than `private`, which tells which are."""
         others = abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard
         question = Question(abi.PAGE_IS_PRESENT, 0, abi.PAGE_IS_PRESENT | others, abi.PAGE_IS_PRESENT)
         return not any(any(self._asked(question, batch, limit=1).counts[: len(batch)].tolist()) for batch in _batches(ranges))

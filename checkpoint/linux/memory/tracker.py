@@ -43,7 +43,7 @@ class Tracker(Protocol):
     Attributes:
         cost: what following with it costs a program, a clause.
         sees_every_write: a page that was changed and changed back counts as written. Otherwise a copy that was made between two
-            scans is of no use.
+            scans cannot be used.
         scans_running: `backlog` and `catch_up` are there.
     """
 

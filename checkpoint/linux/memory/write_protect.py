@@ -164,7 +164,7 @@ class PagemapTracker:
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.catch_up`.
 
-        1. Protection is renewed before it is looked which pages exist: one that comes or is written later is in the next scan.
+        1. We renew the protection before we look which pages exist: one that comes or is written later is in the next scan.
         2. A mapping that goes, or is put in the place of another one, loses its registration: the next scan finds it fresh.
         3. One that does so in the middle of the scan makes the kernel break off, and pages before it may have been protected
            without being told: they are ``_doubtful``, and the next scan finds them, written or not.

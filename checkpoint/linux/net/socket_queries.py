@@ -108,7 +108,7 @@ def _tagged(part: int, offset: int) -> int:
 
 
 class Questions(Struct, frozen=True, eq=False):
-    """All that is asked of sockets of one kind.
+    """All questions to sockets of one kind.
 
     Attributes:
         words: the rows, with offsets instead of addresses.

@@ -209,7 +209,7 @@ class KeptTexts:
         return self._anew(number, links, texts, link, about)
 
     def _anew(self, number: int, links: int, texts: int, link: bytes | None, about: bytes | None) -> Descriptor | None:
-        """Understand it; it is known from then on if just what must be asked of it was asked at this look, and answered."""
+        """Understand it; it is known from then on if this look asked exactly the questions that it needs, and got answers."""
         self._known.pop(number, None)
         self._is_known = False
         standing = standing_of(number, links, texts)

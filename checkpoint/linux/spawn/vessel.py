@@ -57,7 +57,7 @@ _REPORT_LIMIT: Final = 65536
 """Bytes of all reports of one birth; a few hundred are usual."""
 
 _REST_S: Final = 0.001
-"""Before it is looked again whether a process that was killed has ended."""
+"""The pause before we look again whether a killed process has ended."""
 
 
 class Birth(Struct, frozen=True):

@@ -31,10 +31,10 @@ AT_FDCWD: Final = -100
 
 _LOWEST_ADDRESS: Final = 0x10000000000
 _HIGHEST_ADDRESS: Final = 0x7000_0000_0000
-"""Where a hole is looked for: above every non-PIE program, below where the kernel maps libraries."""
+"""The range in which we look for a hole: above every non-PIE program, below the kernel's place for libraries."""
 _STEP: Final = 1 << 36
 _WIDTH: Final = 47
-"""Bits of the smallest address space of which that holds; in a smaller one it is looked for at the same parts of it."""
+"""Bits of the smallest address space for which that holds; in a smaller one we look at the same fractions of it."""
 
 
 class Call(Struct, frozen=True):

@@ -133,7 +133,7 @@ class Threads:
 
     @property
     def pid(self) -> int:
-        """By which the process is looked at (`checkpoint.linux.procfs.live_thread`)."""
+        """The id by which we look at the process (`checkpoint.linux.procfs.live_thread`)."""
         return self.leader.pid
 
     def _count(self) -> int:

@@ -281,7 +281,7 @@ class Tracee:
         return not stop.is_delivery
 
     def _standing(self) -> Stop | None:
-        """As `reported`, but of its end no note is taken: it may be our child, for which another part of this process waits."""
+        """As `reported`, without taking note of its end: it may be our child, for which another part of this process waits."""
         options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT | abi.WALL
         try:
             found = os.waitid(os.P_PID, self.pid, options)

@@ -230,9 +230,9 @@ class MemoryCapture:
         """Copy beforehand what is worth it, so that little is left for the freeze.
 
         Args:
-            copied: of this capture, before a freeze that came to nothing: it is carried on.
-            enough: the pages that may be left, which are copied down to however many passes that takes as long as they catch up
-                with the program; 0: as few as is worth it.
+            copied: the copy of this capture before a failed freeze: this call goes on with it.
+            enough: the number of pages that may be left. Passes go on until no more are left, as long as they catch up with the
+                program; 0: until another pass is not worth it.
         """
         self.refresh()
         is_again = copied is not None and copied.start == self._start

@@ -95,7 +95,7 @@ class CapturedProcess:
     """One process, followed from the entering to `close`.
 
     Attributes:
-        pid: by which it is looked at: its own, or its spokesman's, where its first thread has ended.
+        pid: the id by which we look at it: its own, or its spokesman's, where its first thread has ended.
         ended_first: tells the state of a first thread that has ended; None where it lives.
         slot: see `checkpoint.snapshot.process_tree`.
         born: when it began, which tells it from a later process with its pid.
@@ -150,7 +150,7 @@ class CapturedProcess:
         raise CaptureError(f"cannot enter pid {pid}: its threads end while failover examines it; try again")
 
     def has_lost_its_voice(self) -> bool:
-        """Whether the thread by which it is looked at has ended, and another lives by which it could be.
+        """Whether the thread by which we look at it has ended, and another one lives that can take its place.
 
         Where the first thread lives again, a spokesman has executed another program under its process's id.
 

@@ -240,7 +240,7 @@ class PtraceSession:
                 epoch_variable.renew(process.threads.leader.memory, stat.env_start, stat.env_end, epoch)
 
     def _speaks_by_another(self) -> bool:
-        """Where the thread has ended by which the first process is looked at, enter it by another: the next capture is a base.
+        """Enter the first process by another thread if the one by which we look at it has ended: the next capture is a base.
 
         Raises:
             UnsupportedError: it cannot be kept so (before Linux 6.9, or one of several processes); nothing was touched.
@@ -316,7 +316,7 @@ class PtraceSession:
         """The copy of the first process before the freeze; the tree keeps those of the others.
 
         Args:
-            copied: before a freeze that came to nothing.
+            copied: the copy before a failed freeze.
         """
         enough = self._enough()
         self._first.memory.readers = parallel.thread_count() if order.hold else 1  # it is not to run on by itself

@@ -215,7 +215,7 @@ class CapturedTree:
         self._met.clear()
 
     def follow(self, first: CapturedProcess) -> None:
-        """The first process is looked at anew."""
+        """Use a new object for the first process, which was entered anew."""
         self._first = first
         for process in self._known.values():
             process.memory.buffer, process.memory.budget = first.memory.buffer, first.memory.budget

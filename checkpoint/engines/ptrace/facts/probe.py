@@ -121,7 +121,7 @@ def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, .
     """The living processes of a component and their open files; looked up again where some came or went meanwhile.
 
     Args:
-        first: by which that of ``pid`` is looked at; it stands for it.
+        first: the id by which we look at the process ``pid``; it stands for that.
     """
     stubborn: set[int] | None = None
     for _ in range(LOOKS):
