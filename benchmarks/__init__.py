@@ -1,1 +1,1 @@
-"""What it costs, measured: ``python -m benchmarks`` (see `__main__`)."""
+"""The costs, measured: ``python -m benchmarks`` (see `__main__`)."""

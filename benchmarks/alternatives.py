@@ -1,4 +1,4 @@
-"""What a user would pick instead of us for one image of a process: gcore and CRIU, as their manuals say to call them."""
+"""Alternatives to us for one image of a process: gcore and CRIU, called as their manuals say."""
 
 from __future__ import annotations
 
@@ -115,5 +115,5 @@ def size_of(directory: Path) -> int:
 
 
 def tell(text: str) -> None:
-    """What is going on, for whoever waits."""
+    """Tell the user that waits about progress."""
     print(f"  {text}", file=sys.stderr, flush=True)

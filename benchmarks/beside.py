@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Observed:
-    """What was seen of one snapshot after another by the same maker."""
+    """Figures of one snapshot after another by the same maker."""
 
     stops_ms: list[float] = field(default_factory=list)
     walls_ms: list[float] = field(default_factory=list)
@@ -59,8 +59,8 @@ def beside(quick: bool, directory: Path) -> Findings:
         "One more snapshot, beside what a user would pick instead",
         f"A program with random memory of the given size writes {DIRTY_KB} KB of it anew each 50 ms and reads its clock without "
         "a pause; the longest time between two readings is what it felt. Ours is a delta, the others write the whole program "
-        f"again each time. “{NOBODY}”: no snapshot at all, what the machine itself does to it. The memory that an image takes "
-        "has been in use just before, whoever makes it: on a virtual machine the first use of memory takes its host's time.",
+        f"again each time. “{NOBODY}”: no snapshot at all, only the machine's own delays. The memory that an image takes "
+        "has been in use just before, for every maker: on a virtual machine the first use of memory takes its host's time.",
         tuple(sorted(figures, key=lambda figure: SEEN.index(figure.benchmark))),
         absent,
     )

@@ -1,4 +1,4 @@
-"""What a put and a get of an item of the board cost a program in C, beside bare copies of shared memory."""
+"""The cost of a put and a get of an item of the board for a program in C, beside bare copies of shared memory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CASES: Final = {
     "get of a robot by its name": ("get of another robot", OURS),
     "clock_gettime": ("the clock alone", OURS),
 }
-"""What the program measures: case, and who."""
+"""The program's measurements: case, and maker."""
 
 
 def board_in_c(quick: bool, directory_: Path) -> Findings:

@@ -1,4 +1,4 @@
-"""What protection takes: of the program's work at 1, 10 and 50 snapshots a second, of processor, network and memory."""
+"""The cost of protection: of the program's work at 1, 10 and 50 snapshots a second, of processor, network and memory."""
 
 from __future__ import annotations
 

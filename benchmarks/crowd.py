@@ -1,4 +1,4 @@
-"""What one more thread, descriptor of each kind, and carried file adds to the time that a program stands still."""
+"""The time that one more thread, descriptor of each kind, and carried file adds to the freeze of a program."""
 
 from __future__ import annotations
 

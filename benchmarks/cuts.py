@@ -101,7 +101,7 @@ def cuts(quick: bool, directory: Path) -> Findings:
 
 
 def _beside(quick: bool, directory: Path, figures: list[Figure]) -> tuple[Absent, ...]:
-    """What moves an address alone, put in after ours; or why it was not measured."""
+    """Add the figures of a program that moves an address alone after ours; or tell why it was not measured."""
     if why := keepalived.why_absent():
         return (Absent(keepalived.WHO, why),)
     ours = CASES[0]
@@ -160,7 +160,7 @@ def _cut(case: Case, directory: Path) -> Cut | None:
 
 
 def _story(standby: RobotMachine) -> list[dict[str, Any]]:
-    """What the standby tells, once it tells that the program goes on: that may come after its output."""
+    """The standby's event log, once it tells that the program has resumed: that may come after the program's output."""
     deadline = time.monotonic() + PATIENCE_S
     with standby.control() as link:
         while True:

@@ -55,7 +55,7 @@ class Way:
 
 
 def encoding(quick: bool, directory: Path) -> Findings:
-    """A base and a delta of a Python program's heap, packed and unpacked by everybody."""
+    """A base and a delta of a Python program's heap, packed and unpacked in every way."""
     cells = CELLS // 4 if quick else CELLS
     base, delta, before = _snapshots(cells, directory)
     figures: list[Figure] = []
@@ -157,7 +157,7 @@ def _changes_only(delta: Snapshot, before: Pages) -> Way:
 
 
 def _of_objects(cells: int) -> Way:
-    """What a program does that saves itself: all its objects, each time."""
+    """The way of a program that saves itself: all its objects, each time."""
     found = heap.cells(cells, random.Random(1))
     return Way(
         "pickle of the program's objects, gzip, level 1",
@@ -168,7 +168,7 @@ def _of_objects(cells: int) -> Way:
 
 def _measured(way: Way, case: str) -> list[Figure]:
     """Times of packing and of unpacking, and the size."""
-    packed = way.pack()  # once for nothing, so that everybody is warm
+    packed = way.pack()  # once without measuring, so that every way is warm
     packing, unpacking = _times(way.pack), _times(lambda: way.unpack(packed))
     return [
         Figure("packing", case, "ms", packing, way.who),

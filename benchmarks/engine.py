@@ -36,7 +36,7 @@ PERIOD_S = 0.05
 
 
 def freeze(quick: bool, directory: Path) -> list[Figure]:
-    """What the program feels: how long it stands still for the first base and for each delta."""
+    """The delay that the program feels: how long it stands still for the first base and for each delta."""
     found = []
     for megabytes, dirty_kb, count in QUICK_CASES if quick else CASES:
         found += _freeze_of(megabytes, dirty_kb, count, directory)

@@ -16,7 +16,7 @@ class Figure:
     """One case of one benchmark; ``values`` in ``unit``, in the order they were measured.
 
     Attributes:
-        who: what was measured: `OURS`, or an alternative in the same case.
+        who: the maker that was measured: `OURS`, or an alternative in the same case.
     """
 
     benchmark: str
@@ -41,11 +41,11 @@ class Absent:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What one benchmark found.
+    """The results of one benchmark.
 
     Attributes:
         title: heading of its table.
-        story: one paragraph: what was measured, and how.
+        story: one paragraph about the measurement.
         stolen: of the cores' time meanwhile, the share that the host of a virtual machine gave to others.
     """
 

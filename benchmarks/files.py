@@ -80,7 +80,7 @@ def _ours(pid: int, image: Path) -> Times:
 
 
 def _ready(pid: int, image: Path) -> Times:
-    """What the commands order, without their start."""
+    """The times of the commands' work, without their start."""
     file = image / "snapshot"
     with Keeper.spawn() as keeper:
         engine.wait_until_ready(keeper)
@@ -130,7 +130,7 @@ def _failover(*words: str) -> None:
 
 
 def _end_stranger(pid: int) -> None:
-    """End what was brought back under its old PID, which is nobody's child of ours."""
+    """End the program that was restored under its old PID: it is no child of ours."""
     os.kill(pid, signal.SIGKILL)
     wait_until_gone(pid)
 

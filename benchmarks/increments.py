@@ -1,4 +1,4 @@
-"""What one more snapshot costs by how much was written since the last one, and by how much there is, beside a full copy."""
+"""The cost of one more snapshot by the bytes written since the last one, and by all bytes, beside a full copy."""
 
 from __future__ import annotations
 

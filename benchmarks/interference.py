@@ -1,4 +1,4 @@
-"""What protection costs the protected program, and what a large snapshot costs the beats."""
+"""The cost of protection for the protected program, and of a large snapshot for the beats."""
 
 from __future__ import annotations
 

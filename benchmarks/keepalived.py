@@ -151,7 +151,7 @@ def _watched(namespace: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def _instant(watch: subprocess.Popen[str], directory: Path) -> float:
-    """What it says, seconds since 1970.
+    """The instant that it tells, seconds since 1970.
 
     Raises:
         BenchmarkError: it says nothing in time.

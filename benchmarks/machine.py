@@ -61,7 +61,7 @@ def ticks() -> Ticks:
 
 
 def facts(share: float) -> dict[str, str]:
-    """What a reader needs to know before comparing; ``share`` is what `busy_share` found."""
+    """The facts that a reader needs before comparing; ``share`` is the result of `busy_share`."""
     return {
         "processor": _processor(),
         "cores": str(os.cpu_count()),
@@ -77,7 +77,7 @@ def facts(share: float) -> dict[str, str]:
 
 
 def busy_share() -> float:
-    """The part of all cores' time that somebody used during the last `WATCHED_S`; we only wait."""
+    """The part of all cores' time that other programs used during the last `WATCHED_S`; we only wait."""
     before = ticks()
     time.sleep(WATCHED_S)
     passed = ticks() - before
@@ -85,24 +85,24 @@ def busy_share() -> float:
 
 
 def warning(share: float) -> str:
-    """What to say when the machine is not quiet; "" when it is."""
+    """The warning when the machine is not quiet; "" when it is."""
     if share <= BUSY_SHARE:
         return ""
     return f"{share:.0%} of this machine's time goes to something else: the figures are worse than those of a quiet machine"
 
 
 def touch_memory(megabytes: int) -> None:
-    """Use so much memory and give it back, so that the kernel has it at hand for whoever is measured next.
+    """Use so much memory and give it back, so that the kernel has it at hand for the next measurement.
 
     A virtual machine gets memory from its host when it is first written to, and gives back what lies idle for some seconds. That
-    takes the host's time (2 ms a MB on one that we saw), and is none of what is measured.
+    takes the host's time (2 ms a MB on one that we saw), and is no part of the measurement.
     """
     with mmap.mmap(-1, megabytes << 20, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as room:
         np.frombuffer(room, dtype=np.uint8)[:: mmap.PAGESIZE] = 1
 
 
 def images_place() -> Path:
-    """Where images go: a memory file system where there is room, so that nobody is measured by a disk."""
+    """Where images go: a memory file system where there is room, so that a disk does not change the figures."""
     try:
         roomy = shutil.disk_usage(SHARED_MEMORY).free >= IMAGES_SIZE
     except OSError:
@@ -135,7 +135,7 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    """What is measured; nobody knows where there is no checkout, or no git."""
+    """The commit that is measured; unknown where there is no checkout, or no git."""
     try:
         ran = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
     except FileNotFoundError:

@@ -124,7 +124,7 @@ def _sent(robot: RobotMachine) -> int:
 
 
 def _story(both: list[RobotMachine], began: float) -> list[str]:
-    """What either decided since."""
+    """The decisions of both since then."""
     found: list[dict[str, Any]] = []
     for robot in both:
         with robot.control() as link:

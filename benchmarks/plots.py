@@ -31,7 +31,7 @@ COLOURS: Final = {
     "nobody": "#bdbdbd",
     "unprotected": "#bdbdbd",
 }
-"""Who has a colour of his own everywhere."""
+"""Makers that have a colour of their own everywhere."""
 
 
 def figures_of(record: Path) -> list[Figure]:
@@ -128,7 +128,7 @@ def _increments(axes: Axes, figures: Sequence[Figure]) -> bool:
 
 
 def _sent(axes: Axes, figures: Sequence[Figure]) -> bool:
-    """What a snapshot sends over what was written, beside a full copy of as much memory."""
+    """The bytes that a snapshot sends by the bytes written, beside a full copy of as much memory."""
     found = sorted((figure for figure in figures if figure.benchmark == increments.SENT_OF_ONE), key=_megabytes)
     if found:
         ours = [figure for figure in found if figure.who == OURS]
@@ -193,7 +193,7 @@ def _per_thing(axes: Axes, figures: Sequence[Figure]) -> bool:
 
 
 def _soaked(axes: Axes, figures: Sequence[Figure], measured: str) -> bool:
-    """What each process had, over the time."""
+    """The figure of each process, over the time."""
     found = [figure for figure in figures if figure.benchmark == measured]
     when = next((figure.values for figure in figures if figure.benchmark == soak.WHEN), ())
     for figure in found:
@@ -216,7 +216,7 @@ def _soaked_descriptors(axes: Axes, figures: Sequence[Figure]) -> bool:
 
 
 def _work(axes: Axes, figures: Sequence[Figure]) -> bool:
-    """What is left of the program's work, by snapshots a second."""
+    """The share of the program's work that is left, by snapshots a second."""
     work = {(figure.case, figure.who): figure for figure in figures if figure.benchmark == "work done a second"}
     cases = [case for case, who in work if who == OURS and (case, "unprotected") in work]
     shares = [work[case, OURS].median / work[case, "unprotected"].median * 100 for case in cases]

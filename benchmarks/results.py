@@ -29,7 +29,7 @@ def page(command: str, facts: Mapping[str, str], warning: str, findings: Sequenc
 
 
 def section(found: Findings) -> str:
-    """One benchmark: what was measured, the table, who is missing and why."""
+    """One benchmark: its story, its table, and the makers that are missing, with reasons."""
     parts = [f"## {found.title}", found.story]
     parts += [table(found.figures)] if found.figures else []
     if found.stolen >= STOLEN_SHARE:

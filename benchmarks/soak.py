@@ -1,4 +1,4 @@
-"""What grows: descriptors and memory of every process of ours, over hours, with programs of ten kinds.
+"""Growth: descriptors and memory of every process of ours, over hours, with programs of ten kinds.
 
 python -m benchmarks soak --for 2h --output benchmarks/soak      the default; --quick takes two minutes
 python -m benchmarks.plots --record benchmarks/soak/results.json
@@ -28,7 +28,7 @@ SAMPLES: Final = 240
 PERIOD_S_MIN: Final = 5.0
 """Between two of them: to look takes some tenths of a second, too."""
 SETTLED_SHARE: Final = 0.25
-"""Of the time: what is loaded, laid and remembered for the first time does not count as growth."""
+"""Of the time: memory that is loaded, laid and remembered for the first time does not count as growth."""
 PATIENCE_S: Final = 300.0
 POLL_S: Final = 0.2
 
@@ -169,7 +169,7 @@ def soak(quick: bool, directory: Path, span_s: float | None = None) -> Findings:
 
 @dataclass
 class Samples:
-    """What was seen, by whose it was: for every sample a number, nan where there was none."""
+    """The samples, by process: for every sample a number, nan where there was none."""
 
     minutes: list[float] = field(default_factory=list)
     memory: dict[str, list[float]] = field(default_factory=dict)
@@ -285,7 +285,7 @@ def _looked_at(robot: RobotMachine) -> dict[str, tuple[float, float]]:
 
 
 def _opened(pid: int) -> list[str]:
-    """What its descriptors lead to."""
+    """The targets of its descriptors."""
     return [os.readlink(f"/proc/{pid}/fd/{name}") for name in os.listdir(f"/proc/{pid}/fd")]
 
 

@@ -1,4 +1,4 @@
-"""What a commit costs a program that keeps its own state, beside what it would write otherwise: in one run, for the ratios.
+"""The cost of a commit for a program that keeps its own state, beside other ways of writing: in one run, for the ratios.
 
 The others are on the disk when they return; a commit of ours is in shared memory and on its way. `and wait` is the fair one
 to compare for a program that needs to know; the first line is for one that must not be late.
@@ -57,7 +57,7 @@ def task(quick: bool, directory: Path) -> Findings:
         "What a commit costs a Python program that keeps its own state, as the program sees it. Ours is in shared memory when it "
         "returns and on its way to the disk; the others are on the disk, as ours is after wait_committed. Then the same in a "
         "loop that computes for about half a millisecond before each commit and pauses for 2 ms after it: with the thread that "
-        "writes the file beside it, with nobody, and at a robot whose agent takes its commits to another one.",
+        "writes the file beside it, with no reader, and at a robot whose agent takes its commits to another one.",
         tuple(figures),
     )
 

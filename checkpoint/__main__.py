@@ -16,7 +16,7 @@ def main() -> int:
 
 def run(words: list[str]) -> int:
     """Load and run the keeper."""
-    gc.disable()  # of what is loaded nothing is rubbish, and what captures make is freed by counting
+    gc.disable()  # nothing that is loaded is rubbish, and reference counting frees what captures make
     from checkpoint.runtime import allocator, slim_imports
 
     allocator.be_frugal()

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 
 class Verdict(StrEnum):
-    """What becomes of a kind."""
+    """The result for a kind."""
 
     PRESERVED = "preserved"
     BY_RULE = "by rule"
@@ -21,7 +21,7 @@ class Verdict(StrEnum):
 
 
 class Area(StrEnum):
-    """What a kind is a part of, in the order of the table."""
+    """The area that a kind belongs to, in the order of the table."""
 
     PROCESS = "the process"
     THREADS = "threads"
@@ -39,10 +39,10 @@ class Capability(Struct, frozen=True):
     """One row.
 
     Attributes:
-        kind: what it is, in a few words that a reader of the table would look for.
+        kind: its name, in a few words that a reader of the table would look for.
         sentence: how it comes back, by which rule, or what to do instead.
-        said: a part of each sentence by which the code refuses or notes it, as it stands in the source: ``{}`` for what is filled
-            in.
+        said: a part of each sentence by which the code refuses or notes it, as it stands in the source: ``{}`` for each value
+            that is filled in.
     """
 
     area: Area
@@ -63,5 +63,5 @@ def by_rule(area: Area, kind: str, sentence: str, *said: str) -> Capability:
 
 
 def refused(area: Area, kind: str, sentence: str, *said: str) -> Capability:
-    """A row about what is refused by name, before the program is touched."""
+    """A row about a thing that is refused by name, before the program is touched."""
     return Capability(area, kind, Verdict.REFUSED, sentence, said)

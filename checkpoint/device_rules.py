@@ -13,11 +13,11 @@ from checkpoint.model import Resource
 from checkpoint.sentences import near
 
 RULES_MAX: Final = 256
-"""Rules of one component: each is looked at for each device that it has open."""
+"""Rules of one component at most: we look at each rule for each device that it has open."""
 RULES: Final = ("reopen", "hook", "optional")
 """As an operator says them."""
 KIND: Final = "attached_devices"
-"""Of resources that are kept by these rules."""
+"""The kind of resources that are kept by these rules."""
 
 
 class DeviceRule(Struct, frozen=True):
@@ -27,7 +27,7 @@ class DeviceRule(Struct, frozen=True):
         path: as the operator names it, on every robot; a name that stays, such as one of /dev/serial/by-id, is best.
         action: reopen: it is opened again; hook: the program finds its descriptor hung up, as after unplugging, and opens it
             anew.
-        there: what is opened on this robot in its place; "" for ``path``.
+        there: the path that this robot opens in its place; "" for ``path``.
         optional: where it is missing the program finds it hung up; otherwise it does not run there.
     """
 
@@ -38,7 +38,7 @@ class DeviceRule(Struct, frozen=True):
 
     @property
     def place(self) -> str:
-        """What is opened on this robot."""
+        """The path that this robot opens."""
         return self.there or self.path
 
     def leads_to(self, target: str) -> bool:
@@ -58,7 +58,7 @@ def rules_of(resources: Iterable[Resource]) -> tuple[DeviceRule, ...]:
 
 
 def rule_from(path: str, said: str) -> DeviceRule:
-    """A rule as it is typed: ``reopen``, ``hook``, ``optional``, or the path of what is opened in its place.
+    """A rule as it is typed: ``reopen``, ``hook``, ``optional``, or the path that is opened in its place.
 
     Raises:
         ValueError: it is none, or names no file.
@@ -72,12 +72,12 @@ def rule_from(path: str, said: str) -> DeviceRule:
 
 
 def travelling(rules: Iterable[DeviceRule]) -> tuple[tuple[str, str], ...]:
-    """The rules of one robot as they travel with a component: without what is a place on that robot alone."""
+    """The rules of one robot as they travel with a component: without paths that exist on that robot alone."""
     return tuple((rule.path, "hook" if rule.action == "hook" else "optional" if rule.optional else "reopen") for rule in rules)
 
 
 def arrived(said: Iterable[tuple[str, str]]) -> tuple[DeviceRule, ...]:
-    """The rules that came with a component; what is none counts as none: the device is refused by name then."""
+    """The rules that came with a component. A malformed rule counts as none: the device is refused by name then."""
     found = []
     for path, words in said:
         with contextlib.suppress(ValueError):

@@ -53,7 +53,7 @@ class Finding(Struct, frozen=True):
 
 
 class Report(Struct, frozen=True):
-    """What a capture of one process would preserve, found without touching it.
+    """The things that a capture of one process would preserve, found without touching it.
 
     Attributes:
         command: its arguments, joined by blanks.
@@ -79,7 +79,7 @@ class Report(Struct, frozen=True):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What will differ, one sentence each."""
+        """Differences to come, one sentence each."""
         return tuple(finding.text for finding in self.findings if finding.verdict == NOTED)
 
 
@@ -107,7 +107,7 @@ class Carry(Struct, frozen=True):
     Attributes:
         paths: of files, and of folders with all that is in them; absolute.
         size_max: bytes that they may hold together.
-        places: (path in a snapshot, path on this robot) of those that are laid down elsewhere here.
+        places: (path in a snapshot, path on this robot) of those that this robot lays down at another path.
     """
 
     paths: tuple[str, ...] = ()
@@ -119,7 +119,7 @@ NOTHING_CARRIED: Final = Carry()
 
 
 class Terms(Struct, frozen=True):
-    """What an operator has ruled of what one component holds, for one robot.
+    """The operator's rules for the things that one component holds, for one robot.
 
     Attributes:
         carry: its files that travel with it.
@@ -127,7 +127,7 @@ class Terms(Struct, frozen=True):
         connections: TCP connections with others go along where it goes on from the state in which it stood still for good.
         refuses_connections: a connection with others, of TCP or of unix sockets, stands against a capture; else it ends where the
             program goes on without it.
-        freeze_budget_ns: how long it may stand still for a snapshot, so that what is left to copy then is copied beforehand as
+        freeze_budget_ns: how long it may stand still for a snapshot, so that pages are copied beforehand as
             far as needed; a freeze that would take longer is given up; 0: as short as can be.
         freeze_overrun_ns: when no capture has kept to that for so long, one may take longer; 0: none may.
         owner: with whose rights its files are opened, and beyond whose rights nothing of it is captured: each capture asks again.
@@ -170,8 +170,8 @@ class ProtectOrder(Struct, frozen=True):
     Attributes:
         component: its name.
         streams: the guard's ends of its standard streams, if it lives under a guard; the session owns them from now on.
-        names: of somebody who keeps the program's files by content (`checkpoint.store.content_store`): the paths by which the
-            program knows those that it has from there; snapshots name them so. None: nobody keeps them.
+        names: of a store that keeps the program's files by content (`checkpoint.store.content_store`): the paths by which the
+            program knows those that it has from there; snapshots name them so. None: no store keeps them.
         verb: what the user asked for, as a refusal says it.
     """
 
@@ -197,10 +197,10 @@ def contradiction(carry: Iterable[str], shared: tuple[str, ...]) -> str:
 
 
 class CaptureOrder(Struct, frozen=True):
-    """What the next snapshot is to be.
+    """An order for the next snapshot.
 
     Attributes:
-        base: whole, whatever was acknowledged; a delta is made only when this is False and a position was acknowledged.
+        base: make a base, also after an acknowledgement. A delta needs False here and an acknowledged position.
         generation, sequence: of the position that it gets.
         robot: name of the robot, "" for a one-shot capture.
         hold: leave the program standing still afterwards, until the session is closed.
@@ -228,8 +228,8 @@ class RestoreOptions(Struct, frozen=True):
             has in another version; "": there are none.
         stood_still: nothing of it has run since the capture, so that TCP connections that were taken along can be taken up.
         all_connections: refuse the restore where a TCP connection with another program cannot be taken up; else it is reset.
-        bound: whose rights it gets at most, whatever it asks for (`checkpoint.snapshot.credentials.bounded`); None: what it asks
-            for. The vessel is that user's already, so that the kernel keeps to it, too.
+        bound: whose rights it gets at most, although it may ask for more (`checkpoint.snapshot.credentials.bounded`); None: all
+            that it asks for. The vessel is that user's already, so that the kernel keeps to it, too.
     """
 
     elapsed_ns: int = 0
@@ -262,10 +262,10 @@ class Session(Protocol):
         ...
 
     notes: tuple[str, ...]
-    """What is not as it could be: a fallback that was taken, something that will differ."""
+    """Sentences about a fallback that was taken, or a difference to come."""
 
     def capture(self, order: CaptureOrder) -> Snapshot:
-        """Take one snapshot; the program runs on whatever happens.
+        """Take one snapshot; the program runs on, also when that fails.
 
         Raises:
             ProcessGoneError: it ended.
@@ -280,7 +280,7 @@ class Session(Protocol):
         ...
 
     def acknowledge(self, position: Position) -> None:
-        """A standby holds everything up to ``position``: what was written before it may be forgotten."""
+        """A standby holds everything up to ``position``: the session may forget the pages written before it."""
         ...
 
     def open_file(self, path: str, digest: bytes) -> int:
@@ -306,10 +306,10 @@ LASTING_NOTES: Final = (RESET_NOTE, COPY_NOTE)
 
 
 class Restored(Protocol):
-    """A program that was brought back and stands still until `resume`."""
+    """A restored program, which stands still until `resume`."""
 
     position: Position
-    """Of the snapshot that it stands at."""
+    """The position of the snapshot that it stands at."""
     notes: tuple[str, ...]
 
     @property
@@ -336,7 +336,7 @@ class Copy(Protocol):
     """A ready copy: a stopped process that has a program's mappings and memory. Calls come from the thread that laid it."""
 
     position: Position
-    """That it stands at."""
+    """The position that it stands at."""
 
     @property
     def state(self) -> Snapshot:
@@ -407,7 +407,7 @@ class Engine(Protocol):
         ...
 
     def lacks(self, outline: Snapshot, options: RestoreOptions, digest_of: DigestOf = ...) -> tuple[str, ...]:
-        """What this machine lacks of what a program needs that runs elsewhere, one sentence each; without touching anything.
+        """What this machine lacks for a program that runs on another one, one sentence each; without touching anything.
 
         Args:
             outline: of its newest snapshot (`checkpoint.snapshot.format.read_outline`).

@@ -6,7 +6,7 @@ import contextlib
 from typing import Final
 
 UNDECODABLE: Final = (ValueError, RecursionError)
-"""What msgspec raises for bytes that are no message: its own errors and those of text that is not UTF-8 are `ValueError`s."""
+"""The errors of msgspec for bytes that are no message: its own errors and those of text that is not UTF-8 are `ValueError`s."""
 
 
 class CheckpointError(Exception):
@@ -93,7 +93,7 @@ class SegmentBusyError(SegmentError):
 
 
 class TaskPacketError(CheckpointError):
-    """What came over a task socket is no packet as TASK.md says; nothing of it was used."""
+    """The bytes from a task socket are no packet as TASK.md says; none of them was used."""
 
 
 def let_go(error: BaseException) -> None:

@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from msgspec import Struct, field
 
 Fact = int | str | bytes | bool | float | None | list["Fact"] | dict[str, "Fact"]
-"""One thing that a resource says about itself: whatever msgpack can carry."""
+"""One thing that a resource says about itself: any value that msgpack can carry."""
 
 
 class VmaKind(enum.StrEnum):
-    """What backs a mapping, which decides how it comes back."""
+    """The backing of a mapping, which decides how it comes back."""
 
     ANONYMOUS = "anonymous"
     HEAP = "heap"
@@ -94,7 +94,7 @@ class Vma(Struct, frozen=True):
             "sr"/"rr" read advice, "mg" mergeable, "ht" huge pages, "dp" droppable, "sl" sealed, "mw" may be
             made writable), and two-letter codes of our own
             (`checkpoint.linux.procfs.vm_flags`): "gb" huge pages of 1 GiB, "k1" to "kf" a protection key.
-        guards: pages that MADV_GUARD_INSTALL (madvise(2)) lets nobody touch, in address order; they hold nothing.
+        guards: pages that MADV_GUARD_INSTALL (madvise(2)) makes inaccessible, in address order; they hold nothing.
     """
 
     start: int
@@ -115,7 +115,7 @@ class Vma(Struct, frozen=True):
 
 
 class SignalAction(Struct, frozen=True):
-    """What one signal does (rt_sigaction(2)): the kernel's own four words."""
+    """The action of one signal (rt_sigaction(2)): the kernel's own four words."""
 
     signal: int
     handler: int
@@ -232,7 +232,7 @@ class MemoryLayout(Struct, frozen=True):
 
 
 class ProcessState(Struct, frozen=True):
-    """What belongs to the process as a whole.
+    """The state that belongs to the process as a whole.
 
     Attributes:
         pid: as the program itself sees it (innermost PID namespace).
@@ -277,7 +277,7 @@ class Resource(Struct, frozen=True):
 
     Attributes:
         kind: the file's name there: "files", "devices", "streams" …
-        name: what holds it: for descriptors the number, as "fd 7".
+        name: its holder: for descriptors the number, as "fd 7".
         facts: documented in that file; unknown facts of a newer writer are refused, not ignored.
     """
 

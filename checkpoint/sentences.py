@@ -1,4 +1,4 @@
-"""Parts of sentences for people: what the kernel said, and what was probably meant."""
+"""Parts of sentences for people: the kernel's words, and the name that was probably meant."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 AS_SOON_AS: Final = "failover captures it as soon as"
-"""Begins the cure of what is refused for a moment only: that moment's end follows."""
+"""Begins the cure of a refusal for a moment only: that moment's end follows."""
 
 
 def in_words(error: BaseException) -> str:

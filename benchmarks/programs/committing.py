@@ -4,7 +4,7 @@
 computing took, and the commit; then it sleeps for ever.
 
 CASE: ``small``, a dataclass; ``big``, 1 MB changed inside an array of 100 MB; ``ordinary``, the same, the array handed over in
-the default. HOW: ``kept`` as ever, beside a file or under an agent; ``memory``, no further than shared memory: nobody takes it.
+the default. HOW: ``kept`` as ever, beside a file or under an agent; ``memory``, only shared memory: no reader takes it.
 """
 
 import sys
@@ -70,7 +70,7 @@ def big(is_live: bool) -> tuple[Task, Callable[[], None]]:
 
 
 def work() -> int:
-    """What a program computes between two commits."""
+    """Compute as a program does between two commits."""
     total = 0
     for number in range(WORK):
         total += number & 7
@@ -84,7 +84,7 @@ def main() -> None:
     commit: Callable[[], object] = task.commit if how == "kept" else lambda: task.state.commit(task.value)
     commit()
     if how == "kept":
-        task.wait_committed(60)  # from now on somebody takes them
+        task.wait_committed(60)  # from now on a reader takes them
     lines = []
     for _ in range(int(steps) + WARM_STEPS):
         began = time.perf_counter_ns()

@@ -22,13 +22,13 @@ if TYPE_CHECKING:  # the others have the same names
 __all__ = ["SUPPORTED", "cpu", "extended", "levels", "number_of", "stubs", "why_unsupported"]
 
 KNOWN: Final = ("x86_64", "aarch64")
-"""Those that there are files for, as uname(2) calls them."""
+"""Processors with files here, as uname(2) calls them."""
 UNPROVED: Final[tuple[str, ...]] = ()
-"""Those of them on which not everything has been seen to work yet."""
+"""Processors of `KNOWN` on which some parts are not proved yet."""
 EMULATED: Final = ("aarch64",)
-"""Those of them that were seen to work under software emulation only, no machine being at hand."""
+"""Processors of `KNOWN` that were proved under software emulation only, because no machine was at hand."""
 TRY_UNPROVED: Final = "FAILOVER_TRY_UNPROVED_PROCESSOR"
-"""Variable of the environment by which those who complete one run it; never for a program that matters."""
+"""Variable of the environment with which developers run a processor that is not proved yet; never for a program that matters."""
 SUPPORTED: Final = tuple(name for name in KNOWN if name not in UNPROVED or os.environ.get(TRY_UNPROVED))
 
 EVERY_LEVEL: Final = ("x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4", "armv8-a")
@@ -47,7 +47,7 @@ _NUMBERS: Final[Mapping[str, Mapping[str, int]]] = {
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> ModuleType:
-        """This machine's files, read when somebody needs them: a witness never does."""
+        """This machine's files, read at their first use: a witness never uses them."""
         if name not in _PARTS:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         globals()[name] = found = importlib.import_module(f"{__name__}.{_HERE}{_PARTS[name]}")
@@ -60,9 +60,9 @@ def number_of(call: str) -> int | None:
 
 
 def why_unsupported() -> str:
-    """Why programs that nobody prepared cannot be kept on this kind of processor; "": they can.
+    """Why unmodified programs cannot be kept on this kind of processor; "": they can.
 
-    What this machine's has besides is asked by `checkpoint.linux.spawn.cpuid`.
+    `checkpoint.linux.spawn.cpuid` asks this machine's processor for the rest.
     """
     if _MACHINE in SUPPORTED:
         return ""

@@ -62,7 +62,7 @@ _STAND: Final = struct.Struct("<q248xQ")
 
 
 def stand_of(content: bytes) -> tuple[int, int, int]:
-    """Of NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last is -1 always."""
+    """Read NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last is -1 always."""
     result, pointer = _STAND.unpack_from(content)
     return pointer, result, -1
 
@@ -80,7 +80,7 @@ OUTSIDE_OF_CALLS: Final[tuple[tuple[int, int], ...]] = ()
 STEPPING: Final[tuple[tuple[int, int], ...]] = ()
 """No program steps through itself: only the kernel can set that bit."""
 LOST_IN_A_CALL: Final = ("mark",)
-"""What every system call changes, besides its result: nothing but what is no register, see `recalled`."""
+"""Registers that every system call changes, besides its result: none; the mark is no register, see `recalled`."""
 ARGUMENTS: Final = ("x0", "x1", "x2", "x3", "x4", "x5")
 ENDED_ARGUMENTS: Final = ("first", *ARGUMENTS[1:])
 """Where the arguments of a call are that has ended: a result has taken the place of the first one, see `recalled`."""
@@ -118,7 +118,7 @@ UNKEPT_OUTPUT_SIZE: Final = 16
 
 
 def unkept(output: int) -> tuple[Unkept, ...]:
-    """What of this processor a process may have switched for itself, and no restore gives back.
+    """The switches of this processor that a process may have set for itself, and no restore gives back.
 
     Args:
         output: address of `UNKEPT_OUTPUT_SIZE` bytes that the calls may write to.
@@ -153,7 +153,7 @@ RESTART_BLOCK: Final = -516
 REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "clock_nanosleep": (2, 3)}
 """Which argument points to the time asked for, and which to where the kernel has written what remains of it."""
 ERESTARTNOHAND: Final = -514
-"""What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
+"""A stopped call returns this when it shall be made again, unless a signal handler comes first: that makes it EINTR."""
 FORGETS_CALLS: Final = True
 """Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.trace.syscall_reentry`."""
 
@@ -266,7 +266,7 @@ def call_number_before(code: bytes) -> int | None:
 # Code of a borrowed page (see `checkpoint.linux.trace.remote_syscalls`)
 
 CLOBBERED: Final = ("x0", "x1", "x2", "x3", "x4", "x5", "x8", "x9", "sp", "pstate")
-"""What the calls change, or the code between them: ours to give back, in this order in the table."""
+"""Registers that the calls change, or the code between them: we give them back, in this order in the table."""
 LARGE_DESK_SIZE: Final = 32768
 SMALL_DESK_SIZE: Final = 1024
 """Bytes of a desk's code, and of its table without the frame: for 200 of the longest calls, and for four."""
@@ -305,14 +305,14 @@ _SCALABLE: Final = struct.Struct("<IIHH4x")
 """struct sve_context, before the registers: Z, P, FFR."""
 _FURTHER_MAGIC, _SCALABLE_MAGIC = 0x45585401, 0x53564501
 _BEFORE_UCONTEXT: Final = 128
-"""Bytes of siginfo, which lie before struct ucontext in a frame; nobody reads them."""
+"""Bytes of siginfo, which lie before struct ucontext in a frame; rt_sigreturn(2) does not read them."""
 _VECTORS_HEAD: Final = 0x46508001 | 528 << 32
 _NO_STACK: Final = 7
 """Flags of an alternate stack that are none: rt_sigreturn(2) leaves the one that there is."""
 _PLACES: Final = {name: _GENERAL_OF_FRAME + 8 * index for index, name in enumerate((*_GENERAL, "sp", "pc", "pstate"))}
 _SCRATCH: Final = 9
 _STORES_BEFORE: Final = 0xD5033ABF
-"""``dmb ishst``: whoever sees a later store sees every earlier one."""
+"""``dmb ishst``: a processor that sees a later store sees every earlier one."""
 
 
 def _lost(place: int, content: bytes) -> bytes:
@@ -400,11 +400,11 @@ class _Code:
 
 
 SHOWS_STORES_IN_ORDER: Final = False
-"""Whether who reads what a thread has stored last sees what that one stored before, without asking a second time."""
+"""Whether a reader that sees a thread's last store also sees its earlier ones, without a second look."""
 
 
 def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
-    """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
+    """The batch: make every call once, then wait for the tracer; if it does not come, give everything back and go on.
 
     Args:
         address: where it will lie.
@@ -479,7 +479,7 @@ def entry_code(
 
 
 def _entry_instructions(address: int, calls: EntryCalls, frame: int) -> bytes:
-    """Those of `entry_code`, as many whatever the address of the frame."""
+    """The instructions of `entry_code`; their number does not depend on the address of the frame."""
     code = _Code(address + ENTRY_CODE_OFFSET)
     code.call(SYSCALLS[calls.code_pages.name], calls.code_pages.arguments)
     code.move(19, 0)

@@ -93,7 +93,7 @@ OWN_LOOP: Final = bytes.fromhex(
     "f353c1a8"  #  done: ldp  x19, x20, [sp], #16
     "c0035fd6"  #        ret
 )
-"""A function of C that makes the calls of a table in a process of ours, all of them, whatever comes of each.
+"""A function of C that makes the calls of a table in a process of ours, all of them, also when some fail.
 
 Each call is eight little-endian words: number, six arguments, address where the result goes, 0 for nowhere.
 """
@@ -249,7 +249,7 @@ Source: vdso(7); lib/vdso/getrandom.c.
 def jump_to(address: int) -> bytes:
     """``ldr x16, …; br x16`` and where to: 16 bytes that go on at any address, all registers as they are but x16.
 
-    That one is nobody's at the beginning of a function.
+    x16 is free at the beginning of a function.
     """
     return struct.pack("<IIQ", 0x58000050, 0xD61F0200, address)
 
@@ -279,7 +279,7 @@ def at_call(registers: bytes, instruction: int, number: int, arguments: tuple[in
 
 
 def call_result(registers: bytes) -> int:
-    """What a system call returned: a negative error number, or its value."""
+    """The result of a system call: a negative error number, or its value."""
     value = aarch64.decode_registers(registers)[aarch64.RESULT]
     return value - (1 << 64) if value >> 63 else value
 

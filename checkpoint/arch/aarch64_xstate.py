@@ -38,20 +38,20 @@ a processor with SME."""
 _NEEDED: Final = {VECTORS: "fp", THREAD_POINTER: "fp", ADDRESS_KEYS: "paca", GENERIC_KEY: "pacg", SCALABLE: "sve"}
 """Features without which there is no such set; every processor that runs our kernels has the first.
 
-The kernel tells a set only to who asks for it by number, so all of them are asked for, one by one."""
+The kernel tells a set only if it is asked for by number, so we ask for all of them, one by one."""
 LOST_IN_CALLS: Final[int | None] = SCALABLE
 """The register set of which every system call may take a part. Source: sve.rst, "System call behaviour"."""
 UNKEPT: Final = {"sme": "scalable matrices (SME: arm64.nosme)"}
 """Features of which a thread has registers that are not kept, and that a call of ours would clear: what a message calls each,
 with the parameter that has the kernel leave it alone. Source: Documentation/arch/arm64/sme.rst; kernel-parameters.txt."""
 PERMISSIONS: Final[tuple[tuple[str, str, tuple[int, ...]], ...]] = ()
-"""What a process asks for before it may use some of it: feature, call, arguments. Nothing."""
+"""Features that a process must ask for before it may use them: feature, call, arguments. None."""
 
 
 _HEAD: Final = struct.Struct("<IIHHHH")
 """struct user_sve_header: size, greatest size, bytes of a vector, the most of these, flags, nothing."""
 _WHOLE: Final = 1
-"""Of its flags: all of the scalable vectors follow, not the vector registers alone."""
+"""A flag of it: all of the scalable vectors follow, not the vector registers alone."""
 
 
 def sets(features: Callable[[], Collection[str]], vector_size: Callable[[], int]) -> tuple[tuple[int, int], ...]:
@@ -78,7 +78,7 @@ def _scalable_size(vector_size: int) -> int:
 
 
 def scalable_registers(content: bytes) -> tuple[int, bytes]:
-    """Of a set that holds them all: bytes of a vector, and the registers."""
+    """Read a set that holds them all: bytes of a vector, and the registers."""
     vector_size = _HEAD.unpack_from(content)[2]
     return vector_size, content[_HEAD.size : _HEAD.size + _registers_size(vector_size)]
 
@@ -114,7 +114,7 @@ def lacking(state: bytes, theirs: Layout, ours: Layout) -> Iterator[str]:
 
 
 def _lacking_vectors(content: bytes, here: int) -> Iterator[str]:
-    """What is said of scalable vectors that cannot be had; a thread that has not used any can do without.
+    """Why a thread's scalable vectors cannot be restored here; a thread that has not used any can do without.
 
     Args:
         here: bytes of the set on this machine; 0: there is none.
@@ -127,7 +127,7 @@ def _lacking_vectors(content: bytes, here: int) -> Iterator[str]:
 
 
 def fitted(state: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes:
-    """The same state as this machine lays it out. What is `lacking` here is left out.
+    """The same state as this machine lays it out, without the parts that are `lacking` here.
 
     Args:
         example: the state of any thread here: of that is what the other machine did not have. Scalable vectors are not: what a
@@ -144,7 +144,7 @@ def key_rights(state: bytes, layout: Layout) -> int | None:
 
 
 def _content(state: bytes, one: Component) -> bytes:
-    """Of one set; less than its size where it came short."""
+    """The content of one set; less than its size where it came short."""
     return state[one.offset : one.offset + one.size]
 
 

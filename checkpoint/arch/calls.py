@@ -41,8 +41,8 @@ class Unkept(Struct, frozen=True):
     """A question to a process about something that no restore can give it.
 
     Attributes:
-        usual: what one without it answers; one whose kernel does not know it answers with an error.
-        what: it has then.
+        usual: the answer of a process without it; where the kernel does not know the call, the answer is an error.
+        what: names the thing that a process with another answer has.
     """
 
     call: Call
@@ -71,7 +71,7 @@ class TablePlaces(Struct, frozen=True):
 
 
 class EntryCalls(Struct, frozen=True):
-    """What the first entry does, in this order: map the code pages, map the table pages, advise, open a userfaultfd."""
+    """The calls of the first entry, in this order: map the code pages, map the table pages, advise, open a userfaultfd."""
 
     code_pages: Call
     table_pages: Call

@@ -22,7 +22,7 @@ class Component(Struct, frozen=True):
 
 
 Layout = tuple[Component, ...]
-"""The components in order, as their processor's file says; () where nobody could tell."""
+"""The components in order, as their processor's file says; () where the processor could not be asked."""
 
 _ENTRY: Final = struct.Struct("<III")
 
@@ -33,7 +33,7 @@ def encode_layout(layout: Layout) -> bytes:
 
 
 def decode_layout(content: bytes) -> Layout:
-    """The reverse of `encode_layout`; () for what is none."""
+    """The reverse of `encode_layout`; () for bytes that are no layout."""
     if len(content) % _ENTRY.size:
         return ()
     return tuple(Component(*entry) for entry in _ENTRY.iter_unpack(content))

@@ -58,7 +58,7 @@ _STAND: Final = struct.Struct("<80xq32xqQ")
 
 
 def stand_of(content: bytes) -> tuple[int, int, int]:
-    """Of NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last two are signed."""
+    """Read NT_PRSTATUS, for many threads in little time: (instruction pointer, result, call number); the last two are signed."""
     result, number, pointer = _STAND.unpack_from(content)
     return pointer, result, number
 
@@ -76,7 +76,7 @@ OUTSIDE_OF_CALLS: Final = ((REGISTER_NAMES.index(CALL_NUMBER), NO_CALL),)
 STEPPING: Final = ((REGISTER_NAMES.index("eflags"), 1 << 8),)
 """Words of NT_PRSTATUS, by place, and the bit of each by which a program steps through itself: the trap flag."""
 LOST_IN_A_CALL: Final = ("rcx", "r11")
-"""What every system call changes, besides its result. Source: psABI, A.2.1."""
+"""Registers that every system call changes, besides its result. Source: psABI, A.2.1."""
 ARGUMENTS: Final = ("rdi", "rsi", "rdx", "r10", "r8", "r9")
 ENDED_ARGUMENTS: Final = ARGUMENTS
 """Where the arguments of a call are that has ended."""
@@ -109,7 +109,7 @@ UNKEPT_OUTPUT_SIZE: Final = 16
 
 
 def unkept(output: int) -> tuple[Unkept, ...]:
-    """What of this processor a process may have switched for itself, and no restore gives back.
+    """The switches of this processor that a process may have set for itself, and no restore gives back.
 
     Args:
         output: address of `UNKEPT_OUTPUT_SIZE` bytes that the calls may write to.
@@ -123,7 +123,7 @@ def unkept(output: int) -> tuple[Unkept, ...]:
 
 
 PORT_RIGHTS: Final[int | None] = 0x201
-"""NT_386_IOPERM of linux/elf.h: the register set of who may use I/O ports; nobody else has it."""
+"""NT_386_IOPERM of linux/elf.h: only a thread that may use I/O ports has this register set."""
 
 
 def user_end(highest: int) -> int:
@@ -144,7 +144,7 @@ RESTART_BLOCK: Final = -516
 REMAINING_TIME: Final[Mapping[str, tuple[int, int]]] = {"nanosleep": (0, 1), "clock_nanosleep": (2, 3)}
 """Which argument points to the time asked for, and which to where the kernel has written what remains of it."""
 ERESTARTNOHAND: Final = -514
-"""What a stopped call returns when it is to be made again, unless a signal handler comes first: that makes it EINTR."""
+"""A stopped call returns this when it shall be made again, unless a signal handler comes first: that makes it EINTR."""
 FORGETS_CALLS: Final = False
 """Whether the registers of a stop inside a call do not say that it is one: see `checkpoint.linux.trace.syscall_reentry`."""
 
@@ -166,7 +166,7 @@ SOCKET_TIMEOUT: Final[Mapping[str, Timeout]] = {
 }
 """Calls that do so only at a socket that has a timeout. connect(2) is not made again: it would answer EALREADY."""
 CALL_NUMBER_BITS: Final = 32
-"""Of the register with a call's number newer kernels look at the lower half only, and keep both in `CALL_NUMBER`: the upper one
+"""Newer kernels look at the lower half of the register with a call's number only, and keep both in `CALL_NUMBER`: the upper one
 can hold a mark by which a call is known again, until its result takes that place. 0: marks lie elsewhere."""
 MARK_LIMIT: Final = 1 << 31
 """Marks are smaller: the highest bit says that the thread is in no call."""
@@ -235,7 +235,7 @@ _MOVE_IMMEDIATE: Final = {"rax": 0, "rcx": 1, "rdx": 2, "rbx": 3, "rsp": 4, "rbp
 }
 """Register numbers of the instruction encoding; 8 and above need a REX bit."""
 CLOBBERED: Final = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9", "rcx", "r11")
-"""What the calls change: ours to give back, in this order in the table."""
+"""Registers that the calls change: we give them back, in this order in the table."""
 LARGE_DESK_SIZE: Final = 16384
 SMALL_DESK_SIZE: Final = 512
 """Bytes of a desk's code, and of its table without the frame: for 200 of the longest calls, and for four."""
@@ -308,11 +308,11 @@ class _Code:
 
 
 SHOWS_STORES_IN_ORDER: Final = True
-"""Whether who reads what a thread has stored last sees what that one stored before, without asking a second time."""
+"""Whether a reader that sees a thread's last store also sees its earlier ones, without a second look."""
 
 
 def batch_code(address: int, calls: Sequence[Call], places: TablePlaces) -> bytes:
-    """The batch: every call once, then wait for the tracer, then (nobody came) give everything back and go on.
+    """The batch: make every call once, then wait for the tracer; if it does not come, give everything back and go on.
 
     Args:
         address: where it will lie.

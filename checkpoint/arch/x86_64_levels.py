@@ -14,7 +14,7 @@ from typing import Final
 V1, V2, V3, V4 = "x86-64-v1", "x86-64-v2", "x86-64-v3", "x86-64-v4"
 LEVELS: Final = (V1, V2, V3, V4)
 DEFAULT: Final = V2
-"""What every server processor since 2009 has."""
+"""The features that every server processor since 2009 has."""
 
 _ADDED: Final = {
     V1: frozenset(["cmov", "cx8", "mmx", "sse", "sse2"]),
@@ -37,7 +37,7 @@ _NUMPY_BEYOND: Final = {
     V3: "AVX512F AVX512CD AVX512_SKX X86_V4",
     V4: "XOP FMA4 AVX512_KNL AVX512_KNM AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR",
 }
-"""The same of NPY_DISABLE_CPU_FEATURES. What a build of numpy needs at least it cannot do without, and says so."""
+"""The same of NPY_DISABLE_CPU_FEATURES. A build of numpy cannot switch off the features that it needs at least, and says so."""
 _OPENSSL_BEYOND: Final = {
     V1: ((0, 9, 19, 20, 23), ()),
     V2: ((12, 22, 28, 29), (3, 5, 8)),
@@ -65,9 +65,9 @@ def glibc_hwcaps(level: str) -> str:
 
 
 def variables(level: str) -> dict[str, str]:
-    """Variables of libraries that choose by themselves, unless somebody has set them."""
+    """Variables for libraries that choose by themselves. A variable that the user has set stays as it is."""
     return {
-        "LD_BIND_NOW": "1",  # what binds later saves registers by the size that it found at the start (dl-trampoline.h)
+        "LD_BIND_NOW": "1",  # late binding saves registers by the size that it found at the start (dl-trampoline.h)
         "NPY_DISABLE_CPU_FEATURES": " ".join(_words(_NUMPY_BEYOND, level)),
         "OPENBLAS_CORETYPE": _OPENBLAS[level],
         "MKL_ENABLE_INSTRUCTIONS": _MKL[level],

@@ -93,7 +93,7 @@ OWN_LOOP: Final = bytes.fromhex(
     "5b"  #                pop  rbx
     "c3"  #                ret
 )
-"""A function of C that makes the calls of a table in a process of ours, all of them, whatever comes of each.
+"""A function of C that makes the calls of a table in a process of ours, all of them, also when some fail.
 
 Each call is eight little-endian words: number, six arguments, address where the result goes, 0 for nowhere.
 """
@@ -335,7 +335,7 @@ def at_call(registers: bytes, instruction: int, number: int, arguments: tuple[in
 
 
 def call_result(registers: bytes) -> int:
-    """What a system call returned: a negative error number, or its value."""
+    """The result of a system call: a negative error number, or its value."""
     value = x86_64.decode_registers(registers)[x86_64.RESULT]
     return value - (1 << 64) if value >> 63 else value
 

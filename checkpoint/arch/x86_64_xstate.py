@@ -44,16 +44,16 @@ FIRST_EXTENDED: Final = 2
 """Components 0 and 1 lie in the legacy region."""
 PKRU: Final = 9
 PKRU_OF_LINUX: Final = 0x55555554
-"""What every thread begins with: nothing but key 0. Source: arch/x86/mm/pkeys.c, init_pkru_value."""
+"""The value with which every thread begins: only key 0 is allowed. Source: arch/x86/mm/pkeys.c, init_pkru_value."""
 HIGHEST: Final = 62
 AMX: Final = (17, 18)
 """Only for a process that has asked for it, and 8 KiB a thread: kept while its tiles are released, as between computations."""
 LOST_IN_CALLS: Final[int | None] = None
 """The register set of which every system call may take a part: none."""
 UNKEPT: Final[dict[str, str]] = {}
-"""Features of which a thread has registers that are not kept: none, whatever XSAVE knows is."""
+"""Features of which a thread has registers that are not kept: none. All that XSAVE knows is kept."""
 PERMISSIONS: Final = (("amx_tile", "arch_prctl", (0x1023, 18)),)
-"""What a process asks for before it may use some of it: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
+"""Features that a process must ask for first: feature, call, arguments (ARCH_REQ_XCOMP_PERM: the tiles of AMX).
 
 Source: Documentation/arch/x86/xstate.rst.
 """
@@ -102,7 +102,7 @@ def lacking(xstate: bytes, theirs: Layout, ours: Layout) -> Iterator[str]:
 
 
 def fitted(xstate: bytes, theirs: Layout, ours: Layout, example: bytes) -> bytes:
-    """The same state as this processor lays it out. What is `lacking` here is left out.
+    """The same state as this processor lays it out, without the parts that are `lacking` here.
 
     Args:
         example: the state of any thread here: of its size, with the kernel's own words.
@@ -133,13 +133,13 @@ def key_rights(xstate: bytes, layout: Layout) -> int | None:
 
 
 def _extended_in_use(xstate: bytes, layout: Layout) -> Iterator[Component]:
-    """Those that are in use and inside what was told."""
+    """The components that are in use and inside the bytes told."""
     used = in_use(xstate)
     return (one for one in layout if used >> one.number & 1 and one.offset + one.size <= len(xstate))
 
 
 def _name_of(number: int) -> str:
-    """What a message calls it."""
+    """Its name in messages."""
     return COMPONENTS.get(number, f"component {number}")
 
 
@@ -183,7 +183,7 @@ def layout_here(features: Callable[[], Collection[str]], vector_size: Callable[[
 
     Args:
         vector_size: unused, see `sets`.
-        run: the address of instructions, in memory that nobody can write.
+        run: the address of instructions, in memory that is not writable.
 
     Raises:
         OSError: by `run`: the system forbids code of our own.

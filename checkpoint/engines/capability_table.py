@@ -104,7 +104,7 @@ CARRIERS: Final[tuple[ModuleType, ...]] = (
 
 
 def rows() -> tuple[Capability, ...]:
-    """Every row: by area, within an area what is preserved first and what is refused last."""
+    """Every row: by area, within an area preserved things first and refused ones last."""
     areas, verdicts = list(Area), list(Verdict)
     found = [row for carrier in CARRIERS for row in carried_by(carrier)]
     return tuple(sorted(found, key=lambda row: (areas.index(row.area), verdicts.index(row.verdict))))

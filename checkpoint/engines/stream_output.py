@@ -18,7 +18,7 @@ from checkpoint.resources.ipc.pipes import peek
 from checkpoint.segment.output_counters import StreamCounts, Totals
 
 LOG_TIMEOUT_S: Final = 2.0
-"""How long the guard may take to write to its log what it has read; not during a freeze."""
+"""How long the guard may take to write the output that it has read to its log; not during a freeze."""
 BACKLOG_LIMIT: Final = 16 << 20
 """Bytes of output that one snapshot carries at most: earlier ones are in the log alone."""
 

@@ -30,7 +30,7 @@ IN_MEMFD: Final = b"\x01"
 INLINE_LIMIT: Final = 64 << 10
 """Bytes of a message that travel in the packet itself; a larger one would not fit a socket's default buffer."""
 MEMFD_LIMIT: Final = 64 << 20
-"""Bytes of a message in a memfd; what is larger by nature (pages, streams) travels as descriptors of its own."""
+"""Bytes of a message in a memfd; larger things (pages, streams) travel as descriptors of its own."""
 DESCRIPTOR_LIMIT: Final = 250
 """Descriptors in one message: SCM_MAX_FD is 253; a chain of more files is folded by its sender first."""
 
@@ -66,7 +66,7 @@ class Channel(Generic[M]):
         """Send one message; the descriptors are copied, ours stay open.
 
         Raises:
-            ChannelClosedError: nobody is there any more.
+            ChannelClosedError: the other end is closed.
             ChannelError: the socket does not take it (full while non-blocking, or too many descriptors).
         """
         if len(descriptors) > DESCRIPTOR_LIMIT:
@@ -97,7 +97,7 @@ class Channel(Generic[M]):
 
         Raises:
             ChannelClosedError: the other end has gone.
-            ChannelError: what came is no message; its descriptors were closed.
+            ChannelError: the bytes are no message; their descriptors were closed.
             TimeoutError: the socket has a timeout and nothing came.
         """
         try:
@@ -159,7 +159,7 @@ def memfd_holding(content: bytes | memoryview, name: str) -> int:
 
 
 def seal(descriptor: int) -> None:
-    """Close a memory file to every change, for everybody and for good."""
+    """Close a memory file to every change, for all processes and for good."""
     seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
 
@@ -231,7 +231,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     With a descriptor, of an empty file: it is encoded there, and the answer brings none.
 
     Attributes:
-        hold: leave the program standing still afterwards, until `Release`: who ends it now ends it in exactly this state.
+        hold: leave the program standing still afterwards, until `Release`: an end now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
     """
 
@@ -318,7 +318,7 @@ class Compare(msgspec.Struct, frozen=True, tag=True):
 
     Attributes:
         contents, terms, own_eyes: see `checkpoint.engine.RestoreOptions`.
-        known: what the last `Compared` told, so that only files that have changed are read again.
+        known: the files of the last `Compared`, so that only files that have changed are read again.
         running: the program runs here, as this pid: tell only which of its files others hold open for writing; 0: it does not.
         components: see `checkpoint.engine.Engine.contested`.
     """
@@ -335,7 +335,7 @@ class OpenFile(msgspec.Struct, frozen=True, tag=True):
     """Open a file as the followed program has it: perhaps no name leads to it any more. Answer: `Opened` with the descriptor.
 
     Attributes:
-        digest: of its content when it was captured; whoever asks compares.
+        digest: of its content when it was captured; the asking process compares it.
     """
 
     path: str
@@ -374,7 +374,7 @@ class Release(msgspec.Struct, frozen=True, tag=True):
 
 
 class Probed(msgspec.Struct, frozen=True, tag=True):
-    """What a capture would preserve."""
+    """The things that a capture would preserve."""
 
     report: Report
 
@@ -462,7 +462,7 @@ UNPROTECTED: Final = "it runs, unprotected"
 
 
 class Compared(msgspec.Struct, frozen=True, tag=True):
-    """What is lacking here, one sentence each; and the files that were read for that."""
+    """The things that this machine lacks, one sentence each; and the files that were read for that."""
 
     lacks: tuple[str, ...] = ()
     known: tuple[KnownDigest, ...] = ()
@@ -498,7 +498,7 @@ class Failed(msgspec.Struct, frozen=True, tag=True):
 
 
 def failed(error: CheckpointError) -> Failed:
-    """What a keeper answers when a request failed.
+    """The answer of a keeper when a request failed.
 
     The receiver knows only the classes of ``checkpoint.errors``. So the answer names the nearest of those: a `MovedError` is told
     as the `CaptureError` that it is.

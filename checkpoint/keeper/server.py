@@ -67,7 +67,7 @@ FILES: Final = 65536
 """Descriptors that it may have, as its unit says."""
 
 COLLECTED_AFTER: Final = 128
-"""Requests after which what holds itself is looked for, and memory that is free goes back: 4 ms, every few seconds."""
+"""Requests after which we collect objects that refer to each other, and give free memory back: 4 ms, every few seconds."""
 
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
@@ -80,9 +80,9 @@ class _Encoded(msgspec.Struct, frozen=True):
     """A capture as bytes.
 
     Attributes:
-        snapshot: its pages are of no account any more.
+        snapshot: its pages are not used any more.
         size: bytes of the file; ``dirty_bytes``: of the pages in it; ``known_bytes``: of those told as differences.
-        descriptors: the file, where nobody has brought one.
+        descriptors: the file, where the request brought none.
     """
 
     snapshot: Snapshot
@@ -127,7 +127,7 @@ class Keeper:
     def serve(self) -> None:
         """Answer until the peer hangs up; then let go."""
         try:
-            with waking() as await_readable:  # who is held and killed meanwhile waits for us
+            with waking() as await_readable:  # a program that is held and killed meanwhile waits for us
                 while True:
                     for _ in range(COLLECTED_AFTER):
                         await_readable(self._link.fileno())
@@ -206,7 +206,7 @@ class Keeper:
         return answer, made.descriptors
 
     def _lasting_notes(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """What the restore lost and the program still lacks; it has its connections again once it has opened as many."""
+        """Notes about losses of the restore that last. Lost connections count until the program has opened as many."""
         if any(note.startswith(RESET_NOTE) for note in self._lasting):
             count = tcp.established(held for told in snapshot.processes for held in told.resources)
             if count >= self._connections:
@@ -224,7 +224,7 @@ class Keeper:
                 return _Encoded(snapshot, size, sum(run.size for run in snapshot.runs))
             except ProcessGoneError:
                 raise
-            except CaptureError:  # a page that nobody can read (a guard that this kernel does not tell): a copy leaves it out
+            except CaptureError:  # an unreadable page (a guard that this kernel does not tell): a copy leaves it out
                 os.ftruncate(target, 0)
                 os.lseek(target, 0, os.SEEK_SET)
                 captured = session.capture(order)
@@ -274,7 +274,7 @@ class Keeper:
                 raise RestoreError(f"cannot build a ready copy in pid {request.pid}: this keeper follows a process already")
             options = RestoreOptions(own_eyes=request.own_eyes, contents=request.contents, terms=request.terms)
             with untrusted.facts(f"build a ready copy of {request.component}"):
-                is_whole = _has_several_processes(descriptors)  # who came or went within the chain is not followed
+                is_whole = _has_several_processes(descriptors)  # a process that came or went within the chain is not followed
                 if is_whole:
                     self._copy = self._tracer.lay(request.pid, folded(descriptors), options)
                 else:
@@ -373,7 +373,7 @@ class Keeper:
         return messages.Resumed(notes, let_go_ns), ()
 
     def _follow(self, pid: int, request: messages.Restore, streams: Streams | None) -> tuple[str, ...]:
-        """Protect what has just been let go; that it cannot be protected again must not end it."""
+        """Protect the program that has just been let go; a failure must not end it."""
         try:
             order = ProtectOrder(request.component, streams, request.terms, self._names)
             self._session = self._tracer.protect(pid, order)
@@ -448,7 +448,7 @@ def _commit_at(session: Session, position: Position) -> tuple[int, int]:
 
 
 def _unchanged(session: Session, request: messages.Capture) -> messages.Unchanged | None:
-    """What is said in place of a delta with nothing in it; a base, and the last delta of a handover, are always made."""
+    """The answer in place of an empty delta; a base, and the last delta of a handover, are always made."""
     task = None if request.base or request.hold else _as_task(session)
     position = task.unchanged() if task else None
     return messages.Unchanged(position, *_commit_at(session, position)) if position else None
@@ -525,7 +525,7 @@ def folded(files: Descriptors) -> Snapshot:
 
 
 def main(arguments: list[str]) -> int:
-    """Run a keeper on an inherited socket, or for whoever calls at a path."""
+    """Run a keeper on an inherited socket, or for the first client that connects at a path."""
     if len(arguments) != 2 or arguments[0] != "keeper":
         sys.stderr.write(USAGE)
         return 2
@@ -553,10 +553,10 @@ def _allow_many_files() -> None:
 
 
 def called_at(path: str) -> socket.socket:
-    """Listen at a path (0600) until somebody connects; nobody can afterwards.
+    """Listen at a path (0600) until a client connects. No other client can connect afterwards.
 
     Raises:
-        OSError: it cannot be listened there, or nobody came.
+        OSError: it cannot listen there, or no client came.
     """
     before = os.umask(0o177)
     try:

@@ -48,7 +48,7 @@ WALL: Final = 0x40000000
 """__WALL of waitpid(2): also children that are not ours."""
 
 ENDS: Final = (os.CLD_EXITED, os.CLD_KILLED, os.CLD_DUMPED)
-"""What waitid(2) says of whom has ended."""
+"""The codes of waitid(2) for a process that has ended."""
 
 # linux/elf.h: names of register sets
 NT_PRSTATUS: Final = 1
@@ -60,7 +60,7 @@ SOCK_FILTER_SIZE: Final = 8
 # asm-generic/siginfo.h, asm-generic/signal.h
 SIGINFO_SIZE: Final = 128
 SIGINFO_PID: Final = 16
-"""Offset of si_pid in struct siginfo: after three numbers, and four bytes that are nobody's."""
+"""Offset of si_pid in struct siginfo: after three numbers, and four unused bytes."""
 SIGSET_SIZE: Final = 8
 SIGNAL_COUNT: Final = 64
 ALL_SIGNALS: Final = (1 << SIGNAL_COUNT) - 1

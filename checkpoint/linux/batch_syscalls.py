@@ -56,7 +56,7 @@ def row(name: str, *arguments: int, to: int = 0) -> tuple[int, ...]:
 
 
 class OwnCalls:
-    """A table of calls, made again and again; whatever its rows point to is kept alive by who made them.
+    """A table of calls, made again and again. The maker of its rows keeps alive everything that they point to.
 
     Attributes:
         entries: the rows, (count, 8) words.
@@ -74,7 +74,7 @@ class OwnCalls:
         self.address = int(self.entries.ctypes.data)
 
     def run(self, first: int = 0, last: int | None = None, *, may_wait: bool = False) -> None:
-        """Make the calls of the rows [first, last), one after the other, whatever comes of each.
+        """Make the calls of the rows [first, last), one after the other, also when some fail.
 
         Args:
             may_wait: one of them may, for another thread of ours even: those go on meanwhile. Otherwise they wait for us.
@@ -121,7 +121,7 @@ def _in_machine_code_that_may_wait() -> Loop:
 
 @functools.cache
 def instructions(code: bytes) -> int:
-    """The address of machine code, in memory that nobody can write, so that it is allowed where memory that is both is not.
+    """The address of machine code, in memory that is not writable: some systems forbid memory that is writable and executable.
 
     Raises:
         OSError: the system does not allow it (a noexec policy, for one).

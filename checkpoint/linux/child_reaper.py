@@ -22,13 +22,13 @@ from typing import Final
 from checkpoint.linux import abi
 
 PERIOD_NS: Final = 10_000_000
-"""How long seizing may take before it is looked for the dead, and how often then: usually it takes a microsecond a thread."""
+"""How long seizing may take before we look for ended threads, and how often then: usually it takes a microsecond a thread."""
 
 
 def bury(tid: int) -> bool:
-    """Take note of the end of a thread that we trace; False when it has not ended, is not ours, or somebody has done so.
+    """Take note of the end of a thread that we trace; False when it has not ended, is not ours, or its end is noted already.
 
-    It is looked first what there is to note: a stop is told, once, to whoever waits for ends only.
+    We look first, without taking note: the kernel tells a tracer of a stop once, also one that waits for ends only.
 
     Source: wait_task_stopped() in kernel/exit.c.
     """
@@ -73,7 +73,7 @@ class Burial:
 
 
 class _Plot:
-    """What the thread knows: not its `Burial`, or that could never go."""
+    """The data of the thread. It does not hold its `Burial`, or that could never go."""
 
     def __init__(self, timer: int) -> None:
         self.timer = timer
@@ -86,7 +86,7 @@ class _Plot:
         abi.set_timerfd(self.timer, 1)
 
     def bury(self) -> None:
-        """Take note of the dead whenever the timer goes off; that is closed at the end."""
+        """Take note of ended threads whenever the timer goes off; the timer is closed at the end."""
         try:
             while not self._is_over:
                 os.read(self.timer, 8)

@@ -33,14 +33,14 @@ LINKS_MAX: Final = 40
 IN_MEMORY: Final = ("tmpfs", "ramfs", "devtmpfs")
 """File systems that the kernel keeps itself: their owners are true, also on a mount without set-user-ID."""
 OVERFLOW_GID: Final = Path("/proc/sys/kernel/overflowgid")
-"""The group of a user without an account: a file's own group may be that of a directory (set-group-ID), and is nobody's word."""
+"""The group of a user without an account: a file's own group may be that of a directory (set-group-ID), and proves nothing."""
 
 
 class Author(Struct, frozen=True):
     """Whose word a file is.
 
     Attributes:
-        owner: None: root's, who may ask for everything.
+        owner: None: root, which may ask for everything.
         name: of the account, with its number.
         why: one half of a sentence: what shows that.
     """
@@ -58,7 +58,7 @@ def author_of(file: int, path: str) -> Author:
         path: by which it was opened.
 
     Raises:
-        AuthorError: more than one user may have written or chosen it, or the system cannot tell who.
+        AuthorError: more than one user may have written or chosen it, or the system cannot tell which.
     """
     about = os.fstat(file)
     if not stat.S_ISREG(about.st_mode):
@@ -112,7 +112,7 @@ def _is_being_written(file: int, path: str) -> bool:
     The kernel grants a lease to read only where none has. Of a file system without leases, or of a network, that is not known.
     """
     try:
-        fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)  # who opens it meanwhile waits for us; SIGIO would kill us
+        fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)  # a process that opens it meanwhile waits for us; SIGIO would kill us
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     except OSError as error:
@@ -128,10 +128,12 @@ def _tells_true_owners(file: int, path: str) -> bool:
 
 
 def _chosen_by(about: os.stat_result, path: str) -> Author:
-    """Who besides root could have put this file of root's, or another one, at its path: each directory and link is looked at.
+    """The user besides root that could have put this file of root's, or another one, at its path.
+
+    Each directory and link on the way is looked at.
 
     Raises:
-        AuthorError: several may have, or anybody.
+        AuthorError: several users may have, or any user.
     """
     choosers: dict[int, str] = {}
     place, pending, links, shared = "/", os.path.join(os.getcwd(), path).split("/"), 0, ""
@@ -146,7 +148,7 @@ def _chosen_by(about: os.stat_result, path: str) -> Author:
             folder = os.stat(place)
             if folder.st_mode & WRITABLE_BY_OTHERS and not folder.st_mode & stat.S_ISVTX:
                 raise _unknown(
-                    path, f"every user who may write to {place} could have put another file there", f"chmod go-w {place}"
+                    path, f"every user with write access to {place} could have put another file there", f"chmod go-w {place}"
                 )
             shared = shared or (place if folder.st_mode & WRITABLE_BY_OTHERS else "")
             choosers.setdefault(folder.st_uid, place)

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Final
 
 PRIORITY: Final = 1
-"""The lowest there is: beats, guards and whatever else is in real time on this machine come first."""
+"""The lowest there is: beats, guards and all other real-time threads of this machine come first."""
 NICE: Final = -20
 """87 times the weight of an ordinary thread."""
 LONG_S: Final = 0.01
@@ -73,5 +73,5 @@ class Precedence:
 
 
 def _ends_us() -> bool:
-    """Whether the kernel ends who is in real time for long (RLIMIT_RTTIME, by SIGXCPU): a program stands still for us."""
+    """Whether the kernel ends a thread that is in real time for long (RLIMIT_RTTIME, by SIGXCPU): a program waits for us."""
     return resource.getrlimit(resource.RLIMIT_RTTIME)[0] != resource.RLIM_INFINITY

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 BYTES_AT_ONCE: Final = 4096
-"""Taken out of the socket in one go; what is more is taken the next time."""
+"""Taken out of the socket in one go; the rest is taken the next time."""
 
 
 @contextlib.contextmanager
@@ -49,5 +49,5 @@ def await_readable(descriptor: int, heard: socket.socket | None = None) -> None:
     if heard is not None:
         poll.register(heard, select.POLLIN)
     while descriptor not in [ready for ready, _ in poll.poll()]:
-        assert heard is not None  # nobody else is waited for
+        assert heard is not None  # we wait for no other descriptor
         heard.recv(BYTES_AT_ONCE)

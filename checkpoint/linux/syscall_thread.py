@@ -97,7 +97,7 @@ def _standing() -> Standing:
 
 
 class _Board:
-    """What the two threads share; the second holds on to it, and not to its `SecondThread`, or that could never go.
+    """The memory that the two threads share. The second holds on to it, and not to its `SecondThread`, or that could never go.
 
     Attributes:
         words: of `SECOND_LOOP`.
@@ -122,7 +122,7 @@ class _Board:
         return order != RETURN and self.words[DONE_WITH] + (1 - order % 2) >= order
 
     def begin(self, table: OwnCalls, last: int, keeps: object) -> None:
-        """Give it a table; what it had before it needs no more."""
+        """Give it a table; it does not need the earlier one any more."""
         self._work = table, keeps
         self.words[FIRST] = self.words[MADE] = table.address
         self.words[END] = table.address + last * ROW_SIZE
@@ -133,7 +133,7 @@ class _Board:
         return (self.words[MADE] - self.words[FIRST]) // ROW_SIZE
 
     def stop(self) -> None:
-        """Nobody is woken for that."""
+        """Stop it without waking it."""
         self.words[ORDER] += 1
 
     def order(self, what: int) -> None:

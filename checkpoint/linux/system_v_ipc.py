@@ -32,10 +32,10 @@ class Segment(Struct, frozen=True):
     """One segment.
 
     Attributes:
-        key: signed; 0 where nobody can ask for it by a key.
+        key: signed; 0 where no process can ask for it by a key.
         permissions: of a file, and `SHM_DEST`.
         attached: mappings of it, in all processes.
-        creator: uid of who made it, and may use it whoever owns it; -1 where that is not known.
+        creator: uid of the user that made it, and may use it under any owner; -1 where that is not known.
         changed: when it was made, or its owner set, in seconds of the wall clock; 0 where that is not known.
     """
 
@@ -125,7 +125,7 @@ def wipe(segment: Segment) -> None:
 
 
 def remove(identifier: int) -> None:
-    """Remove a segment, as soon as nobody has it attached any more; one that is gone is no error."""
+    """Remove a segment, as soon as no process has it attached any more; one that is gone is no error."""
     _libc.shmctl(identifier, IPC_RMID, None)
 
 

@@ -14,7 +14,7 @@ PATH_SIZE_MAX: Final = 107
 
 @contextmanager
 def address_of(path: Path) -> Iterator[str]:
-    """What to bind or connect a socket to for it to lie at ``path``; valid inside the body.
+    """The address to bind or connect a socket to, so that it lies at ``path``; valid inside the body.
 
     A path that is too long for an address is reached through a descriptor of its directory.
 

@@ -45,7 +45,7 @@ def eyes_for(pid: int, owner: Owner | None) -> Eyes:
 
 
 def own_uid() -> int:
-    """Whose rights to files count just now: what is made belongs to him. Source: setfsuid(2), which always answers."""
+    """The user whose rights to files count just now; new files belong to him. Source: setfsuid(2), which always answers."""
     return int(_LIBC.setfsuid(-1)) & 0xFFFFFFFF
 
 

@@ -71,7 +71,7 @@ def gathered_within(host: int, contents: Sequence[Buffer], sources: PageMap, pag
 
 
 def gathered_bytes(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> NDArray[np.uint8]:
-    """The same, for who has to change them yet. Neighbours from one copy are copied at once."""
+    """The same, for a caller that has to change them yet. Neighbours from one copy are copied at once."""
     buffer = np.empty(len(sources.addresses) * page_size, dtype=np.uint8)
     _copy_stretches(contents, sources.words, buffer, page_size)
     return buffer

@@ -42,7 +42,7 @@ DIGESTED = 1024
 
 
 def extents(runs: Iterable[PageRun | PageCopy | Vma]) -> Words:
-    """The set that runs or mappings cover, whatever their order and overlap."""
+    """The set that runs or mappings cover, in any order and overlap."""
     edges = [edge for run in runs if run.start < run.end for edge in (run.start, run.end)]
     told = np.array(edges, dtype=np.uint64).reshape(-1, 2)
     if len(told) < 2 or (told[1:, 0] > told[:-1, 1]).all():
@@ -262,7 +262,7 @@ def _rows(contents: Buffer, page_size: int) -> NDArray[np.uint8]:
     return np.frombuffer(contents, dtype=np.uint8).reshape(-1, page_size)
 
 
-# What a state holds at each page
+# The content of a state at each page
 
 
 class PageMap(Struct, frozen=True, eq=False):
@@ -285,7 +285,7 @@ class PageMap(Struct, frozen=True, eq=False):
         """Drop the pages outside the set ``kept`` and those in ``forgotten``.
 
         Returns:
-            What is left, and the words of the pages that went.
+            The rest, and the words of the pages that went.
         """
         dropped = ~_covered_in_order(kept, self.addresses) | _covered_in_order(forgotten, self.addresses)
         if not dropped.any():

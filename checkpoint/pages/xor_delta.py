@@ -21,7 +21,7 @@ Rows: TypeAlias = "NDArray[np.uint8]"
 """Bytes of pages, one row a page."""
 
 Reference = Callable[[Words], Rows]
-"""What a state holds at these addresses, which are in order; raises ChainError where there is no page."""
+"""The content of a state at these addresses, which are in order; raises ChainError where there is no page."""
 
 CHANGED_LIMIT: Final = 1 / 2
 """A page of which more than this part has changed is told whole: it compresses better by itself."""
@@ -45,7 +45,7 @@ def are_worth_it(differences: Rows) -> Flags:
 
 
 def tellable(delta: Snapshot) -> Words:
-    """The pages of a delta that may be told as differences: what was there before is there still, and no copy is of them.
+    """The pages of a delta that may be told as differences: their earlier content is there still, and no copy is of them.
 
     Returns:
         Their addresses, in order.

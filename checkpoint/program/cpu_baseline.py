@@ -13,18 +13,18 @@ from checkpoint.arch import levels as arch
 from checkpoint.arch import stubs
 
 VARIABLE: Final = "FAILOVER_PORTABLE"
-"""Holds the level, for whoever looks at the program later."""
+"""Holds the level, for later looks at the program."""
 TUNABLES: Final = "GLIBC_TUNABLES"
 HWCAPS: Final = "glibc.cpu.hwcaps"
 LEVELS: Final = arch.LEVELS
-"""Those of this machine's processor, the lowest first."""
+"""The levels of this machine's processor, the lowest first."""
 DEFAULT: Final = arch.DEFAULT
 
 
 def environment(given: Mapping[str, str], level: str) -> dict[str, str]:
     """Variables of a program that is to move between processors of a level and above.
 
-    What is set already stays; of the C library's tunables, which are many in one, ours come besides.
+    Variables that are set already stay. The C library's tunables are many in one variable: ours are added to them.
     """
     tunables = [one for one in given.get(TUNABLES, "").split(":") if one]
     others = [one for one in tunables if not one.startswith(f"{HWCAPS}=")]
@@ -43,7 +43,7 @@ def level_in(environ: bytes) -> str:
 
 
 def features_used(features: tuple[str, ...], level: str) -> tuple[str, ...]:
-    """Of a processor's features those that a program may have chosen its code by."""
+    """The features of a processor by which a program may have chosen its code."""
     if not level:
         return features
     beyond = stubs.INSTRUCTION_SETS - arch.flags_of(level)

@@ -19,7 +19,7 @@ from typing import Final, Protocol
 
 VARIABLE: Final = "FAILOVER_EPOCH"
 DIGITS: Final = 20
-"""Of any epoch: it is less than 2**64."""
+"""Digits of any epoch: it is less than 2**64."""
 
 ENVIRONMENT_MAX: Final = 8 << 20
 """Bytes of an environment that are looked through; the kernel allows a quarter of the stack's limit, 2 MiB by default."""
@@ -28,10 +28,10 @@ _ASSIGNMENT: Final = f"{VARIABLE}=".encode()
 
 
 class Memory(Protocol):
-    """Of a process."""
+    """The memory of a process."""
 
     def read(self, address: int, size: int) -> bytes:
-        """So many bytes."""
+        """Read bytes at an address."""
         ...
 
     def write_each(self, contents: list[tuple[int, bytes]]) -> None:
@@ -40,7 +40,7 @@ class Memory(Protocol):
 
 
 def assignment(epoch: int) -> bytes:
-    """What a program is born with."""
+    """The variable that a program is born with."""
     return _ASSIGNMENT + digits(epoch)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 NAME: Final = "failover-scratch"
-"""Of a memory file (memfd_create(2)) that is mapped shared: it is mapped again where the program goes on, and holds zeros."""
+"""The name of a memory file (memfd_create(2)) that is mapped shared: a restore maps it again, filled with zeros."""
 
 MAPPED: Final = f"/memfd:{NAME} (deleted)"
-"""What the kernel calls it in /proc/PID/maps and /proc/PID/fd."""
+"""The kernel's name for it in /proc/PID/maps and /proc/PID/fd."""

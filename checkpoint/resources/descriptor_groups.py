@@ -23,7 +23,7 @@ Group = tuple[Descriptor, ...]
 """Descriptors of one open file, lowest number first."""
 _Identity = tuple[int | bytes, ...]
 _SAME, _BEFORE = 0, 1
-"""What kcmp(2) says of two."""
+"""The answers of kcmp(2) about two."""
 
 
 class _Alike(Struct, frozen=True):
@@ -117,12 +117,12 @@ def _is(one: object, other: object) -> bool:
 
 
 def _identity(one: Descriptor) -> _Identity:
-    """What all descriptors of one open file have in common."""
+    """The facts that all descriptors of one open file have in common."""
     return one.device, one.inode, one.offset, one.flags & ~os.O_CLOEXEC, _own_number(one)
 
 
 def _own_number(one: Descriptor) -> bytes:
-    """What tells an eventfd from all others; b"" for other kinds, and on kernels before 4.20. Source: fs/eventfd.c."""
+    """The number that tells an eventfd from all others; b"" for other kinds, and on kernels before 4.20. Source: fs/eventfd.c."""
     return one.told.partition(b"eventfd-id:")[2].partition(b"\n")[0]
 
 

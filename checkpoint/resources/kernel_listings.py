@@ -19,7 +19,7 @@ Group = tuple[int, str]
 """A multicast group: interface and address."""
 _PEER_COLUMN: Final = 2
 _INODE_COLUMN: Final = 9
-"""Of net/raw, icmp and tcp, and of net/netlink."""
+"""Columns of net/raw, icmp and tcp, and of net/netlink."""
 
 LISTS_MAX: Final = 16
 """Lists of multicast groups that are remembered with what they mean: they are the same from one look to the next."""
@@ -38,7 +38,7 @@ class Listings:
         self._packet_sockets: Mapping[int, PacketSocket] | None = None
 
     def groups(self, pid: int, family: int) -> tuple[Group, ...]:
-        """All multicast groups that anybody has joined, and a socket of a family may be in: one of AF_INET6 may be in any."""
+        """All joined multicast groups that a socket of this family may be in: one of AF_INET6 may be in any."""
         if family not in self._groups:
             self._groups[family] = _listed_groups(pid, family)
         return self._groups[family]
@@ -76,7 +76,7 @@ class Listings:
         return self._lines[table].get(inode, [])
 
     def peer(self, pid: int, table: str, family: int, inode: int) -> list[Fact]:
-        """Whom a socket is connected with, or asks for a connection; empty for none.
+        """The address with which a socket is connected, or asks for a connection; empty for none.
 
         Args:
             table: "raw", "icmp" or "tcp".

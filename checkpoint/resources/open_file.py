@@ -41,7 +41,7 @@ ALONE: Final = Kin()
 
 
 class Lent:
-    """A descriptor of ours that is closed when nobody looks at it any more."""
+    """A descriptor of ours that is closed when no object refers to it any more."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -52,10 +52,10 @@ class Lent:
 
 
 class Signals(Struct, frozen=True):
-    """What an open file sends, to whom.
+    """The signals that an open file sends, and their receiver.
 
     Attributes:
-        signal: 0 for SIGIO; ``kind``: F_OWNER_TID, F_OWNER_PID or F_OWNER_PGRP; ``owner``: 0 for nobody.
+        signal: 0 for SIGIO; ``kind``: F_OWNER_TID, F_OWNER_PID or F_OWNER_PGRP; ``owner``: 0 for none.
     """
 
     signal: int = 0
@@ -70,9 +70,9 @@ class OpenFile(Struct, frozen=True, eq=False):
     """One open file description and every descriptor that shares it, lowest number first.
 
     Attributes:
-        content: what waits in a pipe, read while the process stood still; None where that was not needed.
+        content: the bytes that wait in a pipe, read while the process stood still; None where that was not needed.
         capacity: of a pipe, in bytes.
-        both_ends: of a pipe: the process itself has another descriptor for its other end, or nobody has.
+        both_ends: of a pipe: the process itself has another descriptor for its other end, or no process has.
         is_its_own: the former alone.
         observed: facts that only the process standing still could tell, as its kind's ``observe`` found them.
         kin: the other processes of its component.
@@ -80,8 +80,8 @@ class OpenFile(Struct, frozen=True, eq=False):
             this one alone.
         is_echo: another process of the component has told of it already.
         lent: through which it is looked at, if it is on its way to the program (`scm_rights`); ``pid`` is ours then.
-        owners: what is known of who has owners, of a process that is looked at again and again.
-        signals: what it sends, to whom, if that was asked while the process stood still; else none, or it is asked now.
+        owners: the known owners of signals, of a process that is looked at again and again.
+        signals: the signals that it sends, if that was asked while the process stood still; else none, or it is asked now.
     """
 
     pid: int
@@ -99,7 +99,7 @@ class OpenFile(Struct, frozen=True, eq=False):
     signals: Signals | None = None
 
     def __eq__(self, other: object) -> bool:
-        """What is known of owners makes no other open file of one."""
+        """Compare all but the known owners: they do not make it another open file."""
         return isinstance(other, OpenFile) and astuple(replace(self, owners=None)) == astuple(replace(other, owners=None))
 
     __hash__ = None  # type: ignore[assignment]
@@ -111,7 +111,7 @@ class OpenFile(Struct, frozen=True, eq=False):
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Its name in reports."""
         return self.first.name
 
     @property
@@ -121,16 +121,16 @@ class OpenFile(Struct, frozen=True, eq=False):
 
 
 class Surroundings(Struct, frozen=True):
-    """What the kinds must know about the process's guard.
+    """The facts about the process's guard that the kinds must know.
 
     Attributes:
         pipes: "pipe:[123]" or a terminal's path → stream 0, 1 or 2: of a component under a guard, or what its first process has.
-        devices: what the operator wants to become of devices.
+        devices: the operator's rules for devices.
         connections: TCP connections with others go along where it is handed over.
         is_first: it is about the first process of a component.
         detached: by device and inode number, the shared memory that becomes the program's own copy, and how much of it, from its
             beginning on, the component has mapped; None where the operator's rules say that such a program is refused.
-        terms: what else the operator has ruled.
+        terms: the operator's other rules.
         may_repeat: the program may go on from an older state than its last output, as after a takeover: unlike a restore of what
             stood still for good.
     """
@@ -145,7 +145,7 @@ class Surroundings(Struct, frozen=True):
 
 
 class Held(Struct, frozen=True):
-    """What a process's descriptors are."""
+    """The resources behind a process's descriptors, and the findings about them."""
 
     resources: tuple[Resource, ...]
     findings: tuple[Finding, ...]
@@ -157,7 +157,7 @@ class Held(Struct, frozen=True):
 
 
 class Recalled(Struct, frozen=True):
-    """What a socket answers as it did at the last look.
+    """The facts of a socket that answers as at the last look.
 
     Attributes:
         settings: facts that follow from what the program has set.
@@ -169,21 +169,21 @@ class Recalled(Struct, frozen=True):
 
 
 class Opened(tuple[OpenFile, ...]):
-    """All open files of a process, one entry for those that share one; and what is asked once for many of them."""
+    """All open files of a process, one entry for those that share one; and facts that are asked once for many of them."""
 
     @functools.cached_property
     def listings(self) -> Listings:
-        """What is read once for all of them."""
+        """The kernel's lists, read once for all of them."""
         return Listings()
 
     @functools.cached_property
     def recalled(self) -> dict[int, Recalled]:
-        """Of sockets that are, in part at least, as they were at the last look, by their descriptors."""
+        """Sockets that are, in part at least, as they were at the last look, by their descriptors."""
         return {}
 
     @functools.cached_property
     def travelling(self) -> list[OpenFile]:
-        """What is on its way to the process and not open in it, as far as it was found."""
+        """Open files on their way to the process and not open in it, as far as they were found."""
         return []
 
     @functools.cached_property

@@ -34,11 +34,11 @@ AGE_NS: Final = 1_000_000_000
 KIN_AGE_NS: Final = 5_000_000_000
 """The same while several processes stand still: `look_around` came before."""
 PRIVATE_KNOWN: Final = 8192
-"""Open files remembered as held by nobody else."""
+"""Open files remembered as held by no other process."""
 
 
 class _HeldElsewhereError(Exception):
-    """Another process has it, too: what must be asked again next time."""
+    """Another process has it, too: this must be asked again next time."""
 
     def __init__(self, pid: int) -> None:
         super().__init__(pid)
@@ -64,7 +64,7 @@ def _holder_besides(held: OpenFile) -> int | None:
 
 
 def _others(held: OpenFile, name: str = "") -> Iterator[tuple[int, int]]:
-    """Who else had something of the same name, or of another, open when we last looked, and still has."""
+    """Processes that had something of the same name, or of another, open when we last looked, and still have."""
     name = name or held.first.target
     age_ns, asker = (KIN_AGE_NS, 0) if held.kin.pids else (AGE_NS, held.pid)
     for other, number in CENSUS.holders(name, age_ns, asker):
@@ -96,7 +96,7 @@ def reader_of(held: OpenFile) -> int | None:
 
 
 def opener_of(held: OpenFile) -> int | None:
-    """Another process that has a file of the same name open; what was opened in the last second may be missed."""
+    """Another process that has a file of the same name open; an open of the last second may be missed."""
     return next((other for other, _ in _others(held)), None)
 
 
@@ -115,7 +115,7 @@ def opener_at(held: OpenFile, name: str, place: tuple[int, int]) -> int | None:
 
 
 def refuse(held: OpenFile, what: str) -> str | None:
-    """Why something that is ``what`` cannot be kept: somebody else has it, too."""
+    """Why something that is ``what`` cannot be kept: another process has it, too."""
     if (other := holder_of(held)) is None:
         return None
     return f"{held.name} is {what} that pid {other} holds too: protect the program when that has ended"
@@ -129,7 +129,7 @@ def _require_private(pid: int, number: int, target: str) -> None:
 
 
 class _Census:
-    """What all processes but ours have open: (process, number) by the kernel's name for it."""
+    """The open files of all processes but ours: (process, number) by the kernel's name for each."""
 
     def __init__(self) -> None:
         self._taken_ns = 0
@@ -137,10 +137,10 @@ class _Census:
         self._found: dict[str, list[tuple[int, int]]] = {}
 
     def holders(self, target: str, age_ns: int = AGE_NS, asker: int = 0) -> list[tuple[int, int]]:
-        """Who had it, as far back as is allowed.
+        """The processes that had it, as far back as is allowed.
 
         Args:
-            asker: about which process it is asked: another one than last time takes a census of its own; 0: of several.
+            asker: the process that the question is about: another one than last time takes a census of its own; 0: several.
         """
         now_ns = time.monotonic_ns()
         if not self._taken_ns or now_ns - self._taken_ns > age_ns or (asker and asker != self._asker):
@@ -158,7 +158,7 @@ CENSUS: Final = _Census()
 
 
 def look_around() -> None:
-    """Take the census now if it is old, so that nobody has to while a program stands still."""
+    """Take the census now if it is old, so that no capture has to while a program stands still."""
     CENSUS.holders("")
 
 

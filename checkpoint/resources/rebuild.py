@@ -72,7 +72,7 @@ AT_EMPTY_PATH: Final = 0x1000
 OWN_ATTRIBUTES: Final = ("user.", "system.posix_acl_")
 """How attributes begin that belong to a file as its content does. Source: xattr(7)."""
 ENTRIES_SIZE: Final = 1024
-"""Bytes that hold the first entries of a directory, whatever their names."""
+"""Bytes that hold the first entries of a directory, however long their names are."""
 STREAMS: Final = (0, 1, 2)
 MADE: Final[Mapping[str, Callable[[CallTable, Resource, Rebuilding], int]]] = {
     eventfd.KIND: eventfd.rebuild,
@@ -248,7 +248,7 @@ def _prepare_sockets(
 
 
 def _settle(table: CallTable, wanted: list[Wanted], holders: Mapping[int, int]) -> None:
-    """What refers to other descriptors: all of them are there now."""
+    """Set what refers to other descriptors: all of them are there now."""
     marked = frozenset(one.number for one in wanted if one.close_on_exec)
     for one in wanted:
         if one.resource.kind == epoll.KIND and holders[id(one.resource)] == one.number:
@@ -339,7 +339,7 @@ def _open(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
     path, flags = str(facts["path"]), number_of(facts["flags"])
     brought = rebuilding.objects.get((number_of(facts.get("device", 0)), number_of(facts.get("inode", 0))))
     if brought is not None and not flags & O_PATH:
-        path = f"/proc/self/fd/{brought}"  # what was brought along in its place
+        path = f"/proc/self/fd/{brought}"  # the file that was brought along in its place
     descriptor = table.open(path, flags & (O_PATH | os.O_NOFOLLOW | os.O_DIRECTORY if flags & O_PATH else REOPENED_FLAGS))
     if held.kind == "files" and not flags & O_PATH:
         options = rebuilding.options
@@ -434,7 +434,7 @@ def _fill(table: CallTable, made: int, held: Resource) -> None:
 
 
 def _written_pieces(begin: int, content: bytes) -> Iterator[tuple[int, bytes]]:
-    """What of a part of a file is not zero, in whole pages, and where: the rest becomes holes."""
+    """The pieces of a part of a file that are not zero, in whole pages, and their places: the rest becomes holes."""
     filled = [start for start in range(0, len(content), PAGE_SIZE) if content[start : start + PAGE_SIZE].strip(b"\0")]
     for _, run in groupby(enumerate(filled), key=lambda one: one[1] - one[0] * PAGE_SIZE):
         starts = [start for _, start in run]

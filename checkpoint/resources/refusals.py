@@ -85,8 +85,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "mapped files that were replaced or deleted since the program started",
-        "the old files are carried, up to 64 MiB each, and compared at every checkpoint; what is written to an old file "
-        "still shows in its mappings",
+        "the old files are carried, up to 64 MiB each, and compared at every checkpoint; writes to an old file "
+        "still show in its mappings",
         "KiB of the old one are carried",
     ),
     refused(
@@ -141,7 +141,7 @@ ANONYMOUS_INODES: Final[Mapping[str, str]] = {
     "userfaultfd": "a userfaultfd",
     "perf_event": "a perf event",
 }
-"""What /proc calls a descriptor without a path → what people call it."""
+"""/proc's name for a descriptor without a path → the usual name."""
 
 _MAPPINGS: Final = (
     (re.compile(r"anon_inode:\[io_uring\]"), "the rings of an io_uring"),
@@ -166,12 +166,12 @@ _VM_FLAGS: Final[Mapping[str, str]] = {
 """VmFlags of proc_pid_smaps(5) that no fresh mapping can be given."""
 
 HUGE_NAME: Final = "/anon_hugepage"
-"""What the kernel calls memory of huge pages that has no file."""
+"""The kernel's name for memory of huge pages that has no file."""
 ORPHAN_LIMIT: Final = 64 << 20
 """Bytes of one mapping of a deleted file that are carried: every freeze reads them all, a millisecond for 4 MiB."""
 
 KERNEL_PLACES: Final = ("/proc/", "/sys/")
-"""Where nobody can make a directory."""
+"""Places where no program can make a directory."""
 
 _KERNEL_PAGES: Final = ("[vvar", "[vdso", "[vsyscall")
 """Mappings that the kernel gives every process: they move, see `checkpoint.engines.ptrace.restore.memory`."""
@@ -186,7 +186,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Name what nobody else took."""
+    """Refuse, by name, an open file that no other kind took."""
     return f"{held.name} is {_called(held)}, which {_ADVICE}"
 
 
@@ -313,7 +313,7 @@ def refuse_process(
 
     Args:
         kin: all processes of its component, if there are several.
-        files_kept: somebody keeps its program file by content, so that it need not be there any more.
+        files_kept: a store keeps its program file by content, so that it need not be there any more.
         detaches_memory: shared memory that others have mapped, too, becomes its own copy.
         lines: its mappings, where they are known.
     """
@@ -348,7 +348,7 @@ def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
 
 
 def _refuse_memory(lines: Sequence[MapsLine]) -> Iterator[str]:
-    """What our own calls inside it need."""
+    """Why our own calls inside it are impossible."""
     if all(line.name != _VDSO for line in lines):
         yield "it has no vdso (it unmapped it, or the kernel was started with vdso=0), by which a capture enters it"
 
@@ -383,7 +383,7 @@ def _refuse_namespaces(pid: int) -> Iterator[str]:
 
 
 def _has_other_for_children(pid: int, kind: str) -> bool:
-    """Whether those whom it gives birth to live in another namespace than it; the link leads nowhere before the first one.
+    """Whether its children live in another namespace than it; the link leads nowhere before the first child.
 
     Source: exit_task_namespaces() in do_exit(): of a process that ends, long before it is told, no link but those of ``pid`` and
     ``user`` leads anywhere.

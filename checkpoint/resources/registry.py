@@ -24,7 +24,7 @@ Observer = Callable[[OpenFile, Opened], Mapping[str, Fact]]
 
 
 class Kind(Protocol):
-    """What every file of this room has; for an open file of another kind both answer None."""
+    """The contract of a module for one kind; for an open file of another kind both answer None."""
 
     KIND: str
 
@@ -63,7 +63,7 @@ ASKED: Final[tuple[Kind, ...]] = (
     refused,
     refusals,
 )
-"""The last one refuses whatever no other took."""
+"""The last one refuses everything that no other took."""
 
 _OBSERVED: Final[Mapping[str, Observer]] = {
     timerfd.TARGET: timerfd.observe,
@@ -75,7 +75,7 @@ _OBSERVED: Final[Mapping[str, Observer]] = {
 
 
 def observer_of(one: Descriptor, noted: sockets.Noted | None) -> Observer | None:
-    """What asks an open file for what only a process that stands still can tell.
+    """The function that asks an open file for facts that only a process that stands still can tell.
 
     Args:
         noted: see `sockets.queue_of`; None for a process that runs.
@@ -124,7 +124,7 @@ def _observe_internet_socket(
 
 
 def findings_of_all(resources: Sequence[Resource], surroundings: Surroundings, *, standing: bool) -> tuple[Finding, ...]:
-    """What can be told only of all resources of all processes of a component together.
+    """Findings about all resources of all processes of a component together.
 
     Args:
         standing: they all stood still.
@@ -141,4 +141,4 @@ def findings_of_all(resources: Sequence[Resource], surroundings: Surroundings, *
 
 
 OF_ALL: Final = frozenset(kind.KIND for kind in (tcp, inet, unix, netlink, packet, regular, pidfd))
-"""Kinds of `findings_of_all`: what is noted of these may be otherwise at the next capture."""
+"""Kinds of `findings_of_all`: the notes about these may differ at the next capture."""

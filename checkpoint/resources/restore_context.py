@@ -59,7 +59,7 @@ def ended_place(held: Resource) -> tuple[int, int]:
 
 
 def numbers_of_thread(resources: Iterable[Resource], kind: str, tid: int) -> Iterator[list[int]]:
-    """What a kind tells of a thread, whose ``threads`` are lists of numbers, each with the thread's id first: those after it."""
+    """The numbers that a kind tells of a thread. Its ``threads`` are lists, each with a thread's id before these numbers."""
     for held in resources:
         threads = held.facts["threads"] if held.kind == kind else []
         assert isinstance(threads, list)

@@ -28,7 +28,7 @@ OpenedByAll = dict[int, Opened]
 
 
 def together(opened: Mapping[int, Sequence[OpenFile]]) -> OpenedByAll:
-    """The same, each open file knowing who shares it, and each pipe whether its other end is one of theirs."""
+    """The same; each open file knows the processes that share it, and each pipe whether its other end is one of theirs."""
     every = [held for ours in opened.values() for held in ours]
     kin = _kin(opened, every)
     numbers, echoes = _numbered(every)

@@ -22,12 +22,12 @@ CAPABILITIES: Final = (
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
-    """That it is the same one."""
+    """The resource that names it as the same open file."""
     if not held.is_echo:
         return None
     return Resource(KIND, held.name, {"descriptors": held.numbers, "description": held.description, "path": held.first.target})
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """What can be shared is said by the first of them."""
+    """Refuse nothing here: the first process that has it does."""
     return None

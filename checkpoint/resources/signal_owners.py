@@ -63,14 +63,14 @@ def overlooked(opened: Sequence[OpenFile], known: Owners) -> OpenFile | None:
 
 
 def of(held: OpenFile) -> Signals:
-    """What it sends: as it was told in the freeze, or, of a process that is looked at but once, now."""
+    """The signals that it sends: as told in the freeze, or, of a process that is looked at but once, now."""
     if held.signals is not None:
         return held.signals
     return ask(held) if held.owners is None else NOTHING_SENT
 
 
 def ask(held: OpenFile) -> Signals:
-    """What it sends now, asked through a copy of the descriptor; nothing where there is none any more."""
+    """The signals that it sends now, asked through a copy of the descriptor; nothing where there is none any more."""
     if held.first.flags & O_PATH:
         return NOTHING_SENT
     with contextlib.suppress(OSError), copy_of(held.pid, held.first.number) as descriptor:

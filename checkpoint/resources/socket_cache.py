@@ -44,10 +44,10 @@ class _Known(Struct):
         asking: None until the program runs again.
         groups: multicast groups of the machine that it was asked about.
         settings, state: what it answered; ``state`` None where that says nothing of the next time.
-        listed: what the kernel's lists say of it.
-        facts: what that means.
+        listed: the entries of the kernel's lists about it.
+        facts: the meaning of those answers.
         seen: the open file, and the same with all that was observed.
-        again: what is told of it where it answers as before; None if that must be worked out.
+        again: the resource to tell where it answers as before; None if that must be worked out.
     """
 
     inode: int
@@ -66,9 +66,9 @@ class _Alike(Struct):
 
     Attributes:
         places: of their descriptors among those that are asked at a time.
-        heard: what all of them answered at the last look; b"" where one of them had something new to say, or could not be asked.
-        again: what is told of them where they answer as before, by their descriptors.
-        listed: those of whom the kernel's lists say something.
+        heard: the answers of all at the last look; b"" where one of them had something new to say, or could not be asked.
+        again: the resources to tell where they answer as before, by their descriptors.
+        listed: those that the kernel's lists name.
     """
 
     asking: Asking
@@ -88,7 +88,7 @@ class _AtATime(Struct, frozen=True):
 
     @classmethod
     def of(cls, some: Sequence[tuple[OpenFile, _Known]]) -> _AtATime:
-        """Those of a kind together."""
+        """Sockets at a time, those of a kind together."""
         kinds: dict[Asking, _Alike] = {}
         for place, (one, known) in enumerate(some):
             if known.asking is not None:
@@ -99,7 +99,7 @@ class _AtATime(Struct, frozen=True):
 
 
 class _Round(Struct, frozen=True):
-    """Who is asked, as long as the open files are the very same.
+    """The sockets to ask, as long as the open files are the very same.
 
     Attributes:
         opened: all open files.
@@ -127,7 +127,7 @@ class _Answer(Struct, frozen=True):
 
 
 class Recollection:
-    """What is known of the sockets of one process that is looked at again and again."""
+    """The known facts of the sockets of one process that is looked at again and again."""
 
     def __init__(self) -> None:
         self._known: dict[int, _Known] = {}
@@ -151,7 +151,7 @@ class Recollection:
             if known.asking is None:
                 try:
                     subject = _subject(known.facts, known.groups)
-                except OSError:  # we have no descriptor left: it is looked into, and that says why not
+                except OSError:  # we have no descriptor left: the look into it reports the cause
                     continue
                 self._round = None
                 known.asking = wanted.get(subject) or self._askings.get(subject) or Asking(subject)
@@ -171,20 +171,20 @@ class Recollection:
             self._second = SecondThread.where_it_gains()
 
     def are_plain(self, opened: Opened, is_plain: Callable[[OpenFile], bool]) -> bool:
-        """Whether there is nothing among these to be looked into, nor was; asked once of open files that are the very same.
+        """Whether we need not look into any of these, nor had to before; asked once about open files that are the very same.
 
         Args:
-            is_plain: of one; it follows from what is told of it, which never changes.
+            is_plain: tells it of one; the answer follows from facts of it that never change.
         """
         if self._known or self._pipes:
             return False
         return self._are_plain.of(*opened, make=lambda: all(map(is_plain, opened)))
 
     def recall(self, opened: Opened) -> dict[int, _Answer]:
-        """Ask every socket that was there last time; ``opened`` is told what is as it was. The process stands still.
+        """Ask every socket that was there last time; ``opened`` learns the unchanged ones. The process stands still.
 
         Returns:
-            What those answered that have something new to say, for `remember`.
+            The answers of those that have something new to say, for `remember`.
         """
         if self._round is None or not self._round.holds(opened):
             self._round = self._round_of(opened)
@@ -198,7 +198,7 @@ class Recollection:
         return changed
 
     def _round_of(self, opened: Opened) -> _Round:
-        """Whom to ask now; what was told of them is worked out anew, for it may have followed from others."""
+        """The sockets to ask now. Their resources are worked out anew, for they may have followed from other sockets."""
         held = [one for one in opened if sockets.is_socket(one.first) and not one.is_echo]
         asked = tuple((one, known) for one in held if (known := self._asked_of(one, opened)) is not None)
         for _, known in asked:
@@ -286,7 +286,7 @@ def _recall_alike(
 
 
 def _recalled(one: OpenFile, known: _Known, told: Told, opened: Opened) -> _Answer | None:
-    """What a socket answers, unless that is known."""
+    """The answer of a socket, unless it is known."""
     settings, state = told
     listed = _listed(one, known.facts, opened)
     if known.again is not None and told == (known.settings, known.state) and listed == known.listed:
@@ -301,7 +301,7 @@ def _recalled(one: OpenFile, known: _Known, told: Told, opened: Opened) -> _Answ
     if facts["family"] == socket.AF_UNIX:
         try:
             facts = unix.again(one, facts, opened)
-        except OSError:  # whoever looks into it says why
+        except OSError:  # the next look into it reports the cause
             return _Answer(settings, state, listed)
     if known.seen is None or known.seen[0] is not one or facts is not known.seen[1].observed:
         known.seen = one, replace(one, observed=facts)
@@ -338,7 +338,7 @@ def _may_join(facts: Mapping[str, Fact]) -> bool:
 
 
 def _listed(one: OpenFile, facts: Mapping[str, Fact], opened: Opened) -> object:
-    """What only the kernel's lists say of a socket."""
+    """The facts about a socket that only the kernel's lists tell."""
     if not _is_listed(facts):
         return 0
     if facts["family"] == socket.AF_UNIX:

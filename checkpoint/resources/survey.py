@@ -42,7 +42,7 @@ def pipes_of(outputs: Sequence[int]) -> dict[str, int]:
 
 
 class Kept:
-    """What is kept of a process that is looked at again and again, so that only what has changed is read anew."""
+    """Facts kept of a process that is looked at again and again, so that only changes are read anew."""
 
     def __init__(self, pid: int) -> None:
         self.texts = KeptTexts(pid)
@@ -118,7 +118,7 @@ def with_contents(
 
 
 def _is_plain(held: OpenFile) -> bool:
-    """Whether nothing is to be looked into: what its descriptors say is all that there is. It follows from them alone."""
+    """Whether we need not look into it: its descriptors tell everything. The answer follows from them alone."""
     first = held.first
     if held.is_echo or held.lent or held.observed:
         return False
@@ -129,7 +129,7 @@ def _is_plain(held: OpenFile) -> bool:
 
 
 def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollection | None = None) -> list[OpenFile]:
-    """All of them, sockets looked into, and what was found on its way in these."""
+    """All of them, sockets looked into, and the open files found on their way in these."""
     answers = recollection.recall(opened) if recollection else {}
     known = {number: one.whole for number, one in opened.recalled.items() if one.whole is not None}
     found = [
@@ -157,7 +157,7 @@ def _with_travelling(opened: Opened, noted: Noted | None, recollection: Recollec
 
 
 def _looked_into(held: OpenFile, opened: Opened, noted: Noted | None) -> OpenFile:
-    """A socket as it is observed now; as it was where it cannot be, of which whoever asks next is told."""
+    """A socket as it is observed now; as it was where that fails: the next question about it reports the cause."""
     if not held.is_echo and sockets.is_socket(held.first):
         with contextlib.suppress(CaptureError):
             return replace(held, observed=registry.observe_socket(held, opened, noted=noted))
@@ -172,10 +172,10 @@ def _may_be_half(held: OpenFile) -> bool:
 def glance(pid: int, kin: Kin = ALONE) -> tuple[OpenFile, ...]:
     """Read every descriptor of a process that runs on: enough to tell what is refused.
 
-    What it closes between two of our looks is neither there nor gone: then all is looked at again.
+    A file that it closes between two of our looks is neither there nor gone: then all is looked at again.
 
     Args:
-        kin: what is known of the other processes of its component.
+        kin: the known facts of the other processes of its component.
     """
     found = _glanced(pid, kin)
     for _ in range(GLANCES_MORE):
@@ -208,9 +208,9 @@ def _glanced(pid: int, kin: Kin) -> tuple[OpenFile, ...]:
 
 
 def look(opened: Sequence[OpenFile], surroundings: Surroundings) -> Held:
-    """Sort one process's open files into the kinds: what comes back, and what does not.
+    """Sort one process's open files into the kinds: those that come back, and those that do not.
 
-    What can be told only of all processes of a component together is told by `registry.findings_of_all`.
+    `registry.findings_of_all` tells the findings about all processes of a component together.
     """
     resources, findings = [], []
     for held in opened:

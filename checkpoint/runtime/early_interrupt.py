@@ -46,7 +46,7 @@ def loaded() -> None:
 def left(status: int) -> int:
     """End this process with a status, as the interpreter would, but without taking apart what it has loaded: that takes 10 ms.
 
-    Where something stands against it (other threads, output that nobody takes) it answers the status, for the long way.
+    Where something stands against it (other threads, output that no reader takes) it answers the status, for the long way.
     """
     if threading.active_count() > 1:
         return status

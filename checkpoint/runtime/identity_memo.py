@@ -14,7 +14,7 @@ _Result = TypeVar("_Result")
 
 
 class Memo(Generic[_Result]):
-    """One result, and what it is of. Those things are never changed in place."""
+    """One result, and its arguments. These are never changed in place."""
 
     def __init__(self) -> None:
         self._last: tuple[tuple[object, ...], _Result] | None = None

@@ -25,6 +25,6 @@ else:
 
     np = _Later()
     NDArray = ()
-    """For annotations, which nobody evaluates."""
+    """For annotations, which are not evaluated."""
 
 __all__ = ["NDArray", "np"]

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from concurrent.futures import Future, ThreadPoolExecutor
 
 THREADS: Final = 4
-"""No more: the memory's bandwidth, and whoever else works on this machine."""
+"""No more: the memory's bandwidth is limited, and other programs work on this machine."""
 AHEAD: Final = 4
-"""Pieces a thread that are begun before the oldest result is taken: what waits is held in memory."""
+"""Pieces a thread that are begun before the oldest result is taken: waiting results are held in memory."""
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -28,16 +28,16 @@ def thread_count() -> int:
 
 
 def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Generator[B, None, None]:
-    """What ``work`` answers for each piece, in their order; one thread is our own alone.
+    """The answer of ``work`` for each piece, in their order; one thread is our own alone.
 
-    What a piece raises is raised in its place, and so is what the iterable raises: after the answers of all pieces before it.
+    An error of a piece is raised in its place, and so is one of the iterable: after the answers of all pieces before it.
     No thread is left when the generator is exhausted, closed or has raised. Each has the precedence that ours has at the first
-    piece: who waits for others comes no sooner than they do.
+    piece: a thread that waits for others comes no sooner than they do.
     """
     if threads < 2:
         yield from map(work, pieces)
         return
-    from concurrent.futures import ThreadPoolExecutor  # who has nothing large to do starts without it
+    from concurrent.futures import ThreadPoolExecutor  # a process without large work starts without it
 
     begun: deque[Future[B]] = deque()
     rest = iter(pieces)
@@ -65,7 +65,7 @@ def in_order(work: Callable[[A], B], pieces: Iterable[A], threads: int) -> Gener
 
 
 def in_rows(pieces: Iterable[A], count: int) -> Iterator[tuple[A, ...]]:
-    """So many pieces at a time, as `in_order` takes them where each is soon done; the last row may be shorter."""
+    """Pieces in rows of ``count``, as `in_order` takes them where each is soon done; the last row may be shorter."""
     rest = iter(pieces)
     while row := tuple(islice(rest, count)):
         yield row
@@ -80,13 +80,13 @@ class OwnBuffers:
 
     @property
     def own(self) -> memoryview:
-        """That of the calling thread."""
+        """The buffer of the calling thread."""
         if not hasattr(self._of_thread, "buffer"):
             self._of_thread.buffer = memoryview(bytearray(self._size))
         return self._of_thread.buffer  # type: ignore[no-any-return]
 
     def give_away(self) -> None:
-        """Leave it to whoever has a part of it: the next one is new."""
+        """Leave it to the holders of its parts: the next one is new."""
         del self._of_thread.buffer
 
 

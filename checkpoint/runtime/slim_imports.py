@@ -38,7 +38,7 @@ def begin() -> None:
 
 
 NUMPYS_TYPES: Final = "numpy._typing"
-"""What its annotations are made of; in the few that are evaluated a list does for an array."""
+"""The types of its annotations; in the few that are evaluated a list does for an array."""
 NUMPYS_TEXTS: Final = ("numpy._core._add_newdocs", "numpy._core._add_newdocs_scalars")
 """They write docstrings, and do nothing else."""
 NUMPYS_THREADS: Final = "OPENBLAS_NUM_THREADS"
@@ -46,7 +46,7 @@ NUMPYS_THREADS: Final = "OPENBLAS_NUM_THREADS"
 
 
 def load_numpy() -> None:
-    """Import numpy without what takes half of the time: threads, types and texts. Who asks for its types later finds them.
+    """Import numpy without the parts that take half of the time: threads, types and texts. Its types can be imported later.
 
     Only for processes of ours that start no program meanwhile: it would inherit a variable.
     """
@@ -73,7 +73,7 @@ def load_numpy() -> None:
 
 
 def load_seldom_used() -> None:
-    """Import what was left for when it is used: soon this process may have no right to read it."""
+    """Import now what was left for its first use: soon this process may have no right to read it."""
     for name in SELDOM_USED:
         if isinstance(stand_in := sys.modules.get(name), _Seldom):
             vars(stand_in).update(vars(stand_in.loaded()))
@@ -101,7 +101,7 @@ class _Seldom(ModuleType):
         with _standing_in:
             if sys.modules.get(self.__name__) is self:
                 del sys.modules[self.__name__]
-        return import_module(self.__name__)  # whoever comes meanwhile waits for it here
+        return import_module(self.__name__)  # other threads that come meanwhile wait for it here
 
 
 _standing_in: Final = Lock()

@@ -26,7 +26,7 @@ from checkpoint.runtime.lazy_numpy import NDArray, np
 MAGIC: Final = b"\x89FOSEG\r\n"
 VERSION: Final = 1
 PAGE: Final = 4096
-"""Bytes of a segment's page, whatever the machine's own are: so a state moves between machines."""
+"""Bytes of a segment's page, also on machines with other pages: so a state moves between machines."""
 
 BANKS: Final = 3
 """One is newest, one may be held by a reader, one is free."""
@@ -88,7 +88,7 @@ class Region(Struct, frozen=True):
 
 
 class Layout(Struct, frozen=True):
-    """What lies where in a segment; everything else follows from these.
+    """The places in a segment; everything else follows from these.
 
     Attributes:
         lineage: 16 bytes; the numbers of commits and versions can be compared between segments of one lineage.
@@ -185,9 +185,9 @@ def address_of(place: int) -> int:
 
 
 class Pending(enum.Enum):
-    """What a commit says of its output that had no room in its pipes: part of it lies in the program's buffers still.
+    """The mark of a commit whose output had no room in its pipes: part of it lies in the program's buffers still.
 
-    How much that is nobody knows. Whoever carries output passes such a commit over; a later one tells it all.
+    The size of that part is not known. A reader that carries output passes such a commit over; a later one tells it all.
     """
 
     PENDING = 2
@@ -199,11 +199,11 @@ TOLD: Final = 1
 """The other things that a record says of its program's output."""
 
 Outputs = tuple[int, int] | Pending | None
-"""Bytes that a program had written to its standard output and error at a commit; None where nobody counts them."""
+"""Bytes that a program had written to its standard output and error at a commit; None where they are not counted."""
 
 
 class Committed(Struct, frozen=True, eq=False):
-    """What a program committed, whole or since an earlier commit.
+    """The state that a program committed, whole or since an earlier commit.
 
     Attributes:
         number: of the commit; the first is 1.

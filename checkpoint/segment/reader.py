@@ -140,7 +140,7 @@ class SegmentReader:
 
     @contextmanager
     def _held(self, bank: int) -> Iterator[bool]:
-        """Hold a bank so that nobody writes it; False if it is being written."""
+        """Hold a bank so that the program does not write it; False if it is being written."""
         try:
             fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, lock_of(fcntl.F_RDLCK, bank))
         except BlockingIOError:
@@ -183,7 +183,7 @@ class SegmentReader:
         while target:
             count = os.preadv(self._file, [target], offset)
             if count == 0:
-                raise SegmentError(f"segment: it ends at byte {offset}, in the middle of what it should hold")
+                raise SegmentError(f"segment: it ends at byte {offset}, in the middle of its content")
             target, offset = target[count:], offset + count
 
 

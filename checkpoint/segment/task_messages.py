@@ -69,7 +69,7 @@ class Begin(Struct, frozen=True):
     Attributes:
         component: its name.
         epoch: of the primacy under which it runs: the fencing token.
-        pipes: inode numbers of its standard output and error: whoever finds others there has redirected them.
+        pipes: inode numbers of its standard output and error: a program that finds others there has redirected them.
     """
 
     component: str
@@ -122,7 +122,7 @@ def _begin_body(begin: Begin) -> bytes:
 
 
 def from_program(packet: bytes) -> FromProgram:
-    """What a program says.
+    """Decode a message of a program.
 
     Raises:
         TaskPacketError: it is no such packet; says why.
@@ -135,7 +135,7 @@ def from_program(packet: bytes) -> FromProgram:
 
 
 def from_guard(packet: bytes) -> FromGuard:
-    """What a guard says.
+    """Decode a message of a guard.
 
     Raises:
         TaskPacketError: it is no such packet; says why.

@@ -41,20 +41,20 @@ from checkpoint.segment.layout import (
 Bytes: TypeAlias = "NDArray[np.uint8]"
 
 NAME: Final = "failover-segment"
-"""What /proc/PID/fd and /proc/PID/maps call it."""
+"""Its name in /proc/PID/fd and /proc/PID/maps."""
 
 HANDED_NAME: Final = "failover-handed"
 """…and one that is handed to a program to go on from: it must not be taken for the one that its commits go to."""
 
 COMPARE_SIZE: Final = 1 << 18
-"""Bytes compared at a time where nobody tells which pages were written."""
+"""Bytes compared at a time where the written pages are not known."""
 
 _NEWEST: Final = NEWEST_OFFSET // WORD
 
 RUNS_MAX: Final = 1024
 """Stretches of pages that are copied one by one; more are copied by numpy."""
 
-# These calls keep the interpreter: whoever lets it go in the middle of a commit, be it for a microsecond, may get it back from
+# These calls keep the interpreter: a commit that lets it go in the middle, be it for a microsecond, may get it back from
 # the thread that writes the file only after sys.getswitchinterval(), 5 ms.
 _libc = ctypes.PyDLL(None, use_errno=True)
 _memcmp = _libc.memcmp
@@ -68,12 +68,12 @@ _fcntl.restype = ctypes.c_int
 
 
 class Source(Struct, frozen=True, eq=False):
-    """What one region holds now.
+    """The content of one region now.
 
     Attributes:
         content: its bytes from the beginning; it may be shorter than the region, whose rest is zeros then. Few bytes are
             written fastest as ``bytes``: numpy's calls take longer than their work.
-        written: numbers of its pages that may have changed since the last commit; None where nobody knows: they are compared.
+        written: numbers of its pages that may have changed since the last commit; None where unknown: they are compared.
     """
 
     content: Bytes | bytes
@@ -84,7 +84,7 @@ class SegmentWriter:
     """A segment that this process writes.
 
     Attributes:
-        descriptor: what a reader is handed; whoever inherits it by fork must close it, or it keeps this process's locks alive.
+        descriptor: is handed to a reader. A child that inherits it by fork must close it, or it keeps this process's locks alive.
         number: of the newest commit.
 
     Raises:
@@ -118,7 +118,7 @@ class SegmentWriter:
         self._firsts = layout.first_pages()
         self._counts = [region.page_count for region in layout.regions]
         self._versions = np.zeros(layout.page_count, dtype=np.uint64)
-        """Of every page: the commit that changed it last."""
+        """For every page the commit that changed it last."""
         self._version_words = self._versions.data
         self._stamp_words = [
             memoryview(self._memory)[layout.versions_offset(bank) :][: layout.page_count * WORD].cast("Q")
@@ -165,7 +165,7 @@ class SegmentWriter:
         1. Its record says that it holds nothing, before the first byte of it changes.
         2. Pages and versions; then the times and the bytes of output; then the commit's number: the bank is whole.
         3. The lock ends, and only then the newest word names the bank: no reader that follows it meets the lock, and
-           whoever gets the lock sees all of this.
+           the next holder of the lock sees all of this.
         """
         record = (RECORDS_OFFSET + bank * RECORD_SIZE) // WORD
         since, self._held[bank] = self._held[bank], 0
@@ -294,7 +294,7 @@ class SegmentWriter:
         self._rows[0][here : here + count][held] = other._rows[other._newest][first : first + count][held]
 
     def supersede(self) -> None:
-        """Tell readers that commits go on elsewhere."""
+        """Tell readers that later commits go to another segment."""
         self._words[SUPERSEDED_OFFSET // WORD] = 1
 
     def close(self) -> None:

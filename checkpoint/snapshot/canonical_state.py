@@ -41,7 +41,7 @@ MAX_FACT_DEPTH = 8
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a listing shows of a snapshot. Fields are those of ``Snapshot``; counts are of its lists.
+    """The facts of a snapshot that a listing shows. Fields are those of ``Snapshot``; counts are of its lists.
 
     Attributes:
         contents_size: bytes of page contents before compression.
@@ -275,7 +275,7 @@ def decode_output(packed: bytes | memoryview) -> tuple[OutputPiece, ...]:
 
 
 def state_digest(snapshot: Snapshot) -> bytes:
-    """What a position's digest must be: the first 16 bytes of blake3(page sum ‖ blake3(state bytes))."""
+    """The digest that a position must have: the first 16 bytes of blake3(page sum ‖ blake3(state bytes))."""
     return blake3(snapshot.page_sum + blake3(encode_state(snapshot)).digest()).digest(length=STATE_DIGEST_SIZE)
 
 

@@ -134,7 +134,7 @@ def every_path(state: Snapshot) -> tuple[str, ...]:
 
 
 def without(state: Snapshot) -> Snapshot:
-    """The snapshot of the program alone: what is left is what its process holds."""
+    """The snapshot of the program alone: the rest is what its process holds."""
     if not paths_of(state) and not any(vma.kind is VmaKind.CARRIED_FILE for vma in state.vmas):
         return state
     runs = tuple(run for run in state.runs if run.start < FIRST_ADDRESS)
@@ -149,7 +149,7 @@ def without(state: Snapshot) -> Snapshot:
 
 
 def relocated(state: Snapshot, places: Mapping[str, str]) -> Snapshot:
-    """The same base with carried paths that lie elsewhere here: for what is open or mapped, and the working directory, too.
+    """The same base with carried paths that lie elsewhere here: also for open and mapped files, and the working directory.
 
     Args:
         places: by the path that the snapshot tells of, the path here. Others stay where they are.
@@ -197,7 +197,7 @@ def _listed_at(one: Fact, here: Callable[[str], str]) -> Fact:
 
 
 def pieces(state: Snapshot) -> Mapping[int, list[tuple[int, memoryview]]]:
-    """What a base holds of each stretch: (offset in the file, bytes in whole pages), in order."""
+    """A base's content of each stretch: (offset in the file, bytes in whole pages), in order."""
     found: dict[int, list[tuple[int, memoryview]]] = {}
     content, position = memoryview(state.contents).cast("B"), 0
     for run in state.runs:

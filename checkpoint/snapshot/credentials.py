@@ -1,6 +1,6 @@
 """The rights that a snapshot gets when it is restored: what its threads ask for, limited to the rights of its owner.
 
-`bounded` is the only limit: a snapshot goes through it wherever it is restored for an owner who is not root. `excess` lists the
+`bounded` is the only limit: a snapshot goes through it wherever it is restored for an owner other than root. `excess` lists the
 rights that it takes away, and `beyond` lists rights that only root can have (an agent refuses that). Threads with other rights
 than their first one are in a resource of their own kind, which `checkpoint.resources.process.thread_credentials` makes.
 
@@ -26,9 +26,9 @@ KIND: Final = "thread_rights"
 CONFINED: Final = "seccomp"
 """The kind of resource of `checkpoint.resources.process.seccomp`."""
 LOGIN: Final = "logins"
-"""That of `checkpoint.resources.process.audit_login`."""
+"""The kind of resource of `checkpoint.resources.process.audit_login`."""
 SECBIT_KEEP_CAPS: Final = 1 << 4
-"""The one of the securebits that anybody may set; execve(2) takes it back."""
+"""The one of the securebits that any process may set; execve(2) takes it back."""
 SCHED_DEADLINE: Final = 6
 REAL_TIME: Final = (os.SCHED_FIFO, os.SCHED_RR, SCHED_DEADLINE)
 IO_REAL_TIME: Final = 1
@@ -61,7 +61,7 @@ Process = TypeVar("Process", Snapshot, Member)
 
 
 def at_most(theirs: Credentials, owner: Owner) -> Credentials:
-    """What is left of these rights for an owner: the user, those of the groups that are the owner's, and nothing above that."""
+    """The part of these rights that an owner has: the user, those of the groups that are the owner's, and nothing above that."""
     gid = theirs.gids[1] if owner.may_have(theirs.gids[1:2]) else owner.gid
     groups = tuple(group for group in theirs.groups if owner.may_have((group,)))
     return Credentials((owner.uid,) * 4, (gid,) * 4, groups, NOTHING, theirs.no_new_privs)
@@ -70,7 +70,7 @@ def at_most(theirs: Credentials, owner: Owner) -> Credentials:
 def bounded(state: Snapshot, owner: Owner) -> Snapshot:
     """The same snapshot with the rights of its owner at most, in all threads of all processes.
 
-    The kernel bounds the rest (priorities, limits, files, devices): who restores it has become the owner by then.
+    The kernel bounds the rest (priorities, limits, files, devices): the process that restores it has become the owner by then.
     """
     members = tuple(_bounded(member, owner) for member in state.members)
     return replace(_bounded(state, owner), members=members)
@@ -83,7 +83,7 @@ def _bounded(one: Process, owner: Owner) -> Process:
 
 
 def excess(state: Snapshot | State, owner: Owner) -> tuple[str, ...]:
-    """What a snapshot asks for that is not an owner's, each with its figure; nothing if it asks for no more than the owner has.
+    """The rights that a snapshot asks for beyond those of an owner, each with its figure; none if the owner has them all.
 
     Raises:
         FormatError: it is told in another way than we know.
@@ -104,11 +104,11 @@ def refusal(asked: Iterable[str], owner: Owner) -> str:
 
 
 def beyond(state: Snapshot | State, owner: Owner) -> Iterator[str]:
-    """What only root can give: users, groups, capabilities, securebits, filters and root directories. As `excess`."""
+    """Rights that only root can give: users, groups, capabilities, securebits, filters and root directories. As `excess`."""
     for theirs in everybodys(state):
         yield from above(theirs, owner)
     if could_gain(state):
-        yield "a seccomp filter, and may gain rights by what it executes (no_new_privs is off)"
+        yield "a seccomp filter, and may gain rights by programs that it executes (no_new_privs is off)"
     for directory in sorted({one.process.root_directory for one in (state, *state.members)} - {"/"}):
         yield f"a root directory of its own ({directory}), by whose files it may gain rights"
 
@@ -188,7 +188,7 @@ def could_gain(outline: Snapshot | State) -> bool:
 
 
 def _filtered(resources: Iterable[Resource]) -> Iterator[int]:
-    """The ids of threads that have filters; of strict mode nobody is born who has other rights."""
+    """The ids of threads that have filters. Strict mode is left out: no thread of strict mode is born with other rights."""
     for held in resources:
         for fact in _listed(held.facts.get("threads")) if held.kind == CONFINED else ():
             match _listed(fact):

@@ -67,7 +67,7 @@ def encode(snapshot: Snapshot, file: Sink, *, threads: int = 1) -> int:
 
 
 def begin(snapshot: Snapshot, contents_size: int) -> tuple[Preamble, bytes]:
-    """What stands before the frames: the preamble, and all sections as they are stored.
+    """The bytes before the frames: the preamble, and all sections as they are stored.
 
     Raises:
         FormatError: a section, or all pages together, are larger than the format allows.
@@ -88,7 +88,7 @@ def check_contents_size(size: int, limit: int = layout.MAX_CONTENTS_SIZE) -> Non
 
 
 def worth(threads: int, preamble: Preamble) -> int:
-    """So many of these threads as the frames are worth."""
+    """The number of these threads that the frames are worth."""
     return threads if preamble.frame_count >= WORTH_THREADS else 1
 
 
@@ -172,7 +172,7 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
 
 
 def read_header(source: Source) -> Header:
-    """Read and verify the header alone: cheap, whatever the size of the file.
+    """Read and verify the header alone: cheap, for a file of any size.
 
     Raises:
         FormatError: no header of ours; the rest of the file is not looked at.
@@ -320,9 +320,9 @@ def _read_outline(reader: Reader, preamble: Preamble) -> Snapshot:
         differences=table.differences,
     )
     if (expected := _version_of(snapshot)) != preamble.version:
-        raise FormatError(f"format version {preamble.version}: what it holds has version {expected}")
+        raise FormatError(f"format version {preamble.version}: its content has version {expected}")
     if canonical_state.header_of(snapshot) != header:
-        raise FormatError("header: does not describe what the other sections hold")
+        raise FormatError("header: does not describe the other sections")
     check_snapshot(snapshot, contents_size=preamble.contents_size)
     return snapshot
 

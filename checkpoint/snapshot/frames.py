@@ -55,7 +55,7 @@ class Packer:
         return Body(codec, content, len(raw), layout.digest_of(content))
 
     def each(self, raws: Sequence[memoryview]) -> list[Body]:
-        """Those of several."""
+        """The bodies of several frames."""
         with self._borrowed() as compressor:
             stored = compression.stored_each(raws, compressor)
         told = zip(raws, stored, strict=True)

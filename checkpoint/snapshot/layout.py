@@ -67,7 +67,7 @@ class Codec(enum.IntEnum):
 
 
 class SectionKind(enum.IntEnum):
-    """What a section holds; sections stand in this order."""
+    """The content of a section; sections stand in this order."""
 
     HEADER = 1
     STATE = 2
@@ -201,7 +201,7 @@ def _parse_sections(packed: bytes) -> tuple[Section, ...]:
 
 
 class FrameHead(Struct, frozen=True):
-    """What precedes a frame's body.
+    """The head before a frame's body.
 
     Attributes:
         padding: zero bytes between head and body, so that a raw body is aligned.

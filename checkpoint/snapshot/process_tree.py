@@ -41,7 +41,7 @@ def shifted_runs(runs: Iterable[PageRun], slot: int) -> tuple[PageRun, ...]:
 
 
 def every_mapping(snapshot: Snapshot) -> Sequence[Vma | PageRun]:
-    """What is mapped by any of its processes, in the order of the snapshot's pages."""
+    """The mappings of all its processes, in the order of the snapshot's pages."""
     if not snapshot.members:
         return snapshot.vmas
     found: list[Vma | PageRun] = [*snapshot.vmas]

@@ -22,7 +22,7 @@ PROGRAM: Final = "program"
 """The kind of resource of `checkpoint.engines.cooperative.program_files`."""
 
 MEMORY_PLACE: Final = "/dev/shm/"
-"""What lies here is memory with a name, and no file that could be brought."""
+"""Files here are memory with a name: they cannot be brought along."""
 
 WRITE: Final = 2
 ACCESS_MODE: Final = 3
@@ -74,7 +74,7 @@ class ProgramFile(Struct, frozen=True):
 
 
 def program_of(state: Snapshot) -> tuple[ProgramFile, ...]:
-    """What a program is started again from (`checkpoint.engines.cooperative.program_files`), the first by its command."""
+    """The files that start a program again (`checkpoint.engines.cooperative.program_files`), the first by its command."""
     held = next((one for one in state.resources if one.kind == PROGRAM), None)
     files = held.facts.get("files") if held is not None else None
     found = []
@@ -106,7 +106,7 @@ def _need(file: FileIdentity) -> Need:
 
 
 def _is_run(vma: Vma) -> bool:
-    """Whether it is mapped from a file with a name, and only to be read: what is written to the file is another matter."""
+    """Whether it is mapped from a file with a name, and only to be read: files that the program writes do not count here."""
     file = vma.file
     if vma.kind is not VmaKind.FILE or file is None or file.deleted or not stat.S_ISREG(file.mode):
         return False

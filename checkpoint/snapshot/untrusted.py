@@ -26,20 +26,20 @@ NOT_UNDERSTOOD: Final = (
     ValueError,
     struct.error,
 )
-"""What comes of a fact that is not what it is taken for."""
+"""Errors that a fact of the wrong type or value causes."""
 
 log = logging.getLogger("failover.foreign")
 
 
 @contextlib.contextmanager
 def facts(what: str) -> Iterator[None]:
-    """Read, and act upon, what a snapshot says.
+    """Read, and act upon, the facts of a snapshot.
 
     Args:
-        what: is done with it, for a sentence: "restore /lab/a".
+        what: the act, for a sentence: "restore /lab/a".
 
     Raises:
-        FormatError: it says something that is not understood. Perhaps that is our mistake: where it happened is logged.
+        FormatError: a fact is not understood. Perhaps that is our mistake: the place is logged.
     """
     try:
         yield
@@ -51,7 +51,7 @@ def facts(what: str) -> Iterator[None]:
 
 
 def sentence(what: str, error: Exception) -> str:
-    """That something cannot be done, and why: what the kernel does not do may be this machine's fault, too."""
+    """The sentence that something cannot be done, and why: a refusal of the kernel may be this machine's fault, too."""
     if isinstance(error, OSError):
         cure = "if this machine lacks nothing for that, take a new snapshot: this one asks too much"
         return f"cannot {what}: {in_words(error)}; {cure}"

@@ -125,7 +125,7 @@ def _check_members(snapshot: Snapshot, page_size: int) -> None:
 
 
 def _check_descent(parents: Mapping[int, int]) -> None:
-    """Nobody is an ancestor of its own: whoever is followed upwards comes to the first process, or to nobody."""
+    """No process is an ancestor of its own: the way up from each ends at the first process, or at a parent that is not listed."""
     settled: set[int] = set()
     for pid in parents:
         line: set[int] = set()
@@ -161,7 +161,7 @@ def _check_copies(snapshot: Snapshot, page_size: int) -> None:
         raise FormatError(f"copies: {_span(stray, np.intp(0))}, of which one is, is not carried")
     size = sum(copy.size for copy in snapshot.copies) + sum(run.size for run in snapshot.runs)
     if size > MAX_CONTENTS_SIZE:
-        raise FormatError(f"copies: {size} bytes with what they are of, above the limit of {MAX_CONTENTS_SIZE}")
+        raise FormatError(f"copies: {size} bytes with their sources, above the limit of {MAX_CONTENTS_SIZE}")
 
 
 def _check_differences(snapshot: Snapshot, page_size: int) -> None:

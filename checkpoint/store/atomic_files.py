@@ -70,7 +70,7 @@ class WholeFiles:
             os.close(descriptor)
 
     def _ensure_folder(self, folder: Path) -> None:
-        with self._lock:  # the one for what is set aside belongs to all components
+        with self._lock:  # the folder of files set aside belongs to all components
             if not folder.is_dir():
                 self._disk.make_folder(folder)
                 self._disk.sync_folder(folder.parent)
@@ -108,4 +108,4 @@ def disk_trouble(tried: str) -> Iterator[None]:
         yield
     except OSError as error:
         cure = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        raise StoreError(f"cannot {tried}: {error.strerror}{cure}; what the store held is intact") from error
+        raise StoreError(f"cannot {tried}: {error.strerror}{cure}; the snapshots in the store are intact") from error

@@ -62,12 +62,12 @@ class UnreadBase(Struct, frozen=True):
         return self._finish(file, writer, preamble, page_set.sum_of(np.concatenate(sums)))
 
     def _finish(self, file: RawIOBase, writer: FrameWriter, draft: Preamble, page_sum: bytes) -> tuple[Snapshot, int]:
-        """Write what is known now, after the frames and before them."""
+        """Write the parts that are known now, after the frames and before them."""
         told = replace(self.outline, page_sum=page_sum)
         position = chain.position_of(told, told.position.generation, told.position.sequence)
         told = replace(told, position=position)
         preamble, sections = format.begin(told, draft.contents_size)
-        assert preamble.frames_offset == draft.frames_offset, "a sum and a digest are as long whatever they are"
+        assert preamble.frames_offset == draft.frames_offset, "a sum and a digest are as long for any content"
         file_size = writer.finish(preamble)
         file.seek(0)
         write_all(file, preamble.pack() + sections)

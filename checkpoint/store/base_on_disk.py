@@ -37,12 +37,12 @@ KEPT: Final = 4
 
 
 class StoredBase:
-    """What a chain's files amount to, of which the first one, the base's, stays open; a `checkpoint.pages.source.PageSource`.
+    """The state that a chain's files amount to; the base's file stays open. A `checkpoint.pages.source.PageSource`.
 
     Attributes:
-        outline: what they amount to, without its bytes.
+        outline: that state, without its bytes.
         reader: of the base's file; ``preamble``: its own; ``base_pages``: those that it tells.
-        chain: what was read: the base without its bytes, and the deltas.
+        chain: the files as read: the base without its bytes, and the deltas.
         origins: where its pages come from; None where there are no deltas.
 
     Raises:
@@ -83,7 +83,7 @@ class StoredBase:
     # All pages
 
     def within(self, wanted: Words) -> StoredBase:
-        """Itself: what is left out could not be proved."""
+        """Itself: pages that are left out could not be proved."""
         return self
 
     def each(self, take: Taker, threads: int) -> None:
@@ -111,7 +111,7 @@ class StoredBase:
         yield from parallel.in_order(taken, rows, format.worth(threads, self.preamble))
 
     def _current(self, row: Words, content: memoryview) -> tuple[Words, Buffer]:
-        """What the deltas have left of pages of the base, with what they have changed in them."""
+        """The pages of the base that the deltas have left, with the deltas' changes in them."""
         if self.origins is None:
             return row, content
         sources, addresses = self.origins.sources, page_set.addresses_of(row, self._page_size)
@@ -198,7 +198,7 @@ def stored_base(*sources: Source) -> Iterator[StoredBase]:
 
 @contextmanager
 def stored_chain(base: Path, deltas: Sequence[Snapshot]) -> Iterator[StoredBase]:
-    """The same of deltas that have been read. What the body raises is not of the file, and does not name it."""
+    """The same of deltas that have been read. Errors of the body are not about the file, and do not name it."""
     try:
         file = open(base, "rb", buffering=0)  # noqa: SIM115
     except OSError as error:

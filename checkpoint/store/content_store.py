@@ -1,7 +1,7 @@
 """Store the files of programs by content: ``STORE/contents/HEX``, named by the blake3 digest of the content.
 
 Invariants: a file stands under its name whole, or not at all (`checkpoint.store.atomic_files`); none is ever changed. Every user
-who can reach the store (it is ours alone) can read and execute all of them. They have none of the other powers of the originals,
+that can reach the store (it is ours alone) can read and execute all of them. They have none of the other powers of the originals,
 such as lending their owner's rights. One content is kept once, for any number of programs, paths and snapshots that name it; the
 store removes content that no snapshot of the store names.
 """
@@ -63,7 +63,7 @@ class Contents:
         return stat.S_ISREG(about.st_mode) and about.st_size == size
 
     def hold(self, digest: bytes, size: int) -> bool:
-        """Whether it is kept, and stays for `GRACE_S` whoever names it: a snapshot that relies on it is on its way."""
+        """Whether it is kept, and stays for `GRACE_S` also without a snapshot that names it: one is on its way."""
         if not self.has(digest, size):
             return False
         with contextlib.suppress(OSError):  # removed in this instant
@@ -74,7 +74,7 @@ class Contents:
         """Keep the content of a file; when this returns it survives a power cut.
 
         Args:
-            source: descriptor of the whole file, which has this digest: whoever received it has counted. It stays the caller's.
+            source: descriptor of the whole file, which has this digest: its receiver has computed it. It stays the caller's.
             own: we have made it: an unnamed one (O_TMPFILE) on the store's file system is taken as it is. That of a program is
                 copied, unnamed or not: its owner could go on writing to it.
 
@@ -92,7 +92,7 @@ class Contents:
         Raises:
             StoreError: the disk does not let us.
         """
-        with disk_trouble(f"set the modes of what is in {self._folder}"):
+        with disk_trouble(f"set the modes of the files in {self._folder}"):
             for path in self._folder.iterdir() if self._folder.is_dir() else ():
                 if stat.S_IMODE(path.lstat().st_mode) != CONTENT_MODE and not path.name.startswith(TEMPORARY_PREFIX):
                     os.chmod(path, CONTENT_MODE)
@@ -107,7 +107,7 @@ class Contents:
             return os.open(self.path(digest), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
 
     def collect(self, needed: Collection[bytes], now_s: float | None = None) -> int:
-        """Remove what nobody needs; how many bytes that were.
+        """Remove contents that no snapshot needs; answers with the bytes removed.
 
         Args:
             needed: digests that some snapshot names.

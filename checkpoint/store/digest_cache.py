@@ -1,6 +1,6 @@
 """Cache digests of files that have not changed, so that they need not be read again.
 
-Source: inode(7): ctime is the kernel's own, and every write, also one through a mapping, sets it; only a user who sets the clock
+Source: inode(7): ctime is the kernel's own, and every write, also one through a mapping, sets it; only a user that sets the clock
 could keep it unchanged.
 """
 
@@ -25,7 +25,7 @@ DigestOf = Callable[[str], bytes]
 
 
 class FileVersion(Struct, frozen=True):
-    """What changes when a file does."""
+    """Facts that change when a file does."""
 
     device: int
     inode: int

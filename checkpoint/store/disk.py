@@ -11,7 +11,7 @@ from typing import Final
 
 FILE_MODE = 0o600
 FOLDER_MODE = 0o700
-"""Memory is secret: nobody else reads a snapshot."""
+"""Memory is secret: no other user may read a snapshot."""
 
 COPY_SIZE = 1 << 20
 """Bytes copied at a time."""
@@ -106,7 +106,7 @@ class DiskFile:
         return written
 
     def _write_back(self) -> None:
-        """Begin to write what the file has grown by, and wait for what was begun before; a disk that refuses writes later."""
+        """Begin to write the file's new bytes, and wait for those begun before; a disk that refuses this writes later."""
         _sync_file_range(self._descriptor, self._begun, WRITEBACK_SIZE, _WRITE)
         if self._begun:
             before = self._begun - WRITEBACK_SIZE

@@ -76,13 +76,13 @@ class Folding:
         return writer.finish(self._preamble)
 
     def _pages_told_anew(self) -> Flags:
-        """Of the state's pages, those that a delta has told, whole or as a difference."""
+        """The pages of the state that a delta has told, whole or as a difference."""
         anew: Flags = self._origins.sources.words[:, 0] > 0
         anew[np.searchsorted(self._origins.sources.addresses, self._origins.changed)] = True
         return anew
 
     def _pages_gone(self) -> Flags:
-        """Of the base's pages, those whose content is not the state's any more."""
+        """The pages of the base whose content is not the state's any more."""
         kept = self._origins.sources.addresses[~self._told_anew]
         gone: Flags = np.ones(len(self._base_addresses), dtype=np.bool_)
         gone[np.searchsorted(self._base_addresses, kept)] = False
@@ -90,7 +90,7 @@ class Folding:
 
     def _require_sum(self) -> None:
         for index in page_set.distinct(np.flatnonzero(self._gone).astype(np.uint64) // np.uint64(self._count)).tolist():
-            self._rows_of_base(index)  # what went of it is seen now, if it was not before
+            self._rows_of_base(index)  # notes the pages that went, if they were not noted before
         before = chain.by_itself(self._stored.chain[0])
         after = page_set.add_to_sum(before.page_sum, np.concatenate(self._added), np.concatenate(self._removed))
         chain.check_sum(self._outline, after)

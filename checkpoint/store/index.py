@@ -61,7 +61,7 @@ class Shelf(Struct, frozen=True):
         return Shelf(self.component, tuple(entry for entry in self.entries if entry not in removed))
 
     def positions(self) -> tuple[Position, ...]:
-        """What can be restored, oldest first."""
+        """The positions that can be restored, oldest first."""
         return tuple(entry.position for entry in self._restorable())
 
     def newest(self) -> Position | None:

@@ -26,7 +26,7 @@ PIECE_SIZE: Final = 4 << 20
 
 
 class MemberPages:
-    """Those of one process, a `checkpoint.pages.source.PageSource`.
+    """The pages of one process, a `checkpoint.pages.source.PageSource`.
 
     Args:
         carried: its pages, extents at its own addresses.
@@ -42,7 +42,7 @@ class MemberPages:
         self._places = places
 
     def within(self, wanted: Words) -> MemberPages:
-        """Those of its pages that are in a set."""
+        """Its pages that are in a set."""
         addresses = page_set.addresses_of(self._carried, self._page_size)
         kept = page_set.covered(wanted, addresses)
         if kept.all():

@@ -18,7 +18,7 @@ from checkpoint.snapshot.validity import place
 
 
 class Origins(Struct, frozen=True, eq=False):
-    """Those of one state.
+    """The origins of one state's pages.
 
     Attributes:
         sources: for each page where it was last told whole: (index in the chain, index of the page there).
@@ -32,7 +32,7 @@ class Origins(Struct, frozen=True, eq=False):
 
     @classmethod
     def of(cls, chain: Sequence[Snapshot]) -> Origins:
-        """Those of a chain; a base needs no contents.
+        """The origins for a chain; a base needs no contents.
 
         Raises:
             ChainError: a page is told as the difference from one that is not there.
@@ -80,7 +80,7 @@ class _Layer(Struct, frozen=True, eq=False):
     rows: Rows
 
     def lasting(self, sources: PageMap) -> _Layer:
-        """What of it no later snapshot has set or taken away."""
+        """The part of it that no later snapshot has set or taken away."""
         found, places = page_set.found_among(sources.addresses, self.addresses)
         found[found] = sources.words[places, 0] < np.uint64(self.index)
         return _Layer(self.index, self.addresses[found], self.places[found], self.rows)
@@ -90,7 +90,7 @@ def _newest_sources(chain: Sequence[Snapshot], page_size: int) -> tuple[PageMap,
     """For every page of the folded state where it was last told whole: (index in the chain, index of the page there).
 
     Returns:
-        That, and what was told as differences, oldest first.
+        That, and the pages told as differences, oldest first.
 
     Raises:
         ChainError: a page is told as the difference from one that is not there.

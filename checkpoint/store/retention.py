@@ -47,7 +47,7 @@ class Old(Struct, frozen=True):
 
 
 class History:
-    """The folder, and what is in it. May be called from any thread."""
+    """The folder, and its files. May be called from any thread."""
 
     def __init__(self, root: Path, files: WholeFiles, retention: Retention) -> None:
         """
@@ -67,7 +67,7 @@ class History:
             self._olds[folder.name] = tuple(sorted(found, key=lambda old: old.stored_s))
 
     def of(self, folder: str) -> tuple[Old, ...]:
-        """What is kept of the component with this folder, oldest first."""
+        """The snapshots kept of the component with this folder, oldest first."""
         return self._olds.get(folder, ())
 
     @property
@@ -125,7 +125,7 @@ class History:
             self._remove(folder, self.of(folder))
 
     def _remove(self, folder: str, olds: list[Old] | tuple[Old, ...]) -> None:
-        with disk_trouble(f"remove what was kept in {self._root / folder}"):
+        with disk_trouble(f"remove old snapshots in {self._root / folder}"):
             for old in olds:
                 self._files.remove(old.path)
                 self._olds[folder] = tuple(one for one in self._olds[folder] if one != old)

@@ -5,7 +5,7 @@ whole and on the disk: written aside, synced, renamed, folder synced. So an ackn
 that did not arrive whole leaves only a temporary file that the next opening removes.
 
 There are two kinds of lock, taken in this order. Each component has one for the thread that changes its files, for as long as
-that takes (a base may be gigabytes). The store has one for what is known of all components, held for moments only. Readers wait
+that takes (a base may be gigabytes). The store has one for its index of all components, held for moments only. Readers wait
 for the second alone: a takeover never waits for a snapshot that is being written, proved or folded.
 """
 
@@ -57,7 +57,7 @@ ASIDE_LIMIT = 4
 LOCK_NAME = "lock"
 
 NOTICES_KEPT = 100
-"""Of what was found damaged or left over."""
+"""Notices about files that were found damaged or left over."""
 
 NOTHING_OLD = Retention()
 
@@ -65,7 +65,7 @@ A = TypeVar("A")
 
 
 class Kept(Struct, frozen=True):
-    """What the store has of one component, for people.
+    """The store's content for one component, for people.
 
     Attributes:
         positions: that the rules may go back to; ``olds``: whole checkpoints besides, kept for people.
@@ -98,9 +98,9 @@ class Store:
         self._shelves: dict[str, Shelf] = {}
         self._proofs = Proofs(budget, self._decoded)
         self._made_last: dict[str, tuple[Path, Snapshot]] = {}
-        """Of each component what was put last without a proof, without its pages and its output, and where."""
+        """Of each component the snapshot that was put last without a proof, without its pages and its output, and where."""
         self.notices: list[str] = []
-        """What was found damaged or left over: one sentence each."""
+        """Files that were found damaged or left over: one sentence each."""
 
     # Asking
 
@@ -137,7 +137,7 @@ class Store:
     def open_chain(self, component: str, position: Position | None = None) -> list[int]:
         """Descriptors of the files that lead to a position, a base first; the caller closes them.
 
-        They stay readable whatever the store does with the files meanwhile.
+        They stay readable, also if the store removes or moves the files meanwhile.
         """
         opened: list[int] = []
         try:
@@ -146,7 +146,7 @@ class Store:
                     opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
                     if why := why_not_ours(os.fstat(opened[-1])):
                         raise StoreError(
-                            f"cannot use {entry.path}: {why}; remove it, and see who may write to the store {self._root}"
+                            f"cannot use {entry.path}: {why}; remove it, and check the write rights of the store {self._root}"
                         )
         except StoreError:
             for descriptor in opened:
@@ -206,7 +206,7 @@ class Store:
         return snapshots
 
     def kept(self, component: str) -> Kept | None:
-        """What is here of a component; None if nothing is."""
+        """The stored snapshots of a component; None if there are none."""
         with self._lock:
             shelf = self._shelf(component)
         olds = self._history.of(folder_name(component))
@@ -219,7 +219,7 @@ class Store:
     # Keeping
 
     def make_room(self, size: int) -> None:
-        """See that the disk has room for a snapshot of so many bytes, if what is kept for people can give it."""
+        """Make room on the disk for a snapshot of so many bytes, as far as snapshots that are kept for people can give it."""
         self._history.make_room(size)
 
     def put(self, source: int, *, prove: bool = True) -> Snapshot:
@@ -249,7 +249,7 @@ class Store:
                 self._add(snapshot.component, _entry_of(final, snapshot, size))
             if proved is not None:
                 self._proofs.keep(snapshot.component, proved)
-            else:  # what comes from here is not proved: what was remembered while it came from elsewhere is of no use
+            else:  # a snapshot made here is not proved: pages remembered while it came from elsewhere are of no use
                 self._proofs.forget(snapshot.component)
             outline = replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
             with self._lock:
@@ -329,7 +329,7 @@ class Store:
             self.prune(component, held[0])
 
     def fold(self, component: str, position: Position) -> None:
-        """Write the state at a position as a base of its own, so that what is older can go.
+        """Write the state at a position as a base of its own, so that older files can go.
 
         The long part holds no lock at all: snapshots are taken in meanwhile. Cut off anywhere, the old chain is whole.
 
@@ -380,7 +380,7 @@ class Store:
             return self._read(component, entries, lambda: self._write_base(folded, folding.write))
 
     def _read(self, component: str, entries: tuple[Entry, ...], act: Callable[[], A]) -> A | None:
-        """What an act answers that reads a chain's base, or None when a file had to be set out of use."""
+        """The answer of an act that reads a chain's base, or None when a file had to be set out of use."""
         try:
             return act()
         except FormatError as error:
@@ -413,7 +413,7 @@ class Store:
         final = self._root / ASIDE_FOLDER / f"{folder_name(component)}-{file_name(header_of(folded))}"
         self._files.write(final, lambda file: format.encode(folded, file))
         begin = f"{folder_name(component)}-"
-        with disk_trouble(f"remove what was set aside of {component}"):
+        with disk_trouble(f"remove the snapshots of {component} that were set aside"):
             names = (path.name for path in final.parent.iterdir())
             ours = sorted(name for name in names if name.startswith(begin) and len(name) == len(final.name))
             for name in ours[:-ASIDE_LIMIT]:
@@ -421,7 +421,7 @@ class Store:
         return final
 
     def drop(self, component: str) -> None:
-        """Forget everything of a component; what was set aside stays."""
+        """Forget everything of a component; files that were set aside stay."""
         with self._change_of(component), self._lock:
             self._remove(component, self._shelf(component).entries)
             self._remove_damaged(component, lambda _: True)
@@ -461,7 +461,7 @@ class Store:
     # The disk
 
     def _remove(self, component: str, entries: tuple[Entry, ...], taken: Callable[[Path], bool] = lambda _: False) -> None:
-        """Remove files, the youngest first: what is left at any instant is whole chains.
+        """Remove files, the youngest first: at any instant whole chains are left.
 
         Args:
             taken: whether a whole checkpoint's file has been taken, to be kept elsewhere.
@@ -472,7 +472,7 @@ class Store:
                     self._shelves[component] = self._shelf(component).without((entry,))
                 if entry.parent is None and taken(entry.path):
                     continue
-                self._files.remove(entry.path)  # who opens a chain has opened it, or does not know this file any more
+                self._files.remove(entry.path)  # a reader of a chain has opened it, or does not know this file any more
 
     def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:
         with disk_trouble(f"remove damaged snapshots of {component}"):
@@ -540,7 +540,7 @@ def open_store(
     """Open a store, or make an empty one; removes leftovers and verifies what is there.
 
     Args:
-        retention: what is kept for people besides what is needed; nothing.
+        retention: snapshots kept for people besides the needed ones; nothing.
         budget: for pages that are remembered to prove deltas by; others are read from the files.
 
     Raises:

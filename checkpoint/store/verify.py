@@ -74,11 +74,11 @@ class Proofs:
         self._budget.leave(_user(component))
 
     def _limit(self, component: str, hot: HotPages) -> None:
-        """Have it hold its share; what it then holds is told with the next one."""
+        """Have it hold its share; the next call tells the budget how much it then holds."""
         hot.resize(self._budget.share(_user(component), hot.wanted, min(hot.size, hot.limit)))
 
     def _unproved(self, base: Snapshot) -> Proved:
-        """Before a chain's base. What was known until now may go: its memory is used again."""
+        """Begin before a chain's base. The known pages may go: their memory is used again."""
         known = self._proved.pop(base.component, None)
         page_size = base.machine.page_size
         fits = known is not None and known.table.page_size == page_size
@@ -116,7 +116,7 @@ def _user(component: str) -> str:
 
 
 def _held(shelf: Shelf, proved: Proved, wanted: Words) -> Rows:
-    """What a state holds at some pages: remembered, or read from the files."""
+    """The content of a state at some pages: remembered, or read from the files."""
     assert proved.hot.position == proved.position, "the one follows the other"
     rows = np.empty((len(wanted), proved.table.page_size), dtype=np.uint8)
     found, remembered = proved.hot.lookup(wanted)

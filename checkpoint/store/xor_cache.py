@@ -26,10 +26,10 @@ WHOLE_MAX: Final = 256
 
 
 class Step(Struct, frozen=True, eq=False):
-    """What one snapshot does to the pages of its parent.
+    """The changes of one snapshot to the pages of its parent.
 
     Attributes:
-        kept: what is mapped now.
+        kept: ranges that are mapped now.
         gone: pages whose earlier content counts no more: cleared ones, and all that it tells.
         addresses: of those whose content is kept here, in order; ``rows``: that content.
         count: of all that it tells.
@@ -63,7 +63,7 @@ class Step(Struct, frozen=True, eq=False):
 
 
 class HotPages:
-    """What the state at one position holds at the pages that were told last.
+    """The content of the pages that were told last, in the state at one position.
 
     Invariant: ``_pages`` says of each page in which slot its content is, and when it was told; no two share a slot.
 
@@ -96,7 +96,7 @@ class HotPages:
         self.position, self._pages = None, PageMap.empty()
 
     def resize(self, limit: int) -> None:
-        """Have another limit from now on; what was told longest ago goes, where it is less."""
+        """Have another limit from now on; where it is less, the pages told longest ago go."""
         page_size = self._slots.shape[1]
         self.limit, self._slot_limit = limit, limit // page_size
         if len(self._slots) <= self._slot_limit:
@@ -160,7 +160,7 @@ class Sender:
         self._is_differing = False
         """Whether the delta that was told last has differences, and was not acknowledged."""
         self._whole = 0
-        """So many deltas are told whole from here on; ``_pause``: as many, after the next one that is not acknowledged."""
+        """The number of deltas to tell whole from here on; ``_pause``: that number after the next one without acknowledgement."""
         self._pause = 0
 
     @property
@@ -205,7 +205,7 @@ class Sender:
         return told, len(contents) * page_size
 
     def _count_untaken(self) -> None:
-        """Another one is to be told: was the last one taken?"""
+        """Count the last delta as not taken, if it is not acknowledged when the next one is told."""
         if self._is_differing:
             self._is_differing = False
             self._whole, self._pause = self._pause, min(max(2 * self._pause, 1), WHOLE_MAX)

@@ -13,7 +13,7 @@ from typing import Final
 from msgspec import Struct
 
 PARTS: Final = 256
-"""Of the bound: shares are a number of these, for to change one is to copy it."""
+"""Parts of the bound: a share is a number of these, because a change of a share copies its pages."""
 
 
 class _User(Struct):
@@ -25,7 +25,7 @@ class _User(Struct):
 
 
 class PageBudget:
-    """Who has how much. From any thread.
+    """The share of each user of the budget. From any thread.
 
     Args:
         limit: bytes for all together.
@@ -47,8 +47,8 @@ class PageBudget:
         """How many bytes one may hold from now on.
 
         Args:
-            wanted: what it would hold if it had room; 0: not known yet, then it has what is free, and takes from nobody.
-            held: what it holds.
+            wanted: bytes that it would hold if it had room; 0: not known yet, then it gets the free rest and none from others.
+            held: bytes that it holds.
         """
         with self._lock:
             user = self._users.setdefault(name, _User())
@@ -67,7 +67,7 @@ class PageBudget:
 
 
 def shares(limit: int, wants: Mapping[str, int]) -> dict[str, int]:
-    """What each gets: all that it wants, or as much as everybody else who does not get that."""
+    """The share of each: all that it wants, or as much as every other one that does not get all."""
     left, given = limit, {}
     for count, name in zip(range(len(wants), 0, -1), sorted(wants, key=lambda name: wants[name]), strict=True):
         given[name] = min(wants[name], left // count)

@@ -73,7 +73,7 @@ def _wage(directory: Path, seed: str, faults: int, kinds: list[str]) -> bool:
 
 
 def _is_mistaken(log: Path) -> bool:
-    """Whether there is a traceback in an agent's log: a bug, whatever came of it. It is shown."""
+    """Whether there is a traceback in an agent's log: a bug, also if it did no harm. It is shown."""
     _, found, rest = log.read_text(errors="replace").partition("Traceback")
     if found:
         print(f"a mistake in {log}:", *(found + rest).splitlines()[:MISTAKE_LINES], sep="\n", flush=True)
@@ -88,7 +88,7 @@ def _gawk() -> str | None:
 
 
 def _go_inside() -> NoReturn:
-    """Whoever kills this process kills all of it."""
+    """Become the first process of namespaces: to kill this process kills the whole campaign."""
     command = [*NAMESPACES, "sh", "-c", FIRST_PROCESS, "sh", sys.executable, "-m", "tests.chaos", *sys.argv[1:]]
     os.execvpe(command[0], command, {**os.environ, INSIDE: "1"})
 

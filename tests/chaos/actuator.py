@@ -93,7 +93,7 @@ class Record:
         self._rest = b""
 
     def fresh(self) -> Iterator[Command | Safe]:
-        """What was written down since the last time, in order."""
+        """The lines written since the last call, in order."""
         *lines, self._rest = (self._rest + self._file.read()).split(b"\n")
         for line in lines:
             yield read(line.decode())
@@ -156,7 +156,7 @@ def _piped(descriptor: int) -> Iterator[str]:
 
 
 def _monotonic_ns(wall_ns: int) -> int:
-    """An instant of the calendar on the clock that nobody sets."""
+    """An instant of the calendar, on the monotonic clock, which no program sets."""
     return time.monotonic_ns() - (time.time_ns() - wall_ns)
 
 

@@ -150,7 +150,7 @@ class Campaign:
             time.sleep(SLOW_S)
 
     def _hear(self) -> None:
-        """What was commanded, in order, and what readers had seen by then."""
+        """Tell the judge the commands, in order, and the lines that readers had seen by then."""
         for one in self._record.fresh():
             for reader in self.readers:
                 while reader.seen and reader.seen[0].at_ns < one.at_ns:
@@ -164,7 +164,7 @@ class Campaign:
     # How it stands
 
     def _look(self) -> Draw:
-        """What faults can be aimed at: who runs what, by their own word."""
+        """The targets of faults: the components that each member says it runs."""
         running: dict[str, list[str]] = {}
         standbys: dict[str, str] = {}
         for name, picture in self.house.pictures().items():
@@ -189,7 +189,7 @@ class Campaign:
         return "; ".join(self._illnesses())
 
     def _illnesses(self) -> list[str]:
-        """What is not yet as it should be."""
+        """The states that are not yet as they should be."""
         found = [name for name in self._awaited if not self._acts(name)]
         if found:
             return [f"{name} to act" for name in found]
@@ -214,7 +214,7 @@ class Campaign:
         return newest is not None and newest.at_ns > self._awaited[component]
 
     def _last_look(self) -> None:
-        """Whatever was acknowledged at the end is there; readers have seen what the programs did, without a gap."""
+        """Everything acknowledged is there at the end; readers have seen all steps of the programs, without a gap."""
         for reader in self.readers:
             goal = self.judge.histories[reader.component].newest
             assert goal is not None
@@ -247,7 +247,7 @@ class Campaign:
         return [pause.length_ms for pause in self.judge.pauses() if any(_befell(blow, pause) for blow in blows)]
 
     def figures(self) -> str:
-        """What came of it."""
+        """The results of the campaign."""
         kinds = Counter(blow.kind for blow in self.blows)
         outages = self.outages()
         moved = [one for one in outages if one.moved]

@@ -27,7 +27,7 @@ PARTS: Final[tuple[tuple[str, ...], ...]] = (
     ("main_loop", "worker"),
     ("main_loop", "worker", "keeper"),
 )
-"""What is killed, or stands still, at one instant."""
+"""Parts of an agent that are killed, or stand still, at one instant."""
 
 AIMED: Final = 0.7
 """Of the faults hit a robot that runs something."""
@@ -42,7 +42,7 @@ class Fault:
 
     Attributes:
         kind: one of `KINDS`.
-        sentence: what is done to whom.
+        sentence: names the fault and its member.
         lasts_s: until it is mended.
         hits: members that it is aimed at.
         crashes: how many of the programs of those members it ends without ending their robot.
@@ -99,7 +99,7 @@ class Draw:
         def begin() -> None:
             pids = [pid for part in parts for pid in member.parts(part)]
             self.house.note_cgroups(member)
-            send(pids, signal.SIGSTOP)  # nobody sees another one die
+            send(pids, signal.SIGSTOP)  # no part sees another one die
             send(pids, signal.SIGKILL)
 
         def end() -> None:
@@ -173,7 +173,7 @@ class Draw:
         return Fault("blackout", f"all lose their power for {away_s:.2f} s", away_s, tuple(order), begin, end)
 
     def worst(self) -> Fault:
-        """A primary loses its power while its standby is cut off: nobody else may go on from less than was acknowledged."""
+        """A primary loses its power while its standby is cut off: no other member may resume from less than was acknowledged."""
         primary = self._robot()
         names = [name for name in self.running.get(primary.name, []) if self.standbys.get(name)]
         standby = self.house.member(self.standbys[self.dice.choice(names)]) if names else self.house.members[-1]
@@ -237,7 +237,7 @@ class Draw:
         return Fault("cable", sentence, lasts_s, (member,), lambda: network.pull(plugs), lambda: network.push(plugs))
 
     def one_way(self) -> Fault:
-        """One is not heard by another; by nobody; or hears nobody."""
+        """One member is not heard by another, is not heard by any, or hears none."""
         member = self._busy()
         others = [other for other in self.house.members if other is not member]
         how = self.dice.choice(("mute", "deaf", "pair"))
@@ -245,7 +245,7 @@ class Draw:
             other = self.dice.choice(others)
             return self._cut("one_way", f"{other.name} hears nothing of {member.name}", (member,), _ways([member], [other]))
         ways = _ways([member], others) if how == "mute" else _ways(others, [member])
-        said = f"{member.name} is heard by nobody" if how == "mute" else f"{member.name} hears nobody"
+        said = f"no member hears {member.name}" if how == "mute" else f"{member.name} hears no member"
         return self._cut("one_way", said, (member,), ways)
 
     def partition(self) -> Fault:
@@ -258,7 +258,7 @@ class Draw:
         if not half:
             ways |= set(_ways(other, one))
         names = " ".join(sorted(member.name for member in one))
-        how = "are heard by nobody else" if half else "are apart from the others"
+        how = "are not heard by the others" if half else "are apart from the others"
         return self._cut("partition", f"{names} {how}", tuple(members), ways)
 
     def saturated(self) -> Fault:
@@ -284,9 +284,9 @@ class Draw:
     # Disks
 
     def full(self) -> Fault:
-        """Somebody else's file takes all the room of a disk."""
+        """A file of another program fills a disk."""
         member, lasts_s = self._storing(), self.dice.uniform(1, 10 * LEASE_S)
-        film = member.disk / "somebody's film"
+        film = member.disk / "a user's film"
         sentence = f"the disk of {member.name} is full for {lasts_s:.2f} s"
         return Fault("full", sentence, lasts_s, (member,), lambda: fill(film), lambda: film.unlink(missing_ok=True))
 

@@ -44,19 +44,19 @@ MEMBERS: Final[tuple[tuple[str, Role, tuple[int, ...]], ...]] = (
 BEAT_MS: Final = 50
 LEASE_MS: Final = 500
 PERIOD_MS: Final = 200
-"""Seven agents share two processors with each other and with whatever else runs: slower than on robots, so that it is
+"""Seven agents share two processors with each other and with all other programs: slower than on robots, so that it is
 the faults that are seen and not the machine."""
 
 SETTINGS: Final = f'beat_ms = {BEAT_MS}\nlease_ms = {LEASE_MS}\nsnapshot_period_ms = {PERIOD_MS}\nrule = "majority"\n'
 
 DISK: Final = "size=96m"
 PATIENCE_S: Final = 300.0
-"""A generous bound for whatever is waited for: after a blackout seven agents begin at once, which takes some forty seconds of
+"""A generous bound for every wait: after a blackout seven agents begin at once, which takes some forty seconds of
 processor time, and the machine may be slow or busy."""
 
 POLL_S: Final = 0.02
 LOOK_S: Final = 0.25
-"""Between two questions to everybody how things stand."""
+"""Between two questions to all members for their status."""
 STEP_MS: Final = 50
 """Between two commands of a program."""
 
@@ -70,7 +70,7 @@ MODULES: Final = {
 """Of each part of an agent: the third word of its command line, or the fourth."""
 
 AWAY: Final = (NoAgentError, LostAgentError)
-"""What a member whose agent is not there, or stands still, says."""
+"""Errors for a member whose agent is not there, or stands still."""
 
 T = TypeVar("T")
 
@@ -125,11 +125,11 @@ class Member:
 
     @property
     def disk(self) -> Path:
-        """What survives a power cut."""
+        """The directory that survives a power cut."""
         return self.directory / "state"
 
     def status(self) -> dict[str, Any]:
-        """What its agent knows now.
+        """The status of its agent now.
 
         Raises:
             NoAgentError, LostAgentError: it does not answer.
@@ -191,7 +191,7 @@ class House:
     def __init__(self, directory: Path, programs: tuple[Program, ...]) -> None:
         """
         Args:
-            directory: empty; what is left in it afterwards is the evidence.
+            directory: empty; the files left in it afterwards are the evidence.
         """
         self.directory = directory
         self.programs = programs
@@ -313,7 +313,7 @@ class House:
         self._inside(member, *agent_command(self._configuration(member)))
 
     def _inside(self, member: Member, *command: str) -> None:
-        """Start a process of a member that nobody there is the parent of."""
+        """Start a process of a member that has no parent there."""
         assert member.machine is not None
         script = f'"$@" </dev/null >>{member.directory / "agent.log"} 2>&1 &'
         init = member.machine.processes()[0]
@@ -336,7 +336,7 @@ class House:
             )
 
     def order_handover(self, component: str, source: Member, target: Member) -> None:
-        """Have a component moved; nobody waits for the answer."""
+        """Order a component to move, without waiting for the answer."""
         with contextlib.suppress(*AWAY):
             link = source.control()
             threading.Thread(target=_ask, args=(link, component, target.name), daemon=True).start()
@@ -363,7 +363,7 @@ def _ask(link: Control, component: str, target: str) -> None:
 
 
 def programs(directory: Path, compiler: str | None, awk: str | None) -> Iterator[Program]:
-    """What runs in the house: as many kinds as this machine has.
+    """The programs of the campaign: as many kinds as this machine has.
 
     Args:
         directory: of the actuator; a C program is built there.

@@ -83,7 +83,7 @@ class History:
             self.pauses.append(Pause(self.component, last.at_ns, command.at_ns, moved, lost))
 
     def acknowledge(self, step: int, seal: int) -> None:
-        """Somebody was told, before the next command that is taken in, that this step is safe."""
+        """A reader or the program has learnt, before the next command that is taken in, that this step is safe."""
         if step > self.acknowledged[0]:
             self.acknowledged = (step, seal)
 
@@ -126,10 +126,10 @@ class Judge:
         self._longer_than_ns = longer_than_ms * MS
 
     def hear(self, said: Iterable[Command | Safe]) -> None:
-        """What the actuator wrote down.
+        """Take in the lines that the actuator wrote.
 
         Raises:
-            BrokenPromiseError: says who did what.
+            BrokenPromiseError: names the component and the commands.
         """
         for one in said:
             history = self.histories[one.component]

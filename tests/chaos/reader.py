@@ -20,11 +20,11 @@ STDOUT: Final = 1
 
 
 class Reader:
-    """A thread that asks whoever answers, and notes whatever contradicts what it has seen before.
+    """A thread that asks any member that answers, and notes every contradiction to its earlier lines.
 
     Attributes:
         newest: step of the last whole line; lines are ``STEP SEAL``.
-        seen: lines that nobody has taken yet.
+        seen: lines that the campaign has not taken yet.
         complaint: "" as long as the stream has neither gap nor repetition.
     """
 
@@ -55,7 +55,7 @@ class Reader:
                     break
 
     def _order(self) -> list[Member]:
-        """Whoever has power, robots first, another one first each time."""
+        """The members that have power, robots first, another one first each time."""
         able = [member for member in self._house.powered if member.role != "witness" and not member.stopped]
         turn = self._offset % max(len(able), 1)
         return able[turn:] + able[:turn]

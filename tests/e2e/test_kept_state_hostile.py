@@ -123,8 +123,8 @@ OWNED: Final = Path("/tmp/failover-owned")
 
 REFUSED_BY_ITS_ROBOT: Final = {
     "a region of 2^62 bytes": (with_regions([[0, 1 << 62]]), "do not fill the pages"),
-    "regions that are no list": (with_regions("all of it"), "does not say what its pages mean"),
-    "a region less": (with_regions([]), "does not say what its pages mean"),
+    "regions that are no list": (with_regions("all of it"), "does not describe its pages"),
+    "a region less": (with_regions([]), "does not describe its pages"),
 }
 REFUSED_BY_THE_PROGRAM: Final = {
     "a pickle": (with_state(sized(b"cposix\nsystem\n(S'touch %s'\ntR." % str(OWNED).encode())), "StateFormatError"),

@@ -123,7 +123,7 @@ class Deeds:
         self._world.after(self._world.soon(20, 200) * robot.slow, lambda: done(not fails))
 
     def _inquire(self, robot: Robot, act: acts.Inquire) -> None:
-        """Another robot looks what it lacks, which nobody hears of if nothing gets through."""
+        """Another robot looks what it lacks; if no message gets through, this robot learns nothing."""
         life = robot.life
         now_and_then = LACK if self._world.random.random() < LACKING else ()
 

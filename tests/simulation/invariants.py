@@ -14,7 +14,7 @@ from tests.simulation.robots import NewDisk, vote_record_of
 from tests.simulation.world import World
 
 SURELY_UNREAD_NS = 5_000 * MS
-"""Less than the time for which a sign counts, by any clock, and whatever it leaps."""
+"""Less than the time for which a sign counts, by any clock and after any leap."""
 
 
 class Broken(AssertionError):
@@ -28,7 +28,7 @@ class Invariants:
     Attributes:
         safe: components that must never act twice: ``when_alone`` is freeze, or primaries are elected.
         votes: primaries are elected; ``given``: who voted for whom, of which component, in which epoch; ``cast``: the same, with
-            votes that their voters have lost together with their disks: who was elected by them was elected.
+            votes that their voters have lost together with their disks: their elections still count.
         gone: positions that were on a disk that was lost.
         split: components that computed in two places at once (allowed under ``run``, after a cut).
         acknowledged: newest position that each component's primaries acknowledged while a standby held it.
@@ -171,7 +171,7 @@ class Invariants:
         elsewhere = elsewhere or act.position in self.gone
         is_told = act.is_safe and bool(world.robots[robot].config.peers)
         if not elsewhere and (is_told or self.shipped.get(act.component) == act.position):
-            raise _broken(world, f"{robot} acknowledges {act.position} of {act.component}, which nobody else holds")
+            raise _broken(world, f"{robot} acknowledges {act.position} of {act.component}, which no other robot holds")
         if elsewhere:
             before = self.acknowledged.get(act.component)
             self.acknowledged[act.component] = act.position if before is None else max(before, act.position)
@@ -208,7 +208,7 @@ class Invariants:
         return max(values, default=-1) >= world.values[position]
 
     def _nothing_is_held(self, world: World, robot: str, act: acts.Start) -> None:
-        """Who begins anew loses nothing that was acknowledged, but what was lost with its disks."""
+        """A robot that begins anew loses no acknowledged state, but for state that was lost with its disks."""
         safe_from = self.acknowledged.get(act.component)
         if safe_from is None or (act.component, act.epoch) in self.ordered or act.component in self.split:
             return

@@ -52,17 +52,17 @@ def deaf_to_stale() -> Any:
 
 
 def everybody_yields() -> Any:
-    """Of two claims both give up: nobody decides."""
+    """Of two claims both give up: neither robot decides."""
     return patch.object(pair, "stronger", lambda *_: True)
 
 
 def no_consent() -> Any:
-    """A claim goes on without waiting for anybody."""
+    """A claim goes on without the consent of any robot."""
     return patch.object(pair, "_consented", lambda *_: True)
 
 
 def nobody_needs_the_right() -> Any:
-    """Under freeze anybody thinks that it may act alone."""
+    """Under freeze every robot thinks that it may act alone."""
     return patch.object(pair, "_right_to_act_alone", lambda *_: True)
 
 
@@ -126,7 +126,7 @@ def no_base_for_the_lost() -> Any:
 
 
 def guard_unaware() -> Any:
-    """The lease in the guard is not watched: after a pause nobody lets the program go on."""
+    """The lease in the guard is not watched: after a pause no robot thaws the program."""
     return patch.object(lease, "_may_thaw", lambda *_: False)
 
 
@@ -148,7 +148,7 @@ def runs_the_finished() -> Any:
 
 
 def crash_is_the_end() -> Any:
-    """After a crash nobody resumes the program, and nobody says that it failed."""
+    """After a crash no robot resumes the program, and none says that it failed."""
     return patch.object(exits, "_recover", lambda *_: None)
 
 
@@ -168,12 +168,12 @@ def claims_at_boot() -> Any:
 
 
 def takes_the_unreadable_for_silence() -> Any:
-    """What comes from a robot and cannot be authenticated counts as if nothing came."""
+    """A message of a robot that cannot be authenticated counts as silence."""
     return patch.object(Membership, "unreadable", lambda *_: "")
 
 
 def believes_garbage() -> Any:
-    """What cannot be authenticated proves that its robot lives, also where that robot was heard before."""
+    """A message that cannot be authenticated proves that its robot lives, also where that robot was heard before."""
 
     def unreadable(self: Membership, robot: str, _why: str, now_ns: int) -> str:
         peer = self.peers[robot]
@@ -206,12 +206,12 @@ def believes_its_team_file() -> Any:
 
 
 def no_grace() -> Any:
-    """A robot that has just started takes everybody it has not heard for dead."""
+    """A robot that has just started takes every robot that it has not heard for dead."""
     return patch.object(Config, "grace_ns", property(lambda _: 0))
 
 
 def blind_to_the_better() -> Any:
-    """Whoever holds a checkpoint claims, although another robot holds a newer one."""
+    """Every robot that holds a checkpoint claims, although another one holds a newer checkpoint."""
     return patch.object(pair, "living_entries", lambda *_: [])
 
 
@@ -248,7 +248,7 @@ def forgets_what_it_ran() -> Any:
 
 
 def waits_for_ever() -> Any:
-    """What waits at a robot is not ended when the component has ended, or has another standby."""
+    """A robot does not end its waiting program when the component has ended, or has another standby."""
 
     def stubborn(component: Component, turn: Turn) -> None:
         if component.waiting is None:
@@ -259,7 +259,7 @@ def waits_for_ever() -> Any:
 
 
 def waits_where_it_may_not_run() -> Any:
-    """A program waits also where it was told to be held only, or where somebody else is entrusted."""
+    """A program waits also on a robot that shall only hold it, or where another robot is entrusted."""
     return patch.object(warm_standby, "_wanted", lambda component: component.spec)
 
 
@@ -267,7 +267,7 @@ def waits_where_it_may_not_run() -> Any:
 
 
 def double_voting() -> Any:
-    """A member votes for whoever asks, also twice in one epoch."""
+    """A member votes for every robot that asks, also twice in one epoch."""
     honest = majority.may_follow
 
     def generous(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
@@ -315,7 +315,7 @@ def named_in_advance() -> Any:
 
 
 def best_lease_counts() -> Any:
-    """The lease is the longest that anybody grants, not what a majority grants."""
+    """The lease is the longest that any member grants, not the one that a majority grants."""
 
     def longest(component: Component, turn: Turn) -> int:
         return max((turn.team.lease_ns(peer.robot) for peer in turn.team.peers.values()), default=0)
@@ -324,7 +324,7 @@ def best_lease_counts() -> Any:
 
 
 def lease_from_strangers() -> Any:
-    """Whoever hears us lengthens our lease, also one that votes for another."""
+    """Every member that hears us lengthens our lease, also one that votes for another."""
 
     def granted(component: Component, turn: Turn) -> int:
         leases = sorted((turn.team.lease_ns(peer.robot) for peer in turn.team.peers.values()), reverse=True)
@@ -363,12 +363,12 @@ def generous_lease() -> Any:
 
 
 def proud_primary() -> Any:
-    """A primary without a lease gives up to nobody."""
+    """A primary without a lease never gives up."""
     return patch.object(votes, "lose", lambda *_: None)
 
 
 def humble_primary() -> Any:
-    """A primary without a lease gives up to whoever has a later epoch, also to an old copy that nobody elected."""
+    """A primary without a lease gives up to every later epoch, also to an old copy that was not elected."""
     return patch.object(votes, "_prevails", lambda component, turn, sender, entry: entry.epoch > component.epoch)
 
 
@@ -389,7 +389,7 @@ def never_deaf() -> Any:
 
 
 def no_pre_vote() -> Any:
-    """A robot claims without asking whether anybody would vote for it."""
+    """A robot claims without asking whether others would vote for it."""
     return patch.object(majority, "may_claim", lambda *_: True), patch.object(votes, "vacant", lambda *_: True)
 
 
@@ -423,12 +423,12 @@ def believes_any_epoch() -> Any:
 
 
 def deaf_to_denial() -> Any:
-    """What is told of a robot counts, although that robot lives and says otherwise."""
+    """A message about a robot counts, although that robot lives and says otherwise."""
     return patch.object(peer_claims, "_denier", lambda *_: "")
 
 
 def gives_up_to_any_end() -> Any:
-    """A copy that acts is stopped when anybody tells of an end."""
+    """A copy that acts is stopped when any robot tells of an end."""
     return patch.object(votes, "_heard_end", pair.heard_end), patch.object(pair, "_acted_all_along", lambda *_: False)
 
 

@@ -35,7 +35,7 @@ class Fate:
         return self.world.robots[robot].store[PART]
 
     def positions(self) -> list[Position]:
-        """What robot1 can go on from, oldest first."""
+        """The checkpoints from which robot1 can resume, oldest first."""
         return list(reversed(seen_at(self.world, "robot1", PART).positions))
 
     def notes(self) -> str:

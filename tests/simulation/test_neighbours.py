@@ -42,7 +42,7 @@ def until_the_server_has_all(world: World) -> None:
 
 
 def newest(world: World, robot: str, component: str) -> int:
-    """What its newest checkpoint counts."""
+    """The count in its newest checkpoint."""
     return world.values[world.robots[robot].store[component][-1]]
 
 

@@ -31,7 +31,7 @@ def later(world: World, ms: int = 1_000) -> list[str]:
 
 
 def told(world: World, robot: str, *, is_trial: bool = False) -> str:
-    """What an operator is told at that robot."""
+    """The status that an operator gets at that robot."""
     world.command(robot, Promote(world.request(), PART, is_trial))
     world.run(world.now_ns + 500 * MS)
     return world.log[-1]
@@ -140,7 +140,7 @@ def test_a_robot_without_a_checkpoint_gets_it_from_the_server_when_it_is_promote
     kept = world.robots["server1"].store[PART][-1]
     assert not world.robots[last].store.get(PART)
     assert f"from checkpoint {kept.sequence}, which server1 keeps and sends first" in told(world, last, is_trial=True)
-    assert later(world, 3_000) == [], "nobody asked for it yet"
+    assert later(world, 3_000) == [], "no operator asked for it yet"
     assert f"{PART} runs at {last}" in told(world, last)
     assert later(world) == [last] and world.robots[last].programs[PART].value >= world.values[kept]
 

@@ -27,7 +27,7 @@ PROMOTED_MS = 300
 
 
 class Trouble:
-    """One trouble, drawn from the dice when it is made: who is hit, for how long, by what."""
+    """One trouble, drawn from the dice when it is made: the robot that it hits, for how long, by what."""
 
     def __init__(
         self, world: World, invariants: Invariants, random: Random, specs: tuple[ComponentSpec, ...], *, endless: bool = False
@@ -89,11 +89,11 @@ class Trouble:
         self._cut_ways(*self._ways_out(), *(way[::-1] for way in self._ways_out()))
 
     def _deaf(self) -> None:
-        """One hears nobody and is heard by all."""
+        """One robot hears no other, and all hear it."""
         self._cut_ways(*(way[::-1] for way in self._ways_out()))
 
     def _mute(self) -> None:
-        """One hears all and is heard by nobody."""
+        """One robot hears all, and no other hears it."""
         self._cut_ways(*self._ways_out())
 
     def _mute_primary(self) -> None:
@@ -150,7 +150,7 @@ class Trouble:
         self._outage(self._world.agent_dies)
 
     def _blink(self) -> None:
-        """The agent is back at once: faster than anybody can miss it."""
+        """The agent is back at once: before any robot can miss it."""
         self._pause_ns = self._random.randrange(1, 20) * MS
         self._outage(self._world.agent_dies)
 

@@ -97,7 +97,7 @@ class GuardedTask:
             epoch_variable.renew(Memory(self.pid), stat.env_start, stat.env_end, epoch)
 
     def capture_standing(self, order: CaptureOrder) -> Snapshot:
-        """See `checkpoint.engine.Session.capture_standing`: its segment holds what was committed, whatever it does."""
+        """See `checkpoint.engine.Session.capture_standing`: its segment holds the committed state, also while it runs."""
         return self.capture(order)
 
     @property
@@ -155,7 +155,7 @@ class GuardedTask:
         return self._session
 
     def _follow_files(self) -> CarriedTrees | None:
-        """What follows the carried files, if there are any.
+        """Follow the carried files, if there are any.
 
         Raises:
             UnsupportedError: they cannot be carried.

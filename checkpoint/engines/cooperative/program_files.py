@@ -28,7 +28,7 @@ from checkpoint.snapshot.credentials import Owner
 KIND: Final = "program"
 
 FILES_MAX: Final = 500
-"""Each snapshot names them all; what has more files than this is installed by its operator."""
+"""Each snapshot names them all; a program with more files must be installed by its operator."""
 
 SYSTEM: Final = ("/usr", "/bin", "/sbin", "/lib", "/lib64", "/etc", "/proc", "/sys", "/dev", "/run")
 INTERPRETERS: Final = ("python", "pypy", "node", "ruby", "perl", "lua", "sh", "bash", "dash")
@@ -77,7 +77,7 @@ def _seen(pid: int, path: str) -> str:
 
 
 def _listed(pid: int, arguments: Sequence[str], directory: str) -> tuple[str, Iterator[str]]:
-    """What is started, "" if it is installed; and what lies with it."""
+    """The file that is started, "" if it is installed; and the files beside it."""
     executable = os.readlink(f"/proc/{pid}/exe")
     name = PurePosixPath(executable).name
     if not any(name == one or name.rstrip("0123456789.") == one for one in INTERPRETERS):

@@ -111,7 +111,7 @@ class CooperativeSession:
         self._process = told_by_spokesman(pid, describe_process)
         self._directory = self._process.working_directory
         self.program: tuple[Resource, ...] = ()
-        """What it is started again from, as `checkpoint.engines.cooperative.program_files` tells it."""
+        """The files from which it is started again, as `checkpoint.engines.cooperative.program_files` tells them."""
         self._waiting: deque[_Mark] = deque(maxlen=MAX_WAITING)
         self._acknowledged: _Mark | None = None
 
@@ -163,7 +163,7 @@ class CooperativeSession:
             is_held: it stands still already.
 
         Raises:
-            UnsupportedError: what is to be carried cannot be.
+            UnsupportedError: a file cannot be carried.
             CaptureError: it could not be made to stand still, or the files change all the same.
         """
         since = parent.commit if parent else 0
@@ -185,7 +185,7 @@ class CooperativeSession:
         Raises:
             CaptureError: it does not know; it says that it wrote more than there is, or takes back what it said.
         """
-        assert self._outputs is not None, "somebody counts"
+        assert self._outputs is not None, "the caller counts the output"
         if isinstance(committed.outputs, Pending):
             raise CaptureError(
                 f"cannot capture {self._component}: at its commit {committed.number} its output had no room in the pipe to its "
@@ -321,10 +321,10 @@ def this_machine(robot: str) -> Machine:
 
 
 def describe_process(pid: int) -> ProcessState:
-    """What is true of a program whose memory is not carried: who it is and how it was started.
+    """The state of a program whose memory is not carried: its identity and how it was started.
 
     Args:
-        pid: by which it is looked at (`checkpoint.linux.procfs.live_thread`).
+        pid: the id by which we look at it (`checkpoint.linux.procfs.live_thread`).
 
     Raises:
         ProcessGoneError: it ended.
@@ -346,14 +346,14 @@ def describe_process(pid: int) -> ProcessState:
     )
 
 
-# Finding the segment of a program that has handed it to nobody
+# Finding the segment of a program that has not handed it to a guard
 
 
 def open_segment(pid: int) -> SegmentReader:
     """The segment that a process commits to, found among its descriptors.
 
     Args:
-        pid: by which it is looked at (`checkpoint.linux.procfs.live_thread`).
+        pid: the id by which we look at it (`checkpoint.linux.procfs.live_thread`).
 
     Raises:
         CaptureError: it has none, or several, or is another user's.
@@ -364,7 +364,7 @@ def open_segment(pid: int) -> SegmentReader:
     except OSError as error:
         raise CaptureError(f"cannot look for the segment of pid {pid}: {error.strerror}") from error
     for name in sorted(found, key=int, reverse=True):
-        descriptor = os.open(f"{folder}/{name}", os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # whatever it is, never wait
+        descriptor = os.open(f"{folder}/{name}", os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # never wait, also for a pipe
         try:
             reader = SegmentReader(descriptor)
         finally:
@@ -418,7 +418,7 @@ def _sizes(state: Snapshot) -> list[tuple[int, int]]:
     pairs = [pair for pair in listed if isinstance(pair, list) and len(pair) == 2] if isinstance(listed, list) else []
     sizes = [(kind, size) for kind, size in pairs if isinstance(kind, int) and isinstance(size, int)]
     if len(sizes) != len(state.vmas) or state.machine.page_size != PAGE:
-        raise RestoreError(f"cannot restore {state.component}: its snapshot does not say what its pages mean")
+        raise RestoreError(f"cannot restore {state.component}: its snapshot does not describe its pages")
     return sizes
 
 
@@ -445,5 +445,5 @@ def fill_segment(state: Snapshot) -> SegmentWriter:
     """
     regions = regions_of(state)
     writer = SegmentWriter(Layout(tuple(region for region, _ in regions), secrets.token_bytes(16)), name=HANDED_NAME)
-    assert writer.commit([Source(content[: region.size]) for region, content in regions]), "nobody reads it yet"
+    assert writer.commit([Source(content[: region.size]) for region, content in regions]), "a new segment has no reader yet"
     return writer

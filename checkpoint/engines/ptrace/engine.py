@@ -21,7 +21,7 @@ from checkpoint.store.digest_cache import DigestOf
 
 
 class PtraceEngine:
-    """Captures and restores Linux processes that nobody prepared, with all their threads."""
+    """Captures and restores unmodified Linux processes, with all their threads."""
 
     name = PTRACE
 

@@ -67,11 +67,11 @@ class SoftDirtyTracker:
 
     def backlog(self, lines: Sequence[MapsLine], limit: int, *, changed: bool) -> int:
         """See `Tracker.backlog`."""
-        raise NotImplementedError("clearing is a step of its own, and what is written before it would be lost")
+        raise NotImplementedError("clearing is a step of its own: writes before it would be lost")
 
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.catch_up`."""
-        raise NotImplementedError("clearing is a step of its own, and what is written before it would be lost")
+        raise NotImplementedError("clearing is a step of its own: writes before it would be lost")
 
     def existing(self, lines: Sequence[MapsLine]) -> Words:
         """See `Tracker.existing`."""

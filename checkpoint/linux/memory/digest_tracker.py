@@ -125,7 +125,7 @@ def filled_extents(file: int, begin: int = 0) -> Iterator[tuple[int, int]]:
 
 @functools.cache
 def may_look_into_mappings() -> bool:
-    """Whether what is mapped can be opened: root's right (CAP_CHECKPOINT_RESTORE), as proc_pid_map_files(5) says."""
+    """Whether mapped files can be opened: root's right (CAP_CHECKPOINT_RESTORE), as proc_pid_map_files(5) says."""
     try:
         names = os.listdir("/proc/self/map_files")
         os.close(os.open(f"/proc/self/map_files/{names[0]}", os.O_RDONLY | os.O_CLOEXEC))
@@ -164,7 +164,7 @@ class SharedPages:
         return page_set.union(populated, self._memory.readable_pages(orphans)[0]) if len(orphans) else populated
 
     def _held_by_object(self, line: MapsLine) -> Words:
-        """The mapped pages of an object that hold something, whoever wrote them.
+        """The mapped pages of an object that hold something, from any writer.
 
         Where we may not look into the object itself (it has no name, and we are not root) all that can be read counts: reading
         makes pages where none are, but nothing is lost that was written by other means than through this mapping.
@@ -183,7 +183,7 @@ class SharedPages:
         return np.array(found, dtype=np.uint64).reshape(-1, 2)
 
     def _open_object(self, line: MapsLine) -> int | None:
-        """A descriptor of what is mapped; None where we may not have one."""
+        """A descriptor of the mapped object; None where we may not have one."""
         with contextlib.suppress(OSError):  # root alone may look there
             return os.open(f"/proc/{self._pid}/map_files/{line.start:x}-{line.end:x}", os.O_RDONLY | os.O_CLOEXEC)
         with contextlib.suppress(OSError):  # it has no name any more

@@ -18,7 +18,7 @@ from checkpoint.pages.page_set import Words
 
 
 class Guards:
-    """Those of one process, from freeze to freeze.
+    """The guard pages of one process, from freeze to freeze.
 
     Args:
         look: finds the guards within a set of pages.
@@ -33,7 +33,7 @@ class Guards:
         self._scans: list[Scan] = []
 
     def forget(self) -> None:
-        """What is written is not known any more: the next search is one everywhere."""
+        """Forget the known guards, since writes are not known any more: the next search is one everywhere."""
         self._watched = NONE
 
     def rehearse(self) -> None:
@@ -53,7 +53,7 @@ class Guards:
         """
         scans, self._scans = self._scans, []
         cleared = functools.reduce(page_set.union, (scan.cleared for scan in scans), NONE)
-        if watched is not self._watched:  # what is watched no more (its file was deleted) was not named
+        if watched is not self._watched:  # a range that is not watched any more (its file was deleted) was not named
             self._watched = page_set.intersection(self._watched, watched)
         kept = page_set.intersection(self._known, self._watched)
         if len(kept):

@@ -35,7 +35,7 @@ class Allocation(Struct, eq=False):
 
     Attributes:
         content: all of it, whole pages; zeros at first.
-        owner: what it was last kept as.
+        owner: the name under which it was last kept.
         is_followed: the kernel tells which pages are written.
         is_known: every page written since it was last kept is in ``written``; otherwise it must be compared.
         written: numbers of its pages written since then.
@@ -64,7 +64,7 @@ class LiveMemory:
     """Arrays whose written pages are known. One thread at a time.
 
     Attributes:
-        note: "" or why nobody knows which pages are written, so that every commit compares.
+        note: "" or why the written pages are not known, so that every commit compares.
     """
 
     def __init__(self) -> None:

@@ -38,7 +38,7 @@ class MappingLostError(CaptureError):
 
 
 class Question(NamedTuple):
-    """Which pages are wanted, and what is to be told of them: see struct pm_scan_arg."""
+    """Which pages are wanted, and the categories to tell of them: see struct pm_scan_arg."""
 
     inverted: int
     mask: int
@@ -51,7 +51,7 @@ WRITTEN: Final = Question(0, abi.PAGE_IS_WRITTEN, 0, abi.PAGE_IS_WRITTEN)
 
 
 class _Orders:
-    """One question about several ranges in one go. What stays the same from one time to the next is not filled in anew.
+    """One question about several ranges in one go. Unchanged parts are not filled in anew the next time.
 
     Attributes:
         starts, ends: of the ranges.
@@ -81,7 +81,7 @@ class _Orders:
         self._loop = loop
 
     def ask(self, ranges: Words, flags: int, limit: int) -> None:
-        """Make the scans of these ranges, `BATCH` at most, which nobody changes afterwards.
+        """Make the scans of these ranges, `BATCH` at most. The caller does not change them afterwards.
 
         Args:
             limit: no more than so many pages in each; 0: all.
@@ -149,7 +149,7 @@ class PageScanner:
         return not self.unprotected(np.array([[start, end]], dtype=np.uint64))
 
     def unprotected(self, ranges: Words) -> list[tuple[int, int]]:
-        """Those ranges in which a mapping is not registered for asynchronous write protection."""
+        """The ranges in which a mapping is not registered for asynchronous write protection."""
         found = []
         for batch in _batches(ranges):
             counts = self._asked(UNREGISTERED, batch, abi.PM_SCAN_CHECK_WPASYNC).counts[: len(batch)].tolist()
@@ -173,7 +173,7 @@ class PageScanner:
         With exactly this mask the kernel takes its fast path.
 
         Raises:
-            MappingLostError: a mapping is not protected (any more); what was found until then is lost.
+            MappingLostError: a mapping is not protected (any more); the pages found until then are lost.
         """
         return pages_joined(self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING)[:, :2])
 
@@ -186,8 +186,8 @@ class PageScanner:
         """As `written`, of a process that runs and may unmap anything under our hands.
 
         Returns:
-            What was written, and the ranges in which a mapping was not protected (any more): a part of such a range may have been
-            protected again without being told.
+            The written pages, and the ranges in which a mapping was not protected (any more): a part of such a range may have
+            been protected again without being told.
         """
         refused: list[list[int]] = []
         found = pages_joined(self._collect(WRITTEN, ranges, abi.PM_SCAN_CHECK_WPASYNC | abi.PM_SCAN_WP_MATCHING, refused)[:, :2])
@@ -227,13 +227,13 @@ class PageScanner:
         return Private(pages_joined(extents[present]), swapped, pages_joined(extents[written]))
 
     def are_present(self, ranges: Words) -> bool:
-        """Whether every page of a set is in memory and the process's own; cheaper than to be told which are, as `private`."""
+        """Whether every page of a set is in memory and the process's own; cheaper than `private`, which tells which are."""
         others = abi.PAGE_IS_FILE | abi.PAGE_IS_PFNZERO | self._guard
         question = Question(abi.PAGE_IS_PRESENT, 0, abi.PAGE_IS_PRESENT | others, abi.PAGE_IS_PRESENT)
         return not any(any(self._asked(question, batch, limit=1).counts[: len(batch)].tolist()) for batch in _batches(ranges))
 
     def _there(self, ranges: Words, unwanted: int, told: int = 0) -> Words:
-        """Regions of pages that are present or swapped out, and what is to be told of them besides."""
+        """Regions of pages that are present or swapped out, with the other categories that are asked for."""
         wanted = abi.PAGE_IS_PRESENT | abi.PAGE_IS_SWAPPED
         found = self._collect(Question(unwanted, unwanted, wanted, wanted | told), ranges)
         absent = found[:, 2] & np.uint64(abi.PAGE_IS_PRESENT) == 0
@@ -279,7 +279,7 @@ class PageScanner:
         return found[0] if len(found) == 1 else np.concatenate(found)
 
     def _collect_one(self, orders: _Orders, place: int, found: list[Words], refused: list[list[int]] | None) -> None:
-        """What was found in one range of the batch; the rest of it is asked for."""
+        """Collect the pages found in one range of the batch, and ask for the rest of it."""
         while True:
             count, end = int(orders.counts[place]), int(orders.ends[place])
             if count < 0:

@@ -69,12 +69,12 @@ class Memory:
 
         Raises:
             ProcessGoneError: the process has ended.
-            CaptureError: one of them is not mapped or not readable; what was read until then is in the buffer.
+            CaptureError: one of them is not mapped or not readable; the bytes read until then are in the buffer.
         """
         self._transfer(abi.process_vm_readv, "read", ranges, address_of(buffer))
 
     def read_pages(self, extents: Ranges) -> bytearray:
-        """Read the pages of a set, rows ``[start, end)``, in order; pages that nobody may read are read all the same.
+        """Read the pages of a set, rows ``[start, end)``, in order, also pages without read permission.
 
         Raises:
             ProcessGoneError: the process has ended.
@@ -132,7 +132,7 @@ class Memory:
         return page_set.extents_of_addresses(np.array(kept, dtype=np.uint64), abi.PAGE_SIZE)
 
     def _peek_into(self, ranges: Ranges, buffer: memoryview) -> None:
-        """Read whatever the protection says, through ``/proc/PID/mem``."""
+        """Read in spite of the protection, through ``/proc/PID/mem``."""
         try:
             descriptor = os.open(f"/proc/{self.pid}/mem", os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -180,7 +180,7 @@ class Memory:
             self.write_from(ranges, bytearray(b"".join(content for _, content in contents)))
 
     def poke(self, address: int, content: bytes) -> None:
-        """Write whatever the protection says, through ``/proc/PID/mem`` (FOLL_FORCE).
+        """Write in spite of the protection, through ``/proc/PID/mem`` (FOLL_FORCE).
 
         Raises:
             ProcessGoneError: the process has ended.

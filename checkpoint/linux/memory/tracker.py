@@ -26,7 +26,7 @@ NOT_CARRIED: Final = frozenset(("[vdso]", "[vvar]", "[vvar_vclock]", "[vsyscall]
 
 
 class Scan(Struct, frozen=True, eq=False):
-    """What happened since the last scan.
+    """The changes since the last scan.
 
     Attributes:
         written: pages to be read: written, or of unknown history.
@@ -43,7 +43,7 @@ class Tracker(Protocol):
     Attributes:
         cost: what following with it costs a program, a clause.
         sees_every_write: a page that was changed and changed back counts as written. Otherwise a copy that was made between two
-            scans is of no use.
+            scans cannot be used.
         scans_running: `backlog` and `catch_up` are there.
     """
 
@@ -58,7 +58,7 @@ class Tracker(Protocol):
         ...
 
     def arm(self, lines: Sequence[MapsLine]) -> None:
-        """Begin to follow: whatever is written from now on is in the next scan. The process may run."""
+        """Begin to follow: every page written from now on is in the next scan. The process may run."""
         ...
 
     def scan(self, lines: Sequence[MapsLine], *, changed: bool, everywhere: bool = False) -> Scan:
@@ -84,7 +84,7 @@ class Tracker(Protocol):
         ...
 
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
-        """As `scan`, while the process runs: what is written from now on, also during the call, is in the next scan.
+        """As `scan`, while the process runs: pages written from now on, also during the call, are in the next scan.
 
         A page that is read after the call is as it will be found, unless the next scan names it as written or cleared.
         """
@@ -107,7 +107,7 @@ def is_private(line: MapsLine) -> bool:
 def is_orphan(line: MapsLine) -> bool:
     """Whether it is a private mapping of a file that has no name any more, as after a package was upgraded.
 
-    Its unchanged pages cannot be had from the file on the other side: all of them are carried, and compared as shared ones are.
+    The other robot has no file with its unchanged pages: all of them are carried, and compared as shared ones are.
     """
     return not line.shared and line.has_file and line.name.endswith(procfs.DELETED)
 
@@ -127,11 +127,11 @@ MEMORY_PLACE: Final = "/dev/shm/"
 
 
 ANONYMOUS: Final = f"/dev/zero{procfs.DELETED}"
-"""What the kernel calls shared memory without a file."""
+"""The kernel's name for shared memory without a file."""
 
 
 def is_shared_anonymous(line: MapsLine) -> bool:
-    """Whether it is shared memory without a file: who was born since may have written what was never touched here."""
+    """Whether it is shared memory without a file: a later child may have written pages that were never touched here."""
     return is_shared(line) and line.name == ANONYMOUS
 
 

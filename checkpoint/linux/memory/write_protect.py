@@ -49,10 +49,10 @@ def is_small(line: MapsLine) -> bool:
 
 
 def is_closed(line: MapsLine) -> bool:
-    """Whether nobody may look into a file's mapping, as into what lies between two parts of a library: nothing comes there.
+    """Whether a file's mapping has no permission at all, as the gap between two parts of a library: no page comes there.
 
-    To protect its holes would mark them, and who looks at a marked hole cannot tell it from a page that is swapped out; most of
-    these lie behind the end of their file, where they cannot be read either. A library has 16 to 31 of them on aarch64.
+    Protection of its holes would mark them, and a marked hole looks like a page that is swapped out. Most of these holes
+    lie behind the end of their file, where they cannot be read either. A library has 16 to 31 of them on aarch64.
     """
     return line.has_file and not line.protection
 
@@ -73,9 +73,9 @@ def windows_of(line: MapsLine, existing: Words) -> Words:
 class PagemapTracker:
     """Asynchronous write protection, and one scan that finds and protects again.
 
-    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest, but for what
-    `is_closed` and nothing existed in; a mapping
-    without registration is fresh, whatever maps says, and is copied whole; one that cannot be registered is fresh each time.
+    Invariants: every page that exists in a followed mapping lies in ``_armed`` or is found by looking at the rest, but for
+    mappings that are `is_closed` and in which nothing existed; a mapping without registration is fresh, also if maps shows
+    it as before, and is copied whole; one that cannot be registered is fresh each time.
 
     Private copies of a file's pages that the program has dropped (MADV_DONTNEED) are looked for by name, for the file shows
     again: the kernel leaves such a page protected (zap_install_uffd_wp_if_needed() in mm/memory.c), so that no scan tells. To
@@ -164,10 +164,10 @@ class PagemapTracker:
     def catch_up(self, lines: Sequence[MapsLine], *, changed: bool) -> Scan:
         """See `Tracker.catch_up`.
 
-        1. Protection is renewed before it is looked which pages exist: one that comes or is written later is in the next scan.
+        1. We renew the protection before we look which pages exist: one that comes or is written later is in the next scan.
         2. A mapping that goes, or is put in the place of another one, loses its registration: the next scan finds it fresh.
         3. One that does so in the middle of the scan makes the kernel break off, and pages before it may have been protected
-           without being told: they are ``_doubtful``, and the next scan finds them whatever was written.
+           without being told: they are ``_doubtful``, and the next scan finds them, written or not.
         """
         scan = self._found(lines, changed=changed, is_running=True)
         self._let_writers_finish()
@@ -213,7 +213,7 @@ class PagemapTracker:
         return Scan(written, page_set.union(cleared, emptied))
 
     def _written(self, ranges: Words, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
-        """Written pages of what is protected; while the process runs, mapping by mapping, so that only a lost one is in doubt."""
+        """Written pages of protected ranges; while the process runs, mapping by mapping, so that only a lost one is in doubt."""
         if not is_running:
             return self._scanner.written(ranges)
         parts = self._parts.of(ranges, lines, make=lambda: _by_mapping(ranges, lines))
@@ -258,10 +258,10 @@ class PagemapTracker:
         return [line for line in inside if not self._scanner.is_protected(line.start, line.end)]
 
     def _fresh(self, lines: Sequence[MapsLine], *, is_running: bool) -> Words:
-        """Register mappings and protect them: what exists in them.
+        """Register mappings and protect them; answers with the pages that exist in them.
 
         Args:
-            is_running: one that cannot be registered may be gone, and what exists is looked for once more.
+            is_running: a mapping that cannot be registered may be gone, so existing pages are looked for once more.
         """
         for line in lines:
             if not self._register(line) and not is_running:
@@ -272,7 +272,7 @@ class PagemapTracker:
         return self._own(everywhere) if is_running else existing
 
     def _protect_windows(self, lines: Sequence[MapsLine], existing: Words) -> None:
-        """Protect what is worth it and is not protected yet: what was written there since the scan began must stay known.
+        """Protect windows that are worth it and not protected yet: writes there since the scan began must stay known.
 
         Where a mapping has gone meanwhile nothing is protected, and the next scan finds out.
         """
@@ -341,12 +341,12 @@ class PagemapTracker:
         return real, page_set.union(copied, page_set.intersection(found.swapped, readable))
 
     def _own(self, extents: Words) -> Words:
-        """What exists where holes may be protected by now, which look as if they were swapped out."""
+        """The pages that exist where holes may be protected by now: such holes look like swapped-out pages."""
         real, looked_at = self._existing(extents, NONE)
         return page_set.intersection(page_set.union(real, looked_at), extents)  # it is also told of small gaps between them
 
     def _surroundings_of(self, doubtful: Words) -> Words:
-        """Of the same pages from scan to scan, as a rule: one set while the process runs, and one while it stands still."""
+        """The surroundings of pages. Scans ask for the same pages as a rule: one set while the process runs, one in a freeze."""
         key = doubtful.tobytes()
         for known, around in self._around:
             if known == key:

@@ -18,7 +18,7 @@ _INODE_AT: Final = 68
 _ANY_STATE: Final = 0xFFFFFFFF
 _SHUTDOWN: Final = 8
 _WITHOUT: Final[set[tuple[int, int]]] = set()
-"""What this kernel does not tell of: asked again it would look for the module each time (request_module), for milliseconds."""
+"""Kinds that this kernel does not tell of: each further question would make it look for a module (request_module), for ms."""
 
 
 def shut_down(family: int, protocol: int) -> dict[int, int]:

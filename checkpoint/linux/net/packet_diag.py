@@ -25,7 +25,7 @@ _RINGS: Final = {2: 5, 3: 13}
 
 
 class Membership(Struct, frozen=True):
-    """What a packet socket receives besides what is for this machine.
+    """Packets that a packet socket receives besides those for this machine.
 
     Attributes:
         count: how often it was asked for.
@@ -42,7 +42,7 @@ class PacketSocket(Struct, frozen=True):
     """One packet socket.
 
     Attributes:
-        rings: by the option that makes one, what that was told: struct tpacket_req3.
+        rings: by the option that makes one, its argument: struct tpacket_req3.
     """
 
     memberships: tuple[Membership, ...]

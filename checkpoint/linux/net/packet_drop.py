@@ -93,7 +93,7 @@ class Connection(Struct, frozen=True):
 
     @classmethod
     def between(cls, ours: Sequence[object], peer: Sequence[object]) -> Connection:
-        """Of two addresses as getsockname(2) and getpeername(2) tell them."""
+        """The connection of two addresses as getsockname(2) and getpeername(2) tell them."""
         return cls(*((_plain(str(end[0])), int(str(end[1]))) for end in (ours, peer)))
 
     @property
@@ -165,7 +165,7 @@ def _attributes(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _rules(one: Connection, until_ns: int) -> list[_Message]:
-    """The table of a connection: what comes is dropped, and what goes."""
+    """The table of a connection: it drops packets in both directions."""
     table = one.table
     messages = [_message(_NEW_TABLE, _CREATE, _text(1, table) + _attribute(_USER_DATA, _UNTIL.pack(until_ns)))]
     for name, hook, source, target in (("input", _INPUT, one.peer, one.ours), ("output", _OUTPUT, one.ours, one.peer)):

@@ -14,7 +14,7 @@ NLM_F_REQUEST: Final = 1
 NLM_F_ACK: Final = 4
 NLM_F_DUMP: Final = 0x300
 NLM_F_DUMP_INTR: Final = 0x10
-"""In an answer: what is listed has changed in the middle of the list."""
+"""In an answer: the listed objects have changed in the middle of the list."""
 TRIES: Final = 5
 ROOM: Final = 1 << 18
 """Bytes of one part of a list; the kernel fills 32 KiB at most."""
@@ -27,7 +27,7 @@ class UnknownError(OSError):
 
 
 class ChangedError(OSError):
-    """What was to be listed changed in the middle of the list, every time."""
+    """The listed objects changed in the middle of the list, every time."""
 
 
 def opened() -> socket.socket:

@@ -26,7 +26,7 @@ from checkpoint.runtime.lazy_numpy import NDArray
 Option = tuple[int, int, int]
 """Level, number and size of an option."""
 Told = tuple[bytes, bytes]
-"""Of a socket what the program has set, and what has become of it otherwise; the last two bytes are what poll(2) says."""
+"""A socket's settings by the program, and its other state; the last two bytes are the events of poll(2)."""
 
 OPTION_SIZE: Final = 64
 NUMBER_SIZE: Final = 8
@@ -38,8 +38,8 @@ SO_PEERNAME: Final = 28
 SO_BUF_LOCK: Final = 72
 _TCP_INFO_SIZE: Final = 216
 _TCP_INFO_TOLD: Final = ((0, 1), (24, 32), (128, 136), (144, 148), (200, 216))
-"""Of struct tcp_info: state; what a listener holds; bytes received, not sent yet, sent and sent again. The rest is times and
-estimates."""
+"""Parts of struct tcp_info: state; connections that a listener holds; bytes received, not sent yet, sent and sent again. The
+rest is times and estimates."""
 _CREDENTIALS_SIZE: Final = 12
 _MCAST_MSFILTER: Final = 48
 _POLL: Final = struct.Struct("<ihH")
@@ -57,7 +57,7 @@ SETTINGS, STATE, ASIDE = range(3)
 
 
 class Subject(Struct, frozen=True):
-    """What is asked of a socket follows from this.
+    """The questions to a socket follow from this.
 
     Attributes:
         options: those that a fresh one of its form has.
@@ -108,14 +108,14 @@ def _tagged(part: int, offset: int) -> int:
 
 
 class Questions(Struct, frozen=True, eq=False):
-    """All that is asked of sockets of one kind.
+    """All questions to sockets of one kind.
 
     Attributes:
         words: the rows, with offsets instead of addresses.
         moved: where those are, 1 or 0.
         image: what the memory holds before.
         ends: where the parts end.
-        buffers, info, polled: offsets of what is not compared as a whole, from `ends[STATE]` on; ``info`` -1 for none.
+        buffers, info, polled: offsets of answers that are not compared as a whole, from `ends[STATE]` on; ``info`` -1 for none.
     """
 
     words: NDArray[np.uint64]
@@ -130,7 +130,7 @@ class Questions(Struct, frozen=True, eq=False):
 
 @lru_cache(maxsize=64)
 def questions(subject: Subject) -> Questions:
-    """What is asked of such sockets."""
+    """The questions to such sockets."""
     plan = _Plan()
     plan.ask(SETTINGS, "fstat", (0, 0), {2: (SETTINGS, plan.room(SETTINGS, bytes(STAT_SIZE)))})
     buffers = ((socket.SOL_SOCKET, socket.SO_SNDBUF), (socket.SOL_SOCKET, socket.SO_RCVBUF))
@@ -154,7 +154,7 @@ def questions(subject: Subject) -> Questions:
 
 
 def _ask_state(plan: _Plan, subject: Subject) -> int:
-    """What changes by itself; answers the offset of struct tcp_info."""
+    """Plan the questions about state that changes by itself; answers the offset of struct tcp_info."""
     info = -1
     if subject.family in _INTERNET:
         plan.name("getsockname")
@@ -201,7 +201,7 @@ class _Sheet:
 
     Attributes:
         memory: (capacity, bytes) settings and states, in the order of those that are asked.
-        aside: (capacity, bytes) what is not compared as a whole.
+        aside: (capacity, bytes) the answers that are not compared as a whole.
         table: the calls, those about one socket after the other.
         of_buffers: the same of `BUFFERS`.
 
@@ -319,7 +319,7 @@ class Asking:
         return self._heard(count)
 
     def _ask_with(self, second: SecondThread, numbers: NDArray[np.int64]) -> bool:
-        """Ask from the front while a second thread asks from the back; what it has not finished by then we ask, too.
+        """Ask from the front while a second thread asks from the back; we also ask what it has not finished by then.
 
         False, and nothing was asked, where that thread is busy still.
         """
@@ -359,7 +359,7 @@ class Asking:
         return b"".join((self._sheet.memory[:count].tobytes(), joined.tobytes(), buffers))
 
     def told(self, heard: bytes) -> list[Told]:
-        """Of each what the program has set, and what has become of it otherwise, of what was heard last."""
+        """Of each, from the last answers: its settings, and its state."""
         (end, size, _), more, buffers = self._questions.ends, self._more, self._questions.buffers
         each = buffers.stop - buffers.start
         of_buffers = len(heard) - each * len(self._chosen)
@@ -375,12 +375,12 @@ class Asking:
 
 
 def events(state: bytes) -> int:
-    """What poll(2) said."""
+    """The events of poll(2)."""
     return int.from_bytes(state[-2:], "little")
 
 
 def sized(fresh: Mapping[tuple[int, int], bytes]) -> tuple[Option, ...]:
-    """Options as `Subject` takes them, of what a fresh socket answers: a number stays one, and what is empty may be long."""
+    """Options as `Subject` takes them, from a fresh socket's answers: a number stays one, and an empty option may become long."""
     return tuple(
         (int(level), int(number), NUMBER_SIZE if 0 < len(value) <= NUMBER_SIZE else OPTION_SIZE)
         for (level, number), value in fresh.items()

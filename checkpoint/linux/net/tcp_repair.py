@@ -76,11 +76,11 @@ class CannotCarryError(Exception):
 
 
 class InUseError(CannotCarryError):
-    """Somebody on this machine has it, perhaps not for long."""
+    """Another socket on this machine has it, perhaps not for long."""
 
 
 class Kept(Struct, frozen=True):
-    """Everything that must be known of a connection to take it up elsewhere.
+    """All facts of a connection that another machine needs to take it up.
 
     Attributes:
         state: of tcp(7).
@@ -161,7 +161,7 @@ def read(looked: socket.socket) -> Kept:
 
 
 def leave_behind(looked: socket.socket) -> None:
-    """Set a connection free in which somebody died while he looked at it; its SO_REUSEADDR nobody knows any more.
+    """Set a connection free that a process of ours left in repair when it died. Its SO_REUSEADDR is not known any more.
 
     Raises:
         OSError: we may not.
@@ -171,7 +171,7 @@ def leave_behind(looked: socket.socket) -> None:
 
 
 def _require_plain(looked: socket.socket) -> None:
-    """Refuse what has more to it than the kernel tells."""
+    """Refuse a connection with state that the kernel does not tell."""
     if is_encrypted(looked):
         raise CannotCarryError("the kernel encrypts it (TCP_ULP)")
     if looked.getsockopt(socket.SOL_SOCKET, SO_PEEK_OFF) >= 0:
@@ -225,8 +225,8 @@ Address = tuple[str, int] | tuple[str, int, int, int]
 
 
 def connect(made: socket.socket, kept: Kept, ours: Address, peer: Address) -> None:
-    """Turn a fresh socket into the connection, without a word to the peer. It stays in repair until `set_free`: until then it
-    may be closed, which nobody hears of.
+    """Turn a fresh socket into the connection, without a word to the peer. It stays in repair until `set_free`: a close before
+    that tells the peer nothing.
 
     Raises:
         CannotCarryError: this machine cannot have it.
@@ -286,7 +286,7 @@ def fill(made: socket.socket, kept: Kept) -> None:
 
 
 def _agreed(kept: Kept) -> Iterator[bytes]:
-    """What the ends told each other when they were connected. Source: struct tcp_repair_opt."""
+    """The options on which the ends agreed when they connected. Source: struct tcp_repair_opt."""
     option = struct.Struct("<II")
     if kept.options & _WITH_SACK:
         yield option.pack(_OPTION_SACK, 0)
@@ -326,7 +326,7 @@ def set_free(made: socket.socket, kept: Kept, reuse: int) -> None:
 
 
 def ask_peer(made: socket.socket, kept: Kept, reuse: int) -> None:
-    """Have the kernel ask the peer where it stands, now that it is heard; what waits is sent upon the answer.
+    """Have the kernel ask the peer where it stands, now that it is heard; waiting bytes are sent upon the answer.
 
     Raises:
         OSError: we may not.

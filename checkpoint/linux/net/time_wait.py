@@ -26,7 +26,7 @@ _REST: Final = struct.Struct("<III")
 """Interface and cookie of struct inet_diag_sockid: any."""
 _STATE_AT: Final = HEADER.size + 1
 _INODE_AT: Final = HEADER.size + 68
-"""idiag_inode: 0 of a socket that nobody has open."""
+"""idiag_inode: 0 of a socket that no process has open."""
 _ANY_STATE: Final = 0xFFFFFFFF
 _NO_COOKIE: Final = 0xFFFFFFFF
 
@@ -46,7 +46,7 @@ def remove(ends: Sequence[End]) -> None:
 
 
 def remove_orphan(ends: Sequence[End]) -> None:
-    """Have the kernel forget our end of a connection that no process has open any more, in whatever state (CAP_NET_ADMIN).
+    """Have the kernel forget our end of a connection that no process has open any more, in any state (CAP_NET_ADMIN).
 
     The kernel may want to reset the peer's: the connection is silent.
     """
@@ -58,7 +58,7 @@ def remove_orphan(ends: Sequence[End]) -> None:
 
 
 def _answer(asked: socket.socket, order: int, address: End, peer: End) -> bytes:
-    """What the kernel says of one connection: a struct inet_diag_msg, or b"" for an error or a mere acknowledgement."""
+    """The kernel's answer about one connection: a struct inet_diag_msg, or b"" for an error or a mere acknowledgement."""
     hosts = [ip_address(end[0].partition("%")[0]) for end in (address, peer)]
     family = socket.AF_INET if hosts[0].version == 4 else socket.AF_INET6
     request = _REQUEST.pack(family, socket.IPPROTO_TCP, 0, _ANY_STATE)

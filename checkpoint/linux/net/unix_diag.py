@@ -20,19 +20,19 @@ SIOCUNIXFILE: Final = 0x89E0
 _REQUEST: Final = struct.Struct("<BBHIIIII")
 _ANSWER: Final = struct.Struct("<BBBxIII")
 _SHOW: Final = 1 | 2 | 4 | 8 | 16
-"""Name, file, peer, who waits to be accepted, lengths."""
+"""Name, file, peer, sockets that wait to be accepted, lengths."""
 _NO_COOKIE: Final = 0xFFFFFFFF
 _ANY_STATE: Final = 0xFFFFFFFF
 _NAME, _FILE, _PEER, _WAITING, _LENGTHS, _SHUTDOWN = 0, 1, 2, 3, 4, 6
 _MINOR_BITS: Final = 20
-"""Of a device number as the kernel has it. Source: linux/kdev_t.h."""
+"""Bits of the minor number in a device number of the kernel. Source: linux/kdev_t.h."""
 
 ESTABLISHED: Final = 1
 LISTENING: Final = 10
 
 
 class BoundFile(Struct, frozen=True):
-    """The file that a socket was bound to, as everybody may ask for it: it has this number still when it has no name.
+    """The file that a socket was bound to, as any user may ask for it: it has this number still when it has no name.
 
     Attributes:
         number: the lower 32 bits of its inode's.
@@ -72,7 +72,7 @@ class UnixSocket(Struct, frozen=True):
 
 
 def answer_about(inode: int) -> bytes:
-    """What the kernel says of one unix socket of our network namespace, for `parsed`; b"" where it does not tell."""
+    """The kernel's answer about one unix socket of our network namespace, for `parsed`; b"" where it does not tell."""
     with contextlib.suppress(OSError), sock_diag.opened() as asked:
         asked.send(sock_diag.message(_REQUEST.pack(socket.AF_UNIX, 0, 0, _ANY_STATE, inode, _SHOW, _NO_COOKIE, _NO_COOKIE)))
         packed = asked.recv(1 << 16)
@@ -91,7 +91,7 @@ def answers() -> dict[int, bytes]:
 
 
 def parsed(answer: bytes) -> UnixSocket | None:
-    """What an answer says; None for none."""
+    """The content of an answer; None for none."""
     if not answer:
         return None
     _, socket_type, state, _, _, _ = _ANSWER.unpack_from(answer)
@@ -117,7 +117,7 @@ def _file_of(told: bytes) -> BoundFile | None:
 
 
 def bound_file(looked: socket.socket) -> int | None:
-    """An O_PATH descriptor for the file that a socket is bound to, whatever name that has by now.
+    """An O_PATH descriptor for the file that a socket is bound to, also if the file has another name by now.
 
     Source: unix_open_file() in net/unix/af_unix.c (Linux 4.13); it takes CAP_NET_ADMIN.
 

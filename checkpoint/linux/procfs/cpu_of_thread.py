@@ -22,7 +22,7 @@ _our_processor = ctypes.PyDLL(None).sched_getcpu
 
 
 class Whereabouts:
-    """Of one thread; its file stays open, for it is read while the program stands still."""
+    """The whereabouts of one thread; its file stays open, for it is read while the program stands still."""
 
     def __init__(self, tid: int) -> None:
         self._tid = tid

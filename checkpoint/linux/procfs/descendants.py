@@ -30,7 +30,7 @@ CHILDREN_SIZE: Final = 1 << 12
 GLANCE_SIZE: Final = 16
 """Bytes of a list that tell whether there is anything in it."""
 NEARLY_A_PAGE: Final = 4000
-"""Bytes: the kernel gives a list in pieces of a page at most, so what is shorter is the end.
+"""Bytes: the kernel gives a list in pieces of a page at most, so a shorter piece is the end.
 
 Source: seq_read_iter() in fs/seq_file.c."""
 
@@ -44,7 +44,7 @@ class Children:
         self._glance: _Glance | None = None
 
     def read(self, tids: list[int]) -> list[int]:
-        """Those that these threads have given birth to, oldest first; zombies among them."""
+        """The children of these threads, oldest first; zombies among them."""
         found: list[int] = []
         for tid in tids:
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended; its children are another one's now
@@ -112,11 +112,11 @@ def _whole(file: int) -> bytes:
 
 
 class Kinship:
-    """Who belongs to the component of a process.
+    """The processes that belong to the component of a process.
 
     Args:
         pid: of its first process.
-        reaper: who is given the orphans: the first process of their PID namespace, or their guard; 0: nobody that we know.
+        reaper: the process that gets the orphans: the first one of their PID namespace, or their guard; 0: none that we know.
     """
 
     def __init__(self, pid: int, reaper: int) -> None:
@@ -129,7 +129,7 @@ class Kinship:
         self._has_strays = False
 
     def has_others(self, tids: list[int]) -> bool:
-        """Whether there is anybody besides the first process.
+        """Whether there are processes besides the first one.
 
         Args:
             tids: its threads.
@@ -140,7 +140,7 @@ class Kinship:
         return [pid for pid in self._of_reaper.read([self._reaper]) if pid != self._pid]
 
     def others(self) -> list[int]:
-        """Everybody besides the first process, parents before children, zombies included."""
+        """All processes besides the first one, parents before children, zombies included."""
         found = list(self._walk([*children(self._pid), *(self._orphans() if self._reaper else ())], ()))
         self._has_strays = False
         while strays := self._strays(found):
@@ -149,7 +149,7 @@ class Kinship:
         return found
 
     def _strays(self, found: list[int]) -> list[int]:
-        """Who has lost its parent, and is not among those that were found."""
+        """Processes that have lost their parent, and are not among those that were found."""
         if not self._of_ancestors:
             return []
         elders = {self._pid, *(one.pid for one in self._of_ancestors)}
@@ -246,7 +246,7 @@ def _exists(pid: int) -> bool:
 
 
 def reaper_of(pid: int, *, is_guarded: bool) -> int:
-    """Who is given the orphans of a component; 0: nobody that we know.
+    """The process that gets the orphans of a component; 0: none that we know.
 
     Args:
         is_guarded: its parent is its guard, which has no other children.
@@ -269,7 +269,7 @@ def _namespace(pid: int) -> str:
 
 
 def taken_pids(pid: int) -> Callable[[int], bool]:
-    """Whether a pid is somebody's where a process lives; of those that live apart from us nobody else is there."""
+    """Whether a pid is in use where a process lives; a process in a PID namespace of its own shares it with no stranger."""
     is_apart = len(procfs.status(pid).pids) > 1
     return lambda number: not is_apart and os.path.exists(f"/proc/{number}")
 
@@ -284,5 +284,5 @@ def others(pid: int, reaper: int) -> list[int]:
 
 
 def component(pid: int) -> list[int]:
-    """Everybody of the component of a process that nobody guards, but for itself, parents before children."""
+    """All processes of the component of an unguarded process, without itself, parents before children."""
     return others(pid, reaper_of(pid, is_guarded=False))

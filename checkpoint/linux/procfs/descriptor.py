@@ -49,22 +49,22 @@ class Descriptor(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Its name in reports."""
         return f"fd {self.number}"
 
     @property
     def fields(self) -> Mapping[str, str]:
-        """What fdinfo says, the first of several lines of one key."""
+        """The fields of fdinfo, the first of several lines of one key."""
         return parse_fields(self.text)
 
     @property
     def text(self) -> str:
-        """What fdinfo says."""
+        """The text of fdinfo."""
         return os.fsdecode(self.told)
 
 
 class Standing(Struct, frozen=True):
-    """What must be asked, besides its fdinfo, to know that a descriptor is what it was.
+    """The questions, besides its fdinfo, that tell whether a descriptor is unchanged.
 
     Attributes:
         link: where it leads.
@@ -76,7 +76,7 @@ class Standing(Struct, frozen=True):
 
 
 def head_of(told: bytes) -> re.Match[bytes] | None:
-    """What the first lines of fdinfo say: offset, flags, and of Linux 5.14 mnt_id and inode, which name an open file's file."""
+    """The first lines of fdinfo: offset, flags, and of Linux 5.14 mnt_id and inode, which name an open file's file."""
     return _HEAD.match(told)
 
 
@@ -122,11 +122,11 @@ def _made(number: int, target: str, told: bytes, head: re.Match[bytes] | None, i
 
 
 class _Nameless(Struct, frozen=True):
-    """What all open files of one of the kernel's own file systems have in common, whoever has them; nobody can name a file there.
+    """Facts that all open files of one of the kernel's own file systems share, in all processes; files there have no names.
 
     Attributes:
         prefix: of their targets, before the number of the inode; "" where the target says what it is.
-        about: of one; what differs there (times, permissions that fchmod(2) sets) matters to nobody.
+        about: of one; its differences (times, permissions that fchmod(2) sets) do not matter.
     """
 
     prefix: str
@@ -139,7 +139,7 @@ class _Nameless(Struct, frozen=True):
 
 @functools.cache
 def _nameless() -> Mapping[bytes, _Nameless]:
-    """Those file systems that programs use most, by the mnt_id of fdinfo: two questions less about each of thousands of sockets.
+    """The file systems that programs use most, by the mnt_id of fdinfo: two questions less about each of thousands of sockets.
 
     None before Linux 5.14, whose fdinfo does not tell inodes. These mounts are there from the machine's start to its end.
     """

@@ -26,7 +26,7 @@ _NAME_SIZE: Final = 16
 
 
 class _Column:
-    """One call about each of some descriptors. The table has no gaps, whoever comes and goes."""
+    """One call about each of some descriptors. The table has no gaps, also after descriptors come and go."""
 
     def __init__(self, call: str, size: int) -> None:
         self._call = call
@@ -88,7 +88,7 @@ class _Column:
         return self._results[:count].tobytes() + self._answers[: count * self._size].tobytes()
 
     def told(self, number: int) -> bytes | None:
-        """What was answered about one; None for nothing, an error, and what is too long."""
+        """The answer about one; None for nothing, an error, and an answer that is too long."""
         place = self._places.get(number)
         if place is None:
             return None
@@ -113,7 +113,7 @@ class _Known(Struct):
 class KeptTexts:
     """The fdinfo files of one process, kept open from look to look: reading one again takes a third of opening it anew.
 
-    Such a file tells of whatever has its number when it is read. Source: seq_show() in fs/proc/fd.c.
+    Such a file tells of the descriptor that has its number when it is read. Source: seq_show() in fs/proc/fd.c.
     """
 
     def __init__(self, pid: int) -> None:
@@ -129,7 +129,7 @@ class KeptTexts:
         self._last: tuple[list[int], tuple[bytes, ...], tuple[Descriptor, ...]] | None = None
 
     def are_there(self) -> bool:
-        """Ask about all that were there at the last look; whether they are there still, and nobody else.
+        """Ask about all that were there at the last look; whether exactly those are there still.
 
         To list them takes the kernel longer than to count them.
         """
@@ -142,7 +142,7 @@ class KeptTexts:
         """How many are open; 0 where the kernel does not count them: before Linux 6.2. Source: proc_pid_fd(5)."""
         try:
             return os.stat(f"/proc/{self.pid}/fd" if self._directory < 0 else self._directory).st_size
-        except OSError:  # whoever lists them says why
+        except OSError:  # the listing reports the cause
             return 0
 
     def rehearse(self) -> None:
@@ -153,7 +153,7 @@ class KeptTexts:
 
     @property
     def numbers(self) -> list[int]:
-        """Those of the last look; none where something of it was not understood from what was known."""
+        """The numbers of the last look; none where the known facts did not explain all of it."""
         return self._last[0] if self._last is not None else []
 
     def as_before(self) -> tuple[Descriptor, ...] | None:
@@ -209,7 +209,7 @@ class KeptTexts:
         return self._anew(number, links, texts, link, about)
 
     def _anew(self, number: int, links: int, texts: int, link: bytes | None, about: bytes | None) -> Descriptor | None:
-        """Understand it; it is known from then on if just what must be asked of it was asked at this look, and answered."""
+        """Understand it; it is known from then on if this look asked exactly the questions that it needs, and got answers."""
         self._known.pop(number, None)
         self._is_known = False
         standing = standing_of(number, links, texts)

@@ -37,7 +37,7 @@ def descriptors(pid: int, kept: KeptTexts | None = None) -> tuple[Descriptor, ..
 
 
 def descriptors_to(pid: int, target: str) -> tuple[Descriptor, ...]:
-    """Those that lead there; of the others nothing more is read."""
+    """The descriptors that lead there; of the others nothing more is read."""
     numbers = [number for number in descriptor_numbers(pid) if _target(pid, number) == target]
     return tuple(found for number in numbers if (found := descriptor(pid, number)) is not None)
 
@@ -51,7 +51,7 @@ def _target(pid: int, number: int) -> str:
 
 
 def descriptor_numbers(pid: int) -> list[int]:
-    """The numbers of what is open; of a thread too, by its id.
+    """The numbers of open descriptors; of a thread too, by its id.
 
     Raises:
         ProcessGoneError: there is none.
@@ -132,7 +132,7 @@ class Copier:
         self._closing.entries[:, NUMBER] = row("close")[NUMBER]
         self._taking.entries[:] = row("pidfd_getfd")
         self._taking.entries[:, FIRST_ARGUMENT + 1] = numbers
-        to = self._closing.address_of(0, FIRST_ARGUMENT)  # what is had is what is closed; an error is no descriptor
+        to = self._closing.address_of(0, FIRST_ARGUMENT)  # we close exactly the ones that we got; an error is no descriptor
         self._taking.entries[:, RESULT_TO] = to + ROW_SIZE * np.arange(len(numbers), dtype=np.uint64)
         self._copies = self._closing.entries[:, FIRST_ARGUMENT].view(np.int64)
 

@@ -24,13 +24,13 @@ from checkpoint.linux.procfs.tasks import thread_ids
 Answer = TypeVar("Answer")
 PIDFD_THREAD: Final = os.O_EXCL
 SPOKESMEN_MAX: Final = 8
-"""How many threads may end, one after the other, by which a process is looked at in one look."""
+"""How many spokesmen of a process may end, one after the other, during one look."""
 _NOT_A_PROCESS: Final = (errno.EINVAL, errno.ENOENT)
-"""What pidfd_open(2) answers to a thread that is not the first one."""
+"""The errors of pidfd_open(2) for a thread that is not the first one."""
 
 
 def spokesman_of(pid: int) -> int:
-    """The id by which a process is looked at; its own as long as its first thread lives, and once all of it has ended.
+    """The id by which we look at a process; its own as long as its first thread lives, and once all of it has ended.
 
     Raises:
         ProcessGoneError: it has ended, and its parent has taken note.
@@ -45,10 +45,10 @@ def spokesman_of(pid: int) -> int:
 
 
 def told_by_spokesman(pid: int, question: Callable[[int], Answer]) -> Answer:
-    """What a process answers that is looked at by the id of its spokesman; asked again where that ends meanwhile.
+    """The answer of a process that is looked at by the id of its spokesman; asked again where that ends meanwhile.
 
     Raises:
-        CheckpointError: what the question does.
+        CheckpointError: the question raises it.
         ProbeError: one spokesman ends after the other.
     """
     for _ in range(SPOKESMEN_MAX):

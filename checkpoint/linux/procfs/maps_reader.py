@@ -34,7 +34,7 @@ class MapsReader:
     """Reads one process's maps; lines that did not change are not parsed again.
 
     Attributes:
-        lines: what is there, by the last reading.
+        lines: the mappings, by the last reading.
     """
 
     def __init__(self, pid: int) -> None:
@@ -54,7 +54,7 @@ class MapsReader:
             self._file = None
 
     def refresh(self) -> bool:
-        """Read the maps; answers whether anything changed. ``lines`` then holds what is there."""
+        """Read the maps; answers whether anything changed. ``lines`` then holds the present mappings."""
         text = procfs.read_bytes(self._pid, "maps")
         if text == self._text:
             return False
@@ -70,7 +70,7 @@ class MapsReader:
         """Have the question ready that `refresh_if_moved` asks."""
         if self._question is not None or not self._is_asked or not self._text:
             return
-        with contextlib.suppress(CaptureError, ProbeError):  # whoever reads next says so
+        with contextlib.suppress(CaptureError, ProbeError):  # the next reader reports the cause
             if self._file is None:
                 self._file = procfs.opened(self._pid, "maps")
             self._question = _Question(self._file, self.lines)
@@ -127,7 +127,7 @@ class _Question:
 
 
 def _words_of(line: MapsLine) -> tuple[int, ...]:
-    """What the kernel answers about one mapping."""
+    """The kernel's answer about one mapping."""
     device = os.major(line.device) | os.minor(line.device) << 32
     access = line.protection | SHARED * line.shared
     return line.start, line.end, access, 0, line.offset, line.inode, device

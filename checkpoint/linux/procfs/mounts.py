@@ -19,7 +19,7 @@ _ESCAPED: Final = re.compile(rb"\\([0-3][0-7]{2})")
 """Blanks, newlines and backslashes of a mount point, as octal numbers."""
 
 USER_SPACE: Final = "fuse."
-"""Of those that a process serves nobody can tell what is behind them: sshfs is one."""
+"""A process serves such a file system, and nothing tells what is behind it: sshfs is one."""
 
 
 def network_mount(pid: int, path: str) -> str:
@@ -44,7 +44,7 @@ def innermost(mounts: Iterable[Mount], path: str) -> str:
 
 
 def _at(mounts: list[tuple[str, str]], path: str) -> str:
-    """What is told of the innermost mount above a path; of several at one point the last one counts."""
+    """The entry of the innermost mount above a path; of several at one point the last one counts."""
     above = [(point, told) for point, told in mounts if path == point or path.startswith(point.rstrip("/") + "/")]
     return max(reversed(above), key=lambda mount: len(mount[0]))[1] if above else ""
 

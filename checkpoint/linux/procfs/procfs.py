@@ -19,7 +19,7 @@ from checkpoint.errors import MapsFormatError, ProbeError, ProcessGoneError
 from checkpoint.linux import abi
 
 DELETED: Final = " (deleted)"
-"""What the kernel adds to the path of what no name leads to any more."""
+"""The kernel adds this to the path of a file to which no name leads any more."""
 READ_SIZE: Final = 1 << 15
 """Bytes asked for at once: more than the kernel gives of most files, and less than what is allocated page by page."""
 
@@ -52,7 +52,7 @@ def opened(pid: int, name: str) -> int:
 
 @contextlib.contextmanager
 def _explained(pid: int, name: str) -> Iterator[None]:
-    """What the system says about a file of /proc, in our own words."""
+    """Turn the system's errors about a file of /proc into our own words."""
     path = f"/proc/{pid}/{name}"
     try:
         yield
@@ -66,11 +66,11 @@ def _explained(pid: int, name: str) -> Iterator[None]:
 
 
 def denied(pid: int, sentence: str) -> ProbeError | ProcessGoneError:
-    """Why an ordinary user was not let at what /proc says of a process: it is another's, or has ended, for what is left of it is
-    root's until its parent takes note.
+    """Why an ordinary user could not read a process's files of /proc: the process is another user's, or has ended. The files of
+    an ended process are root's until its parent takes note.
 
     Args:
-        sentence: what to say of one that lives.
+        sentence: the sentence about a living process.
 
     Source: task_dump_owner() in fs/proc/base.c.
     """
@@ -100,7 +100,7 @@ class KeptFiles:
         self._files: dict[str, int] = {}
 
     def descriptor(self, name: str) -> int:
-        """Of ``/proc/PID/name``. Raises as `read_bytes`."""
+        """A descriptor of ``/proc/PID/name``. Raises as `read_bytes`."""
         file = self._files.get(name)
         if file is None:
             file = self._files[name] = opened(self._pid, name)
@@ -172,7 +172,7 @@ def head_of_program(pid: int, size: int) -> bytes:
 
 
 def outlook(pid: int) -> str:
-    """What to put before an absolute path that the kernel tells of a process, so that we find there what it finds.
+    """The prefix for an absolute path that the kernel tells of a process, so that we find the same file as the process.
 
     The kernel tells paths from the root of the mount namespace, also of a process that has another root directory (chroot).
     Of a process that is gone, or not ours to look at, the answer leads nowhere.
@@ -242,8 +242,8 @@ def parse_maps_line(line: str) -> MapsLine:
 def lines_of(text: str) -> list[str]:
     """The lines of a text as the kernel ends them.
 
-    `str.splitlines` sees ends of its own (a carriage return, for one) in the name of a process or file, which whoever gave it
-    chose: a process could tell lines about itself.
+    `str.splitlines` sees ends of its own (a carriage return, for one) also inside the name of a process or file. A process
+    chooses such names, so it could forge lines about itself.
     """
     return [line for line in text.split("\n") if line]
 
@@ -308,7 +308,7 @@ class Status(Struct, frozen=True):
 
 
 _ESCAPED: Final = re.compile(r"\\n|\\\\")
-"""Of a name: a line feed and a backslash. Source: proc_task_name() in fs/proc/array.c."""
+"""Escaped characters of a name: a line feed and a backslash. Source: proc_task_name() in fs/proc/array.c."""
 
 
 def _name_in(status: str) -> str:
@@ -360,7 +360,7 @@ def _five(words: tuple[int, ...]) -> tuple[int, int, int, int, int]:
 
 
 def signal_sets(text: bytes) -> tuple[int, int, int]:
-    """Of an unparsed /proc/PID/status: signals with an action of their own, pending for the thread, pending for the process."""
+    """Signals in an unparsed /proc/PID/status: with an action of their own, pending for the thread, pending for the process."""
 
     def mask(key: bytes) -> int:
         begin = text.index(key) + len(key)
@@ -377,7 +377,7 @@ def swapped_size(pid: int) -> int:
 
 
 def pid_max() -> int:
-    """What every pid is smaller than."""
+    """The limit: every pid is smaller."""
     with open("/proc/sys/kernel/pid_max") as file:
         return int(file.read())
 

@@ -41,7 +41,7 @@ class ThreadCount:
                 self._close = weakref.finalize(self, os.close, self._directory)
             return count
         count = os.fstat(self._directory).st_nlink - FIRST_LINKS
-        if count < 1:  # what is open still has its own links when nobody is left
+        if count < 1:  # the open directory keeps its own links when no thread is left
             raise ProcessGoneError(f"there is no process {self._pid} any more")
         return count
 
@@ -61,6 +61,6 @@ def thread_ids(pid: int) -> list[int]:
         first, *others = map(int, os.listdir(f"/proc/{pid}/task"))
     except (FileNotFoundError, ProcessLookupError) as error:
         raise ProcessGoneError(f"there is no process {pid} any more") from error
-    except ValueError as error:  # nobody is listed: it is just going
+    except ValueError as error:  # no thread is listed: the process is just ending
         raise ProcessGoneError(f"there is no process {pid} any more") from error
     return sorted([first, *others] if first == pid else others, key=lambda tid: (tid != pid, tid))

@@ -25,7 +25,7 @@ GIGANTIC: Final = "gb"
 SEALED: Final = "sl"
 DROPPABLE: Final = "dp"
 MAY_WRITE: Final = "mw"
-"""Its protection may be changed to allow writing: what is mapped was open for that. Kept of shared mappings of files only."""
+"""Its protection may be changed to allow writing: its file was open for that. Kept of shared mappings of files only."""
 LOCKED, LOCKED_ON_FAULT = "lo", "lf"
 WATCHED: Final = frozenset(("um", "uw"))
 """A userfaultfd watches it, or write-protects it: ours, or one of the program's own."""
@@ -63,7 +63,7 @@ def key_in(flags: tuple[str, ...]) -> int:
 
 
 REST: Final = 200
-"""How many times as long as a reading took nothing is read again while the mappings stay: a reader is in the way of who maps."""
+"""How many times as long as a reading took nothing is read again while the mappings stay: a reading delays a thread that maps."""
 REST_S_MIN: Final = 5.0
 
 
@@ -85,7 +85,7 @@ class FlagsReader(Struct):
 
         Args:
             lines: the mappings as they were read last.
-            anew: whatever was read before.
+            anew: read them in any case.
         """
         began = time.perf_counter()
         if lines == self._lines and began < self._due_s and not anew:

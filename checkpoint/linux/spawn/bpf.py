@@ -78,7 +78,7 @@ def allows(programs: Iterable[bytes], number: int, architecture: int, arguments:
 
 
 def _verdict(program: bytes, call: Sequence[int]) -> int:
-    """What a filter returns; every program ends, for the kernel knows no way back.
+    """The value that a filter returns; every program ends, for the kernel knows no backward jumps.
 
     Args:
         call: struct seccomp_data in words of 32 bits.

@@ -35,7 +35,7 @@ def xstate_layout() -> extended.Layout:
 
 
 def why_unsupported() -> str:
-    """Why programs that nobody prepared cannot be kept on this machine's processor; "": they can."""
+    """Why unmodified programs cannot be kept on this machine's processor; "": they can."""
     if reason := arch.why_unsupported():
         return reason
     has = features() if extended.UNKEPT else ()
@@ -48,7 +48,7 @@ def why_unsupported() -> str:
 
 
 def require_supported(what: str) -> None:
-    """Check that programs that nobody prepared can be kept on this machine's processor.
+    """Check that unmodified programs can be kept on this machine's processor.
 
     Args:
         what: was tried, for the message: "capture pid 412".
@@ -83,7 +83,7 @@ def vector_size() -> int:
 
 @contextlib.contextmanager
 def _instructions(code: bytes) -> Iterator[int]:
-    """The address of instructions in a page that nobody can write, for as long as they are needed.
+    """The address of instructions in a page that is not writable, for as long as they are needed.
 
     Raises:
         OSError: the system does not allow that.
@@ -99,7 +99,7 @@ def _instructions(code: bytes) -> Iterator[int]:
 
 @functools.cache
 def features() -> tuple[str, ...]:
-    """What /proc/cpuinfo says that the processor has, in alphabetical order."""
+    """The features of the processor by /proc/cpuinfo, in alphabetical order."""
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith(cpu.FEATURES_LINE):
             return tuple(sorted(line.partition(":")[2].split()))

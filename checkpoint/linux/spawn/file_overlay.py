@@ -2,7 +2,7 @@
 
 A child calls this module between its creation and its execve. Other programs see only an empty directory, which is made with the
 rights of the program's user and over which the files are mounted. Everything but the mount itself is done with those rights: a
-user who puts a link in the way can cause no write that he could not make himself.
+user that puts a link in the way can cause no write that he could not make himself.
 
 Source: mount(2), tmpfs(5), seteuid(2), setgroups(2).
 """

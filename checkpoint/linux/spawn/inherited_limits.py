@@ -28,11 +28,11 @@ EVERY_CAPABILITY: Final = (1 << CAPABILITIES_MAX) - 1
 
 
 class Inheritance(Struct, frozen=True):
-    """What execve(2) does not change, besides environment, directory, umask and descriptors, which a client sends.
+    """The state that execve(2) does not change, besides environment, directory, umask and descriptors, which a client sends.
 
     Attributes:
         groups: the supplementary ones.
-        bounding: set of capabilities, bit N for capability N: what a program of root may have at most.
+        bounding: set of capabilities, bit N for capability N: those that a program of root may have at most.
         limits: RLIMIT number → (soft, hard); -1 is infinity. Numbers that are missing stay as they are.
         affinity: processors; empty: any.
     """
@@ -56,7 +56,7 @@ class Inheritance(Struct, frozen=True):
 
 
 def of_owner(uid: int, gid: int, groups: tuple[int, ...]) -> Inheritance:
-    """What a program of another user gets where root starts it by hand: none of root's priorities, nor a right to any."""
+    """The inheritance of another user's program that root starts by hand: none of root's priorities, nor a right to any."""
     return Inheritance(
         uid,
         gid,
@@ -121,7 +121,7 @@ def _set_limit(number: int, soft: int, hard: int) -> None:
 
 
 def _lesser(one: int, other: int) -> int:
-    """Of two limits."""
+    """The lesser of two limits."""
     finite = [limit for limit in (one, other) if limit != resource.RLIM_INFINITY]
     return min(finite, default=resource.RLIM_INFINITY)
 

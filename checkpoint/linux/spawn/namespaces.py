@@ -46,7 +46,7 @@ _MS_REC_SLAVE: Final = 16384 | (1 << 19)
 _CAPABILITY_VERSION_3: Final = 0x20080522
 _NS_PER_S: Final = 1_000_000_000
 
-# Holds the interpreter's lock across the call: in a child made by clone3 nobody else is there to hand it back.
+# Holds the interpreter's lock across the call: in a child made by clone3 there is no other thread to hand it back.
 _libc = ctypes.PyDLL(None, use_errno=True)
 
 
@@ -129,8 +129,8 @@ _IN_A_CHROOT: Final = (
 
 
 def _may_keep_mounts() -> bool:
-    """Whether mounts can be of one namespace alone here: what hands them on is the mount of the root directory, which whoever was
-    put into a directory of it (chroot(2)) cannot name. Source: mount_namespaces(7); do_change_type() in fs/namespace.c."""
+    """Whether mounts can be of one namespace alone here. The mount of the root directory hands them on, and a process that was
+    put into a directory of it (chroot(2)) cannot name it. Source: mount_namespaces(7); do_change_type() in fs/namespace.c."""
     lines = Path("/proc/self/mountinfo").read_text().splitlines()
     return any(line.split(" ", 5)[4] == "/" for line in lines)
 
@@ -203,7 +203,9 @@ def mount_proc() -> None:
 
 
 def mount_terminals() -> None:
-    """Mount pseudo-terminals of the caller's own over those that are there: their numbers begin at 0, and nobody else takes one.
+    """Mount pseudo-terminals of the caller's own over those that are there.
+
+    Their numbers begin at 0, and no other program takes one.
 
     Raises:
         OSError: there is no /dev/pts, or it may not be mounted.

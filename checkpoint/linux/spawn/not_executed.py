@@ -10,7 +10,7 @@ import os
 from typing import Final
 
 FIRST_LINE_SIZE: Final = 256
-"""Of a script: the kernel reads no more of it."""
+"""Bytes of a script's first line: the kernel reads no more of it."""
 
 INTERPRETERS: Final = {".py": "python3", ".sh": "sh"}
 
@@ -29,7 +29,7 @@ def explained(error: OSError, name: str, path: str) -> OSError:
 
 def _because(error: OSError, found: str) -> str:
     if error.errno == errno.ENOENT and os.path.lexists(found):
-        return f": the file is there, but not what it names as its interpreter{_interpreter(found)}"
+        return f": the file is there, but not its interpreter{_interpreter(found)}"
     if error.errno == errno.EACCES and os.path.isdir(found):
         return ": it is a directory"
     if error.errno == errno.EACCES and os.path.isfile(found):

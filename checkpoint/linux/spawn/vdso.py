@@ -63,7 +63,7 @@ def _functions(image: bytes) -> Iterator[Function]:
 
 
 def _dynamic(image: bytes) -> dict[int, int]:
-    """What its dynamic section says: tag → value; addresses are offsets, for an image is linked at 0."""
+    """Its dynamic section: tag → value; addresses are offsets, for an image is linked at 0."""
     for address, size in _segments(image, PT_DYNAMIC):
         return dict(_ENTRY.iter_unpack(image[address : address + size]))
     raise ValueError("no dynamic section")

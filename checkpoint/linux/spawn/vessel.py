@@ -57,7 +57,7 @@ _REPORT_LIMIT: Final = 65536
 """Bytes of all reports of one birth; a few hundred are usual."""
 
 _REST_S: Final = 0.001
-"""Before it is looked again whether a process that was killed has ended."""
+"""The pause before we look again whether a killed process has ended."""
 
 
 class Birth(Struct, frozen=True):
@@ -69,7 +69,7 @@ class Birth(Struct, frozen=True):
         clocks: the reading its monotonic and boot time are to go on from; None: this machine's clocks are right for it.
         elapsed_ns: time since that reading, as it was at ``counted_ns`` on CLOCK_BOOTTIME; 0: as it is now.
         stdio: our descriptors that become its 0, 1 and 2; all others are closed.
-        own_session: make it the leader of a session, with standard input as its terminal if that is one and nobody's yet.
+        own_session: make it the leader of a session, with standard input as its terminal if that is one and no session has it.
         die_with_parent: SIGKILL it when the calling thread ends.
         inheritance: whose rights, limits and priorities it gets; None: ours. A vessel keeps the right that a restore takes.
         brought: files of the program that are to be there; they are shown to it where its own are missing.
@@ -148,7 +148,7 @@ def discard(born: Born) -> None:
 
 
 class _Lines(Struct, frozen=True):
-    """Our end of the pipe on which everybody at a birth reports; the reports end when the last of them has executed or ended."""
+    """Our end of the pipe on which all children at a birth report; it ends when the last of them has executed or ended."""
 
     descriptor: int
 
@@ -259,7 +259,7 @@ def _sibling_with_pid(wanted: int) -> tuple[int, list[str]]:
 
 
 def _why_taken(pid: int) -> str:
-    """By whom a PID is in use, where that can be mended."""
+    """Why a PID is in use; names the process that can free it, where there is one."""
     with contextlib.suppress(ProbeError, ProcessGoneError):
         found = procfs.status(pid)
         if found.state == "Z":
@@ -268,13 +268,13 @@ def _why_taken(pid: int) -> str:
 
 
 def _end_after(act: Callable[..., object], lines: _Lines, *arguments: object) -> NoReturn:
-    """Run a child's part and end: whatever goes wrong is reported, and nothing of the caller's Python goes on in the child."""
+    """Run a child's part and end: report any error, and run nothing more of the caller's Python in the child."""
     status = 1
     try:
         act(lines, *arguments)
         status = 0
     except OSError as error:
-        with contextlib.suppress(OSError):  # the caller is gone: nobody is left to be told
+        with contextlib.suppress(OSError):  # the caller is gone: the error has no reader
             lines.fail(error)
     finally:
         os._exit(status)
@@ -284,9 +284,9 @@ def _end_after(act: Callable[..., object], lines: _Lines, *arguments: object) ->
 
 
 def _become_first_process(lines: _Lines, watch_read: int, ready_write: int, own_terminals: bool) -> None:
-    """PID 1 of the namespace: mount /proc and terminals, learn whom to watch, then run nothing but a poll on its pidfd."""
+    """PID 1 of the namespace: mount /proc and terminals, learn which process to watch, then only poll its pidfd."""
     null = os.open("/dev/null", os.O_RDWR)
-    _keep_only((lines.descriptor, watch_read, ready_write), null)  # before the checks look who holds the program's files
+    _keep_only((lines.descriptor, watch_read, ready_write), null)  # before the checks look for holders of the program's files
     notes = []
     try:
         namespaces.mount_proc()
@@ -333,7 +333,7 @@ def _grow_up(
         os.setsid()
     _take_stdio(birth.stdio)
     if birth.own_session and os.isatty(0):
-        with contextlib.suppress(PermissionError):  # it is that of the session of whoever restores by hand, and stays so
+        with contextlib.suppress(PermissionError):  # it belongs to the session of a user that restores by hand, and stays so
             fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     _forget_signals()
     namespaces.close_others_on_exec(3)
@@ -342,13 +342,13 @@ def _grow_up(
     if birth.die_with_parent:
         namespaces.prctl(namespaces.PR_SET_PDEATHSIG, signal.SIGKILL)  # after a change of user, which takes it back
     lines.say(inner_pid=os.getpid())  # race 1
-    with contextlib.suppress(BrokenPipeError):  # nobody watches: there is no namespace of its own
+    with contextlib.suppress(BrokenPipeError):  # no process watches: there is no namespace of its own
         os.write(watch_write, str(os.getpid()).encode())
     become()
 
 
 def _take_stdio(stdio: tuple[int, int, int]) -> None:
-    """Move three of our descriptors to 0, 1 and 2, in whatever order they stand now."""
+    """Move three of our descriptors to 0, 1 and 2, whose order may be any now."""
     copies = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, 3) for descriptor in stdio]
     for target, copy in enumerate(copies):
         os.dup2(copy, target)

@@ -65,7 +65,7 @@ class _Layout:
 
 
 def _further_places() -> list[tuple[int, int, int]]:
-    """Of the further register sets: where the kernel is told where they go, where they go, and their size."""
+    """The places of the further register sets: that of the kernel's pointer, that of the set, and its size."""
     places, place = [], _Layout.further + len(FURTHER) * _IOV_SIZE
     for index, (_, size) in enumerate(FURTHER):
         places.append((_Layout.further + index * _IOV_SIZE, place, size))
@@ -87,7 +87,7 @@ NICE_ORIGIN: Final = 20
 
 
 class Reading(Struct, frozen=True):
-    """What was told of one thread.
+    """The facts told of one thread.
 
     Attributes:
         registers, xstate: as `Tracee.registers` and `Tracee.xstate` give them.
@@ -123,7 +123,7 @@ class Reading(Struct, frozen=True):
 
 
 class Unread:
-    """What was told of one thread: what is needed while it stands still, and all of it, which is read when it is wanted.
+    """The facts told of one thread: those needed while it stands still, and all of them, which are read when wanted.
 
     Attributes:
         registers, mask, is_filtered: as in `Reading`.
@@ -194,7 +194,7 @@ class _Area:
         return found
 
     def address(self, tids: list[int], files: list[int]) -> None:
-        """Fill in whom the calls are about."""
+        """Fill in the threads that the calls are about."""
         if (tids, files) == self._about:
             return
         self._about = tids, files
@@ -209,7 +209,7 @@ class _Area:
 
 
 class _Answers:
-    """What was told of all threads at once, as bytes. Whoever holds it keeps its memory from being written to again."""
+    """The facts told of all threads at once, as bytes. While this object is held, its memory is not written to again."""
 
     __slots__ = ("__weakref__", "_area", "_files", "_results")
 
@@ -252,7 +252,7 @@ class _Answers:
         return bytes(self._area.view[begin : begin + self._word(index, _REGISTERS_LENGTH)])
 
     def mask(self, index: int) -> int:
-        """Of signals."""
+        """The mask of blocked signals."""
         return self._word(index, _Layout.mask // _WORD)
 
     def rseq(self, index: int) -> Rseq | None:
@@ -300,7 +300,7 @@ class Readings:
         self._given: weakref.ref[_Answers] | None = None
 
     def read(self, tracees: Sequence[Tracee], files: Sequence[int]) -> list[Unread]:
-        """Ask about these; they stand still. What was read earlier stays as it was.
+        """Ask about these; they stand still. Earlier answers stay as they were.
 
         Args:
             files: for each a descriptor of a file of /proc that tells of it; `NO_FILE` if none is wanted.
@@ -316,11 +316,11 @@ class Readings:
         return [Unread(answers, index, tracee, results[index]) for index, tracee in enumerate(tracees)]
 
     def _is_taken(self) -> bool:
-        """Whether somebody holds what was read last."""
+        """Whether a caller still holds the last answers."""
         return self._given is not None and self._given() is not None
 
     def rehearse(self, tid: int, file: int) -> None:
-        """Ask about ourselves, who are not traced, and forget the answers.
+        """Ask about our own thread, which is not traced, and forget the answers.
 
         Args:
             tid, file: what the next `read` is about, if there is but one thread.
@@ -347,7 +347,7 @@ class Waiting:
         )
 
     def read(self) -> tuple[bytes, ...]:
-        """Those of the thread, then those of the process. Raises as `Tracee.pending`: hardly ever there are any."""
+        """The pending signals of the thread, then of the process. Raises as `Tracee.pending`; there are seldom any."""
         self._calls.run()
         if not self._results.any():
             return ()

@@ -25,7 +25,7 @@ STEP: Final = 16
 
 
 class Report(Struct, frozen=True):
-    """What wait4(2) told of one thread.
+    """The answer of wait4(2) about one thread.
 
     Attributes:
         status: its wait status, of which note was taken by this; None: there is none.
@@ -71,7 +71,7 @@ class Together:
         return [result == 0 for result in self._run(SEIZE, tids, may_wait=True)]
 
     def ask_to_stop(self, tids: Sequence[int]) -> list[bool]:
-        """Have these stop: who was asked. Nobody was who stands already, or has ended."""
+        """Have these stop; answers which were asked. A thread that stands already, or has ended, is not asked."""
         looks = self._run(LOOK, tids)
         found = self._found[: len(tids), 0].tolist()
         moves = [result == 0 and not pid for result, pid in zip(looks, found, strict=True)]
@@ -79,7 +79,7 @@ class Together:
         return [is_moving and next(asked) == 0 for is_moving in moves]
 
     def reports(self, tids: Sequence[int]) -> list[Report]:
-        """What these have to tell; note is taken of it, so nobody may be among them whose end is for somebody else."""
+        """The reports of these. It takes note of ends, so a thread whose end another process must note may not be among them."""
         results = self._run(REPORT, tids)
         statuses = self._statuses[: len(tids)].tolist()
         return [
@@ -88,7 +88,7 @@ class Together:
         ]
 
     def let_go(self, tids: Sequence[int]) -> list[bool]:
-        """Let go of these, who stand: of whom that worked."""
+        """Let go of these, which stand; answers for which that worked."""
         return [result == 0 for result in self._run(DETACH, tids)]
 
     def _run(self, group: int, tids: Sequence[int], *, may_wait: bool = False) -> list[int]:

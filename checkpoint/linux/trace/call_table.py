@@ -31,10 +31,10 @@ AT_FDCWD: Final = -100
 
 _LOWEST_ADDRESS: Final = 0x10000000000
 _HIGHEST_ADDRESS: Final = 0x7000_0000_0000
-"""Where a hole is looked for: above every non-PIE program, below where the kernel maps libraries."""
+"""The range in which we look for a hole: above every non-PIE program, below the kernel's place for libraries."""
 _STEP: Final = 1 << 36
 _WIDTH: Final = 47
-"""Bits of the smallest address space of which that holds; in a smaller one it is looked for at the same parts of it."""
+"""Bits of the smallest address space for which that holds; in a smaller one we look at the same fractions of it."""
 
 
 class Call(Struct, frozen=True):
@@ -89,7 +89,7 @@ class CallTable(Struct):
         return number
 
     def obtain_pair(self, what: str, name: str, *arguments: int) -> tuple[int, int]:
-        """Add a call that makes two descriptors, whatever it writes about them."""
+        """Add a call that makes two descriptors; the numbers that it writes are not checked."""
         pair = []
         for _ in range(2):
             pair.append(self.lowest_descriptor())
@@ -230,7 +230,7 @@ RUN_TIMEOUT_S: Final = 30.0
 def single_call(tracee: Tracee, registers: bytes, instruction: int, number: int, *arguments: int) -> int:
     """Make one system call with a syscall instruction that the tracee already has; it stands after the call then.
 
-    Stops at entry and exit are no signals, so this works whatever the program does with SIGTRAP (a breakpoint would reset a
+    Stops at entry and exit are no signals, so this works with any use of SIGTRAP by the program (a breakpoint would reset a
     blocked or ignored SIGTRAP, see force_sig_info_to_task in kernel/signal.c).
     """
     tracee.set_registers(arch.at_call(registers, instruction, number, arguments))

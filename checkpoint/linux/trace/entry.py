@@ -42,7 +42,7 @@ FAULTS_TARGET: Final = "anon_inode:[userfaultfd]"
 
 
 class Entered(Struct, frozen=True):
-    """What the first entry brought.
+    """The result of the first entry.
 
     Attributes:
         faults: a userfaultfd of the tracee's memory, ours now; None where it was refused, there or to us.

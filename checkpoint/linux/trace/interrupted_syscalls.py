@@ -29,9 +29,9 @@ from checkpoint.linux.trace.tracee import Tracee
 
 _NUMBER: Final = struct.Struct("<i")
 _WORDS: Final = 9
-"""Of /proc/PID/syscall for one that waits in a call: number, six arguments, stack and instruction pointer."""
+"""Words of /proc/PID/syscall for a thread that waits in a call: number, six arguments, stack and instruction pointer."""
 EPOLL: Final = "anon_inode:[eventpoll]"
-"""What a descriptor of epoll_create(2) is called in /proc/PID/fd."""
+"""The name of a descriptor of epoll_create(2) in /proc/PID/fd."""
 
 
 def look(tracee: Tracee) -> None:
@@ -70,7 +70,7 @@ def told(tracee: Tracee, registers: Registers) -> Registers:
 
 
 def _first_argument(tracee: Tracee, number: int) -> int | None:
-    """That of the last call that a thread has made, unsigned; None where the kernel does not tell."""
+    """The first argument of the last call of a thread, unsigned; None where the kernel does not tell."""
     assert arch.CALL_SET is not None
     known = tracee.register_set(arch.CALL_SET)
     tracee.set_register_set(arch.CALL_SET, _NUMBER.pack(number))

@@ -127,7 +127,7 @@ class BorrowedPages:
             self._memory.write(self._note, bytes(NOTE.size))
 
     def take_note(self) -> tuple[int, int] | None:
-        """What an earlier tracer had written down and could not put back: a descriptor and a number; it is forgotten here."""
+        """The note of an earlier tracer about a value that it could not put back: a descriptor and a number. Erases the note."""
         descriptor, value = NOTE.unpack(self._memory.read(self._note, NOTE.size))
         if not descriptor:
             return None
@@ -241,7 +241,7 @@ class BorrowedPages:
             raise failures[0]
 
     def _take_back_singly(self, places: Sequence[tuple[Desk, Guest]], failures: list[CaptureError]) -> list[Desk]:
-        """Stop them, and set them back: the desks of those with whom that worked."""
+        """Stop them, and set them back; answers with the desks of those for which that worked."""
         moving = [False] * len(places)
         for index, (_, guest) in enumerate(places):
             with _collected(failures):
@@ -265,8 +265,8 @@ class Errand:
     """Threads at the desks: on their way there, at work, or asked to stop.
 
     Attributes:
-        answers: what they brought back.
-        asked: who takes it that they were asked to stop; None: none was.
+        answers: the results of their calls.
+        asked: for each, whether it takes the request to stop; None: none was asked.
     """
 
     def __init__(self, memory: Memory, sent: Round, places: Sequence[tuple[Desk, Batch, Guest]]) -> None:

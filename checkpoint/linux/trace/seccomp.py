@@ -38,7 +38,7 @@ ASKS_ANOTHER: Final = 0x7FC00000
 """SECCOMP_RET_USER_NOTIF."""
 CAP_SYS_ADMIN: Final = 21
 WHOLE_MACHINE: Final = ["0", "0", "4294967295"]
-"""What uid_map says in the first user namespace (user_namespaces(7))."""
+"""The words of uid_map in the first user namespace (user_namespaces(7))."""
 
 
 class Filter(Struct, frozen=True):
@@ -54,7 +54,7 @@ class Filter(Struct, frozen=True):
 
 
 class Confinement(Struct, frozen=True):
-    """What one thread is confined to; the filters are told oldest first."""
+    """The confinement of one thread; the filters are told oldest first."""
 
     is_strict: bool = False
     filters: tuple[Filter, ...] = ()
@@ -94,7 +94,7 @@ def why_not() -> str:
     if not (is_first and ours.capabilities[2] >> CAP_SYS_ADMIN & 1):
         return "to suspend it takes CAP_SYS_ADMIN: run failover as root, or the program without the filter"
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.ptrace(abi.PTRACE_SEIZE, os.getpid(), 0, abi.PTRACE_O_SUSPEND_SECCOMP)  # never succeeds: nobody traces himself
+    libc.ptrace(abi.PTRACE_SEIZE, os.getpid(), 0, abi.PTRACE_O_SUSPEND_SECCOMP)  # never succeeds: no process can trace itself
     if ctypes.get_errno() == errno.EINVAL:
         return "this kernel cannot suspend it: boot one with CONFIG_CHECKPOINT_RESTORE, or run the program without the filter"
     return ""

@@ -30,7 +30,7 @@ class Reports:
             self._before = set(signal.pthread_sigmask(signal.SIG_BLOCK, (REPORT,)))
 
     def give_back(self) -> None:
-        """As before; also after no `keep`. Whoever has a handler for that signal hears it now, for it tells of others, too."""
+        """As before; also after no `keep`. A handler for that signal runs now, for the signal tells of other children, too."""
         before, self._before = self._before, None
         if before is None or REPORT in before:
             return
@@ -43,5 +43,5 @@ def sleep_until_report(seconds: float) -> None:
     """Sleep for so long, or until a thread has stopped for us, if reports are kept."""
     if REPORT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
         signal.sigtimedwait((REPORT,), seconds)
-    else:  # it would be taken from whoever has a handler
+    else:  # it would be taken from a handler
         time.sleep(seconds)

@@ -132,7 +132,7 @@ class Batch:
 
 
 class Answers:
-    """What a batch brought back: a desk's table, read when an answer is asked for.
+    """The results of a batch: a desk's table, read when an answer is asked for.
 
     Args:
         address: of the table.
@@ -149,10 +149,10 @@ class Answers:
 
     @property
     def results(self) -> tuple[int, ...]:
-        """Of each call, signed: negative is an errno."""
+        """The result of each call, signed: negative is an errno."""
         return struct.unpack_from(f"<{self._count}q", self._table, self._plan.results)
 
     def at(self, address: int, size: int) -> bytes:
-        """What a call wrote at an address that `Batch.output` gave."""
+        """The bytes that a call wrote at an address that `Batch.output` gave."""
         offset = address - self._address
         return self._table[offset : offset + size]

@@ -122,7 +122,7 @@ class Desk:
         return self._guest is not None and self._guest.is_here()
 
     def _lay_lost(self, lost: bytes) -> None:
-        """What the kernel is to give back by the code's own frame besides, unless it stands there."""
+        """Write the registers that the kernel is to give back by the code's own frame, unless they stand there."""
         if lost != self._lost:
             place, content = arch.frame_of_lost(self._places.frame, lost)
             if content:
@@ -135,7 +135,7 @@ class Desk:
         return table[done : done + 8] == struct.pack("<Q", self._serial)
 
     def answers(self, table: bytes, batch: Batch) -> Answers:
-        """What they brought back, by the table's bytes."""
+        """The results of its calls, by the table's bytes."""
         return Answers(table, self.table, self._plan, len(batch.calls))
 
 
@@ -157,7 +157,7 @@ def set_back(guest: Guest, is_ours: Callable[[int], bool]) -> Registers:
     tracee, registers, mask, lost = guest
     found = arch.decode_registers(tracee.registers())
     if not is_ours(found[arch.INSTRUCTION_POINTER]):
-        tracee.is_as_found = True  # whatever it stands in now it has come to by itself
+        tracee.is_as_found = True  # it has come to its present place by itself
         waited_ms = patience_ns(tracee) // 1_000_000
         _busy.set()
         raise RanOnError(

@@ -25,7 +25,7 @@ REGISTERS_ROOM: Final = 512
 START, LOOK, INTERRUPT, STAND, GIVE_BACK = range(5)
 """Groups of calls, each made about all threads in one go."""
 CALLS: Final = (3, 1, 1, 2, 2)
-"""Of each group about one thread."""
+"""Calls of each group about one thread."""
 
 
 _POINTER: Final = arch.REGISTER_NAMES.index(arch.INSTRUCTION_POINTER)
@@ -92,14 +92,14 @@ class Round:
         return not any(self._run(START))
 
     def ask_to_stop(self) -> list[bool] | None:
-        """Ask all who were started to stop: who takes it; None when one stands by itself already, and nobody was asked."""
+        """Ask all started threads to stop; answers which take it; None when one stands already, and none was asked."""
         pids = self._memory[: len(self._tids), _Layout.siginfo + abi.SIGINFO_PID : _Layout.siginfo + abi.SIGINFO_PID + 4]
         if any(self._run(LOOK)) or pids.any():
             return None
         return [result == 0 for result in self._run(INTERRUPT)]
 
     def await_stops(self, tracees: Sequence[Tracee], asked: Sequence[bool]) -> list[bool]:
-        """Wait for a moment for the stops of those who were asked: who stands."""
+        """Wait for a moment for the stops of the asked threads; answers which stand."""
         stand = [False] * len(tracees)
         began = now = time.perf_counter()
         waiting = [index for index, was_asked in enumerate(asked) if was_asked]
@@ -125,7 +125,7 @@ class Round:
         return stand
 
     def give_back(self, is_ours: Callable[[int], bool]) -> bool:
-        """Set all who were started where they stood; they stand. False when one was killed, or has left our code by itself."""
+        """Set all started threads where they stood; they stand. False when one was killed, or has left our code by itself."""
         if any(self._results[self._firsts[STAND] + 1 :][: 2 * len(self._tids) : 2]):
             return False
         if not all(map(is_ours, self._words[: len(self._tids), _Layout.found // WORD + _POINTER].tolist())):
@@ -136,7 +136,7 @@ class Round:
         """Make all of the calls about ourselves: we are not traced, nor our own child, so the kernel refuses each.
 
         Args:
-            tid: whom the next ones are about.
+            tid: the thread that the next ones are about.
         """
         self._address([threading.get_native_id()])
         for group in range(len(CALLS)):
@@ -144,7 +144,7 @@ class Round:
         self._address([tid])
 
     def _address(self, tids: list[int]) -> None:
-        """Fill in whom the calls are about."""
+        """Fill in the threads that the calls are about."""
         if tids == self._tids:
             return
         self._tids = tids

@@ -51,10 +51,10 @@ SEIZINGS: Final = 30
 
 
 def _seized_at_last(tracee: Tracee) -> None:
-    """Seize a thread; whoever has this id may just be leaving it to the one that executes another program (8).
+    """Seize a thread; its id may just be passing to the one that executes another program (8).
 
     Raises:
-        ProbeError: we may not, or somebody else traces it.
+        ProbeError: we may not, or another process traces it.
     """
     for _ in range(SEIZINGS):
         try:
@@ -68,7 +68,7 @@ def _seized_at_last(tracee: Tracee) -> None:
 
 
 class Ear:
-    """SIGCHLD, heard for all who want to hear it: a process has one such signal."""
+    """SIGCHLD, heard for all listeners: a process has one such signal."""
 
     def __init__(self) -> None:
         self._listeners: list[Threads] = []
@@ -99,7 +99,7 @@ EAR: Final = Ear()
 class Threads:
     """The threads of one process; every call from the thread of ours that makes the first one.
 
-    Invariants: between `thaw` and `freeze` nobody is seized, but for threads in ``_loose``, which had not stopped.
+    Invariants: between `thaw` and `freeze` no thread is seized, but for those in ``_loose``, which had not stopped.
 
     Attributes:
         leader: the first thread, whose id is the process's; or, where that has ended, its spokesman.
@@ -110,7 +110,7 @@ class Threads:
         patience_ns: how long they may take to stop; None: as long as is usual.
 
     Args:
-        mend: what is done to each thread that is let go as it was found, of which nothing else was asked.
+        mend: is called for each thread that is let go as it was found, of which nothing else was asked.
         process: where it is not the leader's.
     """
 
@@ -133,11 +133,11 @@ class Threads:
 
     @property
     def pid(self) -> int:
-        """By which the process is looked at (`checkpoint.linux.procfs.live_thread`)."""
+        """The id by which we look at the process (`checkpoint.linux.procfs.live_thread`)."""
         return self.leader.pid
 
     def _count(self) -> int:
-        """Of threads that can be stopped: a first one that has ended is counted until all have."""
+        """The number of threads that can be stopped: the kernel counts a first thread that has ended until all have."""
         return self._thread_count.read() - (self.process != self.pid)
 
     @functools.cached_property
@@ -146,7 +146,7 @@ class Threads:
 
     @property
     def others(self) -> tuple[Tracee, ...]:
-        """Those that stand still, besides the leader, oldest first."""
+        """The threads that stand still, besides the leader, oldest first."""
         first, held = self.pid, self._held
         return tuple([held[tid] for tid in sorted(held) if tid != first])
 
@@ -157,8 +157,8 @@ class Threads:
 
         Raises:
             ProcessGoneError: the process has ended.
-            ProbeError: somebody else traces one of them, or we may not.
-            CaptureError: one did not stop in time. Nobody stands still for us after any of these.
+            ProbeError: another process traces one of them, or we may not.
+            CaptureError: one did not stop in time. No thread stands still for us after any of these.
         """
         self._require_none_loose()
         self._whereabouts.prepare()
@@ -196,10 +196,10 @@ class Threads:
     def _await_end_of_first(self, deadline: float) -> None:
         """See that its spokesman is of the process still, and that its first thread has done all that it does at its end.
 
-        Until that is a zombie it may still write to the memory (robust futexes, and where those wait who join it).
+        Until that is a zombie it may still write to the memory (robust futexes, and the word on which threads wait that join it).
 
         Raises:
-            ProcessGoneError: the spokesman's id is nobody's any more, or a stranger's; or the first thread lives (8).
+            ProcessGoneError: no thread has the spokesman's id any more, or a stranger has it; or the first thread lives (8).
             CaptureError: it does not come to its end.
         """
         began = now = time.perf_counter()
@@ -242,7 +242,7 @@ class Threads:
         return self._burial.watching(self._seized)
 
     def _seize_together(self, tids: list[int]) -> set[int]:
-        """Those that are seized by this. While it waits (7) all must be known whose end may have to be noted."""
+        """Seize these; answers with those seized. While it waits (7) all threads must be known whose end we may have to note."""
         self._seized.update(tid for tid in tids if tid != self.pid)
         seized = [tid for tid, is_ours in zip(tids, self._together.seize(tids), strict=True) if is_ours]
         for tid in seized:
@@ -251,7 +251,7 @@ class Threads:
         return set(seized)
 
     def _ask_together(self, tids: list[int]) -> set[int]:
-        """Those that are asked to stop by this."""
+        """Ask these to stop; answers with those asked."""
         asked = {tid for tid, was_asked in zip(tids, self._together.ask_to_stop(tids), strict=True) if was_asked}
         self._moving |= asked
         return asked
@@ -316,7 +316,7 @@ class Threads:
                 self._glance(now - began, ended)
 
     def _hear_reports(self, ended: set[int]) -> list[int]:
-        """Hear of all in one go; who is to be asked singly: the first one, whose end may be for somebody else to note."""
+        """Hear of all in one go; answers with those to ask singly: lost ones, and the first, whose end its parent must note."""
         others = [tid for tid in self._moving if tid != self.pid]
         singly = [self.pid] if self.pid in self._moving else []
         for tid, report in zip(others, self._together.reports(others), strict=True):
@@ -338,11 +338,11 @@ class Threads:
             self._moving.discard(tid)
 
     def _glance(self, waited_s: float, ended: set[int]) -> None:
-        """See who keeps us waiting.
+        """See which threads keep us waiting.
 
         Raises:
             ProcessGoneError: another thread has become the first one, which is not traced.
-            CaptureError: one waits inside the kernel; but where nobody else stands still, that may take its time.
+            CaptureError: one waits inside the kernel; but where no other thread stands still, that may take its time.
         """
         for tid in [tid for tid in self._held if tid not in self._moving and tid != self.pid and bury(tid)]:
             ended.add(tid)
@@ -358,7 +358,7 @@ class Threads:
     def _glance_at_first(self) -> None:
         """The first thread may be another one than we have seized, or than we have asked (8)."""
         status = procfs.status(self.pid)
-        if status.state in "ZX":  # of which nobody is told while others live
+        if status.state in "ZX":  # the kernel does not report that while others live
             raise ProcessGoneError(f"the first thread of pid {self.pid} has ended")
         if status.tracer != threading.get_native_id():
             raise ProcessGoneError(f"pid {self.pid} has become another program (exec)")
@@ -368,7 +368,7 @@ class Threads:
     # Letting go
 
     def thaw(self) -> None:
-        """Let everybody go, however far `freeze` came, whoever has ended meanwhile."""
+        """Let all threads go, however far `freeze` came, also when some have ended meanwhile."""
         held, self._held = self._held, {}
         together: list[int] = []
         for tid, tracee in held.items():
@@ -389,7 +389,7 @@ class Threads:
         self._settle()
 
     def close(self) -> None:
-        """Nothing more will be asked of it; nobody may be held."""
+        """Nothing more will be asked of it; no thread may be held."""
         self._whereabouts.close()
         self._thread_count.close()
         if self._burial is not None:
@@ -420,7 +420,7 @@ class Threads:
             self._tend()
 
     def _tend(self) -> None:
-        """Let go of whom can be. SIGCHLD may have `hear` do the same in the middle of it: what that has let go of stays so."""
+        """Let go of all threads that can be let go. SIGCHLD may make `hear` do the same in the middle of it; its results stay."""
         for tid, tracee in tuple(self._loose.items()):
             if self._is_let_go(tracee):
                 self._loose.pop(tid, None)
@@ -428,7 +428,7 @@ class Threads:
     def _is_let_go(self, tracee: Tracee) -> bool:
         """Try once more to let go of a thread; whether it is ours no more."""
         if self._is_our_child(tracee) and tracee.is_dead():
-            return True  # whoever of us is its parent takes note of it
+            return True  # its parent, a part of this process, takes note of it
         try:
             stop = tracee.reported()
         except ProcessGoneError:
@@ -436,7 +436,7 @@ class Threads:
             return True
         if stop is None:
             if tracee.interrupt_if_ours():
-                return False  # (8): nobody may have asked it yet under this id
+                return False  # (8): perhaps we have not asked it yet under this id
             self._look_for_heir(tracee)
             return True
         try:
@@ -446,7 +446,7 @@ class Threads:
         return True
 
     def _look_for_heir(self, gone: Tracee) -> None:
-        """A thread whose id is gone may have its process's by now (8), and have stopped before anybody looked for it there."""
+        """A thread whose id is gone may have its process's by now (8), and have stopped before we looked for it there."""
         heir = self.leader if self.process == self.pid else Tracee(self.process, self.leader.memory)
         if gone.pid != heir.pid and heir.pid not in self._held and not heir.is_dead() and heir.interrupt_if_ours():
             self._loose[heir.pid] = heir
@@ -484,7 +484,7 @@ class Threads:
         EAR.remove(self)
 
     def hear(self) -> None:
-        """One of somebody's has stopped or ended."""
+        """A child or a traced thread of this process has stopped or ended."""
         for tracee in self._held.values():
             if not self._is_our_child(tracee):
                 bury(tracee.pid)

@@ -87,7 +87,7 @@ def _is_dead(pid: int) -> bool:
 
 
 def no_stop(tid: int, waited_s: float) -> CaptureError:
-    """What is said of a thread that does not stop."""
+    """The message about a thread that does not stop."""
     return CaptureError(
         f"pid {tid} did not stop within {waited_s:.2g} s: it waits inside the kernel for a device or "
         "a file system; capture it again when that answers"
@@ -110,7 +110,7 @@ class Tracee:
     """One thread of another process, from `seize` to `detach`.
 
     Attributes:
-        is_as_found: it stands where the program has come to by itself: nobody has set its registers since.
+        is_as_found: it stands where the program has come to by itself: we have not set its registers since.
         left_alone: the registers that it gives itself back if we die while it makes calls of ours; empty: those it stood with.
         waited_in: its /proc/TID/syscall just before it was stopped, where it is looked at (`interrupted_syscalls`); "" otherwise.
         whereabouts: tells where it runs, of one that is stopped again and again.
@@ -118,7 +118,7 @@ class Tracee:
 
     Args:
         pid: the thread's id; for the first thread of a process that of the process.
-        memory: its process's, if somebody has it already.
+        memory: its process's, if the caller has it already.
     """
 
     def __init__(self, pid: int, memory: Memory | None = None) -> None:
@@ -173,7 +173,7 @@ class Tracee:
         """Become its tracer without disturbing it.
 
         Raises:
-            ProbeError: not permitted, or traced by somebody else.
+            ProbeError: not permitted, or another process traces it.
             CaptureError: it did not stop in time for an earlier look of ours, and is not let go of yet.
         """
         try:
@@ -202,9 +202,9 @@ class Tracee:
         self.request("interrupt", abi.PTRACE_INTERRUPT)
 
     def interrupt_if_ours(self) -> bool:
-        """As `interrupt`, of whoever has this id now; False when that is nobody whom we trace.
+        """As `interrupt`, of the thread that has this id now; False when we do not trace it.
 
-        A thread that executes another program has its process's id from then on, and is traced under that by whoever traced it.
+        A thread that executes another program has its process's id from then on, and its tracer traces it under that id.
         """
         try:
             _ptrace(abi.PTRACE_INTERRUPT, self.pid, 0, 0)
@@ -281,7 +281,7 @@ class Tracee:
         return not stop.is_delivery
 
     def _standing(self) -> Stop | None:
-        """As `reported`, but of its end no note is taken: it may be our child, which somebody of us waits for."""
+        """As `reported`, without taking note of its end: it may be our child, for which another part of this process waits."""
         options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT | abi.WALL
         try:
             found = os.waitid(os.P_PID, self.pid, options)
@@ -347,7 +347,7 @@ class Tracee:
         return b"".join(self._getregset("read vector registers of", kind, self._xstate, size) for kind, size in STATE_SETS)
 
     def lost_in_calls(self) -> bytes:
-        """What calls of ours would take from its registers, for `give_back_lost`; empty: nothing."""
+        """The registers that calls of ours would take from it, for `give_back_lost`; empty: none."""
         if not LOST_SIZE or extended.LOST_IN_CALLS is None:
             return b""
         content = self._getregset("read vector registers of", extended.LOST_IN_CALLS, self._xstate, LOST_SIZE)

@@ -1,6 +1,6 @@
 """Set owner, mode, attributes and time of a carried file through an open descriptor, because its name may change meanwhile.
 
-A program of root may carry files below a folder of another user, who can replace anything there by a link at any moment. So each
+A program of root may carry files below a folder of another user. That user can put a link in place of any file there. So each
 component of a path is opened by itself and no link is followed (O_PATH, O_NOFOLLOW: nothing is read, and opening affects no
 device or pipe). The open file is then changed through /proc/self/fd, which leads to exactly that file (proc_pid_fd(5)).
 """
@@ -23,7 +23,7 @@ HELD: Final = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def path_of(descriptor: int) -> str:
-    """A path that leads to what is open, whatever has become of its name."""
+    """A path that leads to the open file, also if its name has changed or is gone."""
     return f"{DESCRIPTORS}{descriptor}"
 
 
@@ -31,7 +31,7 @@ def give(top: str, entry: Entry, name: bytes, identity: Identity | None = None) 
     """Give what stands at a name below a path, b"" for the path itself, its owner, mode, attributes and time.
 
     Args:
-        identity: device and inode of what is meant; None: whatever stands there.
+        identity: device and inode of the file that is meant; None: any file that stands there.
 
     Returns:
         Whether it has its owner now.
@@ -70,7 +70,7 @@ def _own(path: str | bytes, entry: Entry, about: os.stat_result, folder: int | N
 
 @contextmanager
 def _held(place: str, top: str, name: bytes) -> Iterator[tuple[int, bytes, int]]:
-    """Hold what stands at a name open: (its folder, what it is called there, itself).
+    """Hold the file at a name open: (its folder, its name there, itself).
 
     Raises:
         OSError: it is not there, or a component of the name is a link (ENOTDIR).

@@ -100,17 +100,17 @@ class Name(NamedTuple):
 
     @property
     def key(self) -> Key:
-        """What it is a name of."""
+        """Device and inode of the file that it names."""
         return self.about.st_dev, self.about.st_ino
 
     @property
     def kind(self) -> int:
-        """Of what kind that is, see inode(7)."""
+        """The file's kind, see inode(7)."""
         return stat.S_IFMT(self.about.st_mode)
 
 
 class Seen(Struct, frozen=True):
-    """What one look brought home.
+    """The result of one look.
 
     Attributes:
         names: of each path, a directory before what is in it.
@@ -124,7 +124,7 @@ class Seen(Struct, frozen=True):
 
 
 class Parcel(Struct, frozen=True):
-    """What a snapshot says of carried files.
+    """A snapshot's part about carried files.
 
     Attributes:
         addresses, content: of the pages that it carries.
@@ -139,7 +139,7 @@ class Parcel(Struct, frozen=True):
 
 
 NO_PARCEL: Final = Parcel((), (), np.empty(0, dtype=np.uint64), memoryview(b""), ())
-"""Of a program without carried files."""
+"""The parcel of a program without carried files."""
 
 
 class CarriedTrees(Struct):
@@ -214,15 +214,15 @@ class CarriedTrees(Struct):
             mapped: inodes of the files that it has mapped to be shared.
 
         Raises:
-            CaptureError: too much changed a moment ago; or somebody else changes the tree meanwhile.
+            CaptureError: too much changed a moment ago; or another program changes the tree meanwhile.
         """
         return self._look(frozenset(mapped), frozen=True)
 
     def _look(self, mapped: frozenset[int], *, frozen: bool) -> Seen:
-        """See everything. What is read is remembered, whether or not it becomes a snapshot.
+        """See everything. Remembers all that it reads, whether or not it becomes a snapshot.
 
         Raises:
-            CaptureError: what was there a moment ago has gone.
+            CaptureError: a file that was there a moment ago has gone.
         """
         with seeing_as(self.eyes):
             try:
@@ -241,7 +241,7 @@ class CarriedTrees(Struct):
         return Seen(tuple(names), links)
 
     def _refuse_link(self, path: str) -> str:
-        """Why a path means another one; at each look, for what was a folder may have become a link."""
+        """Why a path means another one; asked at each look, for a folder may have become a link."""
         top, parts = f"/proc/self/fd/{self._root}", path.strip("/").split("/")
         for count in range(1, len(parts) + 1):
             try:
@@ -290,7 +290,7 @@ class CarriedTrees(Struct):
         return os.path.join(self.paths[name.tree], os.fsdecode(name.name)).rstrip("/")
 
     def _path_of(self, error: OSError) -> str:
-        """What the process itself calls it."""
+        """The process's own name for it."""
         return os.fsdecode(error.filename or b"").removeprefix(f"/proc/self/fd/{self._root}")
 
     def _unreadable(self, error: OSError) -> str:
@@ -352,10 +352,10 @@ class CarriedTrees(Struct):
         finally:
             os.close(file)
 
-    # What a snapshot says, while the program runs on
+    # The snapshot's part, while the program runs on
 
     def reasons(self, seen: Seen) -> tuple[str, ...]:
-        """Why what was seen cannot be carried."""
+        """Why the files of a look cannot be carried."""
         reasons = list(seen.unreadable)
         devices = {name.tree: name.about.st_dev for name in seen.names if not name.name}
         for name in seen.names:
@@ -389,7 +389,7 @@ class CarriedTrees(Struct):
         return ""
 
     def parcel(self, seen: Seen, parent: Position | None) -> Parcel:
-        """What the next snapshot says of a look, relative to a position (None: to nothing)."""
+        """The next snapshot's part about a look, relative to a position (None: to nothing)."""
         trees = self._trees(seen)
         contents = tuple(sorted(self._known.values(), key=lambda content: content.place))
         if self._now_of != contents:
@@ -405,7 +405,7 @@ class CarriedTrees(Struct):
         return Parcel(resources, mappings, sources.addresses, content, page_set.page_runs(cleared))
 
     def _trees(self, seen: Seen) -> tuple[Tree, ...]:
-        """What a look saw, as a snapshot tells it; files that have gone are forgotten."""
+        """The files of a look, as a snapshot tells them; files that have gone are forgotten."""
         standing = {name.key for name in seen.names if name.kind == stat.S_IFREG}
         self._known = {key: content for key, content in self._known.items() if key in standing}
         self._place_of = {(name.tree, name.name): self._known[name.key].place for name in seen.names if name.kind == stat.S_IFREG}
@@ -429,7 +429,7 @@ class CarriedTrees(Struct):
         return replace(entry, size=about.st_size, place=content.place, attributes=content.attributes)
 
     def _changes(self, acknowledged: PageMap) -> tuple[Words, Words]:
-        """What differs from what a standby has, and from the last snapshot, by whose sum the next one is reckoned."""
+        """The differences from the standby's state, and from the last snapshot, whose sum is the base of the next sum."""
         written, cleared = NONE, NONE
         for before in {id(one): one for one in (acknowledged, self._newest)}.values():
             if before is not self._now:
@@ -447,7 +447,7 @@ class CarriedTrees(Struct):
 
 
 def followed(pid: int, terms: Terms) -> CarriedTrees | None:
-    """What follows the carried files of a process; None where it has none.
+    """An object that follows the carried files of a process; None where it has none.
 
     Raises:
         ProcessGoneError, CaptureError: it has ended.

@@ -23,7 +23,7 @@ Version = tuple[int, int, int, int, int]
 
 
 class Content(Struct, frozen=True, dict=True, eq=False):
-    """What one file held when it was read.
+    """The content of one file when it was read.
 
     Attributes:
         place: number of its stretch of addresses.
@@ -59,7 +59,7 @@ class Content(Struct, frozen=True, dict=True, eq=False):
 
 
 def version_of(about: os.stat_result) -> Version:
-    """Of the content of a file that looks like this."""
+    """The version of the content of a file with this stat(2)."""
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 
 
@@ -69,7 +69,7 @@ def held_size_of(about: os.stat_result) -> int:
 
 
 def pages_of(file: int, about: os.stat_result, start: int) -> Copy:
-    """What a file holds, in whole pages, at its addresses; holes are left out of a sparse one."""
+    """The content of a file, in whole pages, at its addresses; holes of a sparse one are left out."""
     page = abi.PAGE_SIZE
     end = -(-about.st_size // page) * page
     is_sparse = about.st_blocks * 512 < about.st_size

@@ -47,7 +47,7 @@ Pieces = Mapping[int, list[tuple[int, memoryview]]]
 
 
 class Laid(Struct, frozen=True):
-    """What was laid down.
+    """The result of laying down files.
 
     Attributes:
         notes: a sentence for each difference.
@@ -62,7 +62,7 @@ def lay_down_for(state: Snapshot, pid: int, *, own_eyes: bool) -> Laid:
     """Put all carried files of a base where they belong, before its program runs; see `lay_down`.
 
     Args:
-        pid: what is to become the program, or ourselves.
+        pid: the process that is to become the program, or our own.
         own_eyes: with the rights of the program's own user, not with ours.
     """
     if not carried_files.paths_of(state):
@@ -136,7 +136,7 @@ def _told(state: Snapshot, laying: _Laying) -> Iterator[None]:
 
 
 def _outermost(trees: Sequence[Tree]) -> list[Tree]:
-    """Those that no other one holds.
+    """The paths that no other one holds.
 
     Raises:
         RestoreError: two of them would have different things at one path.
@@ -152,7 +152,7 @@ def _outermost(trees: Sequence[Tree]) -> list[Tree]:
 
 
 def _names_at(tree: Tree, path: str) -> set[bytes]:
-    """What a tree has at a path and below it."""
+    """The names of a tree at a path and below it."""
     names = {os.fsencode(_at(tree.path, entry)) for entry in tree.entries}
     return {name for name in names if (name + b"/").startswith(os.fsencode(path) + b"/")}
 
@@ -285,7 +285,7 @@ class _Laying(Struct):
                 os.rmdir(self._kept)
                 os.rmdir(os.path.dirname(self._kept))
         self.clear()
-        with contextlib.suppress(OSError):  # somebody else has put something there
+        with contextlib.suppress(OSError):  # another program has put something there
             for folder in reversed(self._made):
                 os.rmdir(folder)
         return ()
@@ -299,7 +299,7 @@ class _Laying(Struct):
             self._held = -1
 
     def called(self, path: str) -> str:
-        """What a path of ours is called by everybody."""
+        """The name that all programs use for a path of ours."""
         return path.replace(path_of(self._held), self._aside) if self._held >= 0 else path
 
     def _remove_aside(self) -> None:
@@ -316,7 +316,7 @@ class _Laying(Struct):
         return os.path.join(path_of(self._held), "new")
 
     def _make_folders(self, folder: str) -> None:
-        """What is missing above the path."""
+        """Make the directories that are missing above the path."""
         missing = []
         while not os.path.lexists(folder):
             missing.append(folder)
@@ -326,7 +326,7 @@ class _Laying(Struct):
             self._made.append(one)
 
     def _make_aside(self, place: str) -> None:
-        """Nobody else can change what is in it. Who may write beside it can let its name lead elsewhere, so that is not used."""
+        """Make a folder that only we can change. A user who may write beside it can redirect its name, so we do not use that."""
         self._aside = tempfile.mkdtemp(prefix=os.fsdecode(carried_files.OWN_PREFIX) + "new-", dir=place)
         self._held = os.open(self._aside, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         if not _is_own(path_of(self._held)) or os.listdir(path_of(self._held)):
@@ -357,7 +357,7 @@ class _Laying(Struct):
             self._moves.rename(os.path.join(self._new, name), os.path.join(path, name))
 
     def _make_kept(self, place: str) -> None:
-        """A new folder for what is replaced."""
+        """A new folder for replaced files."""
         above = os.path.join(place, f"{os.fsdecode(carried_files.OWN_PREFIX)}kept-{os.path.basename(self.tree.path)}")
         with contextlib.suppress(FileExistsError):
             os.mkdir(above, 0o700)
@@ -435,7 +435,7 @@ class _Laying(Struct):
 
 
 def _is_own(folder: str) -> bool:
-    """Whether it is no link and nobody else's, who would have us remove, or could see, what is in it."""
+    """Whether it is no link and ours alone: another owner would have us remove, or could see, its content."""
     about = os.stat(folder) if folder.startswith(DESCRIPTORS) else os.lstat(folder)
     return stat.S_ISDIR(about.st_mode) and about.st_uid == own_uid() and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 

@@ -14,7 +14,7 @@ RENAME_NOREPLACE: Final = 1
 RENAME_EXCHANGE: Final = 2
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _CANNOT: Final = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
-"""What a file system or kernel says that does not know the flag."""
+"""The errors of a file system or kernel that does not know the flag."""
 
 
 class _Move(NamedTuple):
@@ -24,7 +24,7 @@ class _Move(NamedTuple):
 
 
 class Moves(Struct):
-    """What was moved, in order."""
+    """The moves that were made, in order."""
 
     _made: list[_Move] = field(default_factory=list)
 

@@ -75,7 +75,7 @@ TIOCEXCL: Final = 0x540C
 TIOCGEXCL: Final = 0x80045440
 TIOCSPTLCK: Final = 0x40045431
 TIOCGPTPEER: Final = 0x5441
-"""Of x86-64 and aarch64 alike. Source: asm-generic/ioctls.h."""
+"""Requests of ioctl(2), the same on x86-64 and aarch64. Source: asm-generic/ioctls.h."""
 SETTINGS_SIZE: Final = 44
 """Bytes of struct termios2."""
 MODEM_OUTPUTS: Final = 0x002 | 0x004

@@ -54,7 +54,7 @@ _WATCHED: Final = re.compile(rb"tfd: *(\d+) events: *([0-9a-f]+) data: *([0-9a-f
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """What it watches.
+    """The descriptors that it watches.
 
     Args:
         opened: everything that the process has open.
@@ -83,7 +83,7 @@ def _now(held: OpenFile, slot: abi.EpollSlot, opened: Sequence[OpenFile]) -> int
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
-    """What it watches, as it was observed."""
+    """The descriptors that it watches, as they were observed."""
     if held.first.target != TARGET:
         return None
     facts: dict[str, Fact] = {"descriptors": held.numbers, "flags": held.first.flags & ~os.O_CLOEXEC, **held.observed}

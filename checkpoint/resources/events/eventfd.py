@@ -33,7 +33,7 @@ CAPABILITIES: Final = (preserved(Area.PIPES, "event counters (eventfd)", "with t
 TARGET: Final = "anon_inode:[eventfd]"
 EFD_SEMAPHORE: Final = 1
 INITIAL_MAX: Final = (1 << 32) - 1
-"""What eventfd(2) takes at first; more is written."""
+"""The largest count that eventfd(2) takes; a larger one is written."""
 _TELLING: Final = 2
 """The least count of which one read tells the kind: a semaphore gives one."""
 _SIZE: Final = 8
@@ -46,7 +46,7 @@ def is_told(one: Descriptor) -> bool:
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Of which kind one is that the kernel does not tell of; everybody who has it stands still.
+    """The kind of one, where the kernel does not tell it. All processes that have it stand still.
 
     Raises:
         CaptureError: it cannot be asked.
@@ -74,7 +74,7 @@ def _count(one: Descriptor) -> int:
 
 
 def _taken(counter: int) -> int:
-    """What one read of it takes; it does not wait."""
+    """The count that one read of it takes; it does not wait."""
     content = bytearray(_SIZE)
     os.preadv(counter, [content], -1, os.RWF_NOWAIT)
     return int.from_bytes(content, "little")

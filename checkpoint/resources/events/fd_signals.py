@@ -47,7 +47,7 @@ THE_PROCESS: Final = 1
 ITS_FIRST_THREAD: Final = 2
 _OWNERS: Final = {F_OWNER_PID: THE_PROCESS, F_OWNER_TID: ITS_FIRST_THREAD}
 SETTABLE: Final = os.O_APPEND | os.O_ASYNC | os.O_DIRECT | os.O_NOATIME | os.O_NONBLOCK
-"""What F_SETFL changes; it ignores the rest."""
+"""The flags that F_SETFL changes; it ignores the rest."""
 
 
 def describe(held: OpenFile) -> dict[str, Fact]:
@@ -67,7 +67,7 @@ def _is_of_ours(held: OpenFile, owner: int) -> bool:
 
 
 def refuse(held: OpenFile) -> str | None:
-    """Why its signals cannot be kept: they go to somebody else."""
+    """Why its signals cannot be kept: they go to another process, or to a single thread."""
     sent = signal_owners.of(held)
     if not sent.owner:
         return None
@@ -81,7 +81,7 @@ def refuse(held: OpenFile) -> str | None:
 
 
 def rebuild(table: CallTable, descriptor: int, held: Resource, inner_pid: int) -> None:
-    """Set them again, as far as they are the process's own: of others, `settle` does, who may not be born yet."""
+    """Set them again, as far as the process itself owns them. `settle` does the others: their owners may not be born yet."""
     if held.facts.get("owner") and held.facts.get("owner_pid", inner_pid) == inner_pid:
         _own(table, descriptor, held, inner_pid)
     if held.facts.get("signal"):
@@ -109,5 +109,5 @@ def _own(table: CallTable, descriptor: int, held: Resource, pid: int) -> None:
 
 
 def disown(table: CallTable, descriptor: int) -> None:
-    """Have nobody own them for now."""
+    """Leave them without an owner for now."""
     table.call("disown the signals of a descriptor", "fcntl", descriptor, fcntl.F_SETOWN, 0)

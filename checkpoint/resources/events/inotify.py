@@ -104,7 +104,7 @@ def _major_minor(device: int) -> str:
 
 
 def _kernels(device: int) -> str:
-    """Of a device as the kernel packs it, 12 bits and 20."""
+    """The number of a device as the kernel packs it, 12 bits and 20."""
     return f"{device >> 20}:{device & 0xFFFFF}"
 
 

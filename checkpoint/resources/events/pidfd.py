@@ -45,7 +45,7 @@ CAPABILITIES: Final = (
 
 TARGET: Final = "anon_inode:[pidfd]"
 NOBODY: Final = -1
-"""What fdinfo tells of a process that has ended, and has been waited for."""
+"""The pid that fdinfo tells of a process that has ended, and has been waited for."""
 
 
 def is_of_ended(one: Descriptor) -> bool:
@@ -54,7 +54,7 @@ def is_of_ended(one: Descriptor) -> bool:
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Of one that stands for a single thread of its process: the id by which the program knows that, and who watches it."""
+    """Facts of a pidfd of a single thread of its process: that thread's id for the program, and whether epoll watches it."""
     tid = _target(held)
     if tid in (NOBODY, _process(held)) or not held.first.flags & os.O_EXCL:
         return {}
@@ -91,7 +91,7 @@ def _target(held: OpenFile) -> int:
 
 
 def _process(held: OpenFile) -> int:
-    """Who has it, as pidfds name a process: `OpenFile.pid` may be its spokesman's."""
+    """The process that has it, as pidfds name one: `OpenFile.pid` may be its spokesman's."""
     return procfs.status(held.pid).tgid
 
 
@@ -120,7 +120,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Sequence[Resource]) -> Iterator[Finding]:
-    """Those of threads that are on their way in a socket, too: what is sent before threads are born stands for the process."""
+    """Refuse pidfds of threads that are also on their way in a socket: one sent before threads are born is of the process."""
     messages = [numbers for one in held for numbers in _list(one.facts.get("passed", []))]
     passed = {number for numbers in messages for number in _list(numbers)}
     for one in held:

@@ -65,7 +65,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Its clock, how it was set, what is left and what was not read.
+    """Its clock, how it was set, the time left, and the expirations that were not read.
 
     It goes on meanwhile, and may go off between two questions. Asking winds a periodic timer up that went off and was not read,
     so that its unread expirations can be told: `timerfd_gettime` changes nothing else.
@@ -96,7 +96,7 @@ def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
 
 
 def _periodic(held: OpenFile, timer: int, value_ns: int) -> tuple[int, int, int]:
-    """Of a periodic timer: what is left, how many expirations were not read, and when that was so."""
+    """Of a periodic timer: the time left, how many expirations were not read, and when that was so."""
     while True:
         went_off, before_ns = _went_off(timer, 0 if value_ns else DUE_MS), value_ns
         ticks = _ticks(held) if went_off else 0
@@ -108,7 +108,7 @@ def _periodic(held: OpenFile, timer: int, value_ns: int) -> tuple[int, int, int]
 
 
 def _times(timer: int) -> tuple[int, int, int]:
-    """The interval, what is left, and when that was so, by the calendar; ns."""
+    """The interval, the time left, and when that was so, by the calendar; ns."""
     times = ctypes.create_string_buffer(_TIMES.size)
     if _libc.timerfd_gettime(timer, times):
         abi.raise_errno("timerfd_gettime")
@@ -144,14 +144,14 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 class Left(Struct, frozen=True):
-    """What is left of a timer when some time has gone by."""
+    """The rest of a timer when some time has gone by."""
 
     value_ns: int
     ticks: int
 
 
 def left_after(value_ns: int, interval_ns: int, ticks: int, elapsed_ns: int) -> Left:
-    """What is left: the expirations of a periodic timer are counted, a single one goes off as soon as it is armed."""
+    """The rest: the expirations of a periodic timer are counted, a single one goes off as soon as it is armed."""
     if not value_ns:
         return Left(0, ticks)
     if value_ns > elapsed_ns:

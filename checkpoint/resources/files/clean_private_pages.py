@@ -29,11 +29,11 @@ KIND: Final = "untouched"
 
 
 def describe(lines: Sequence[MapsLine], theirs: Words, opened: Iterable[OpenFile]) -> tuple[Resource, ...]:
-    """Those of a process that stood still.
+    """The clean private pages of a process that stood still.
 
     Args:
         theirs: pages of such mappings that are not the process's own.
-        opened: what it had open then.
+        opened: its open files then.
     """
     if not len(theirs):
         return ()

@@ -36,8 +36,8 @@ def name_of(path: str, file: File, pids: Sequence[int], mapped_on: int = 0) -> s
 
     Args:
         path: the name that it had.
-        pids: who has it, and then the other processes of the component.
-        mapped_on: the device as the mappings tell it, where nobody may ask the file itself: btrfs and overlayfs have two
+        pids: the process that has it, and then the other processes of the component.
+        mapped_on: the device as the mappings tell it, where the file itself cannot be asked: btrfs and overlayfs have two
             numbers for one.
     """
     named = {name for pid in pids for name in _names_held(pid, file, mapped_on)}
@@ -45,7 +45,7 @@ def name_of(path: str, file: File, pids: Sequence[int], mapped_on: int = 0) -> s
 
 
 def _names_held(pid: int, file: File, mapped_on: int) -> Iterator[str]:
-    """What a process calls the file, as far as that leads to it."""
+    """The process's names of the file, as far as they lead to it."""
     outlook = procfs.outlook(pid)
     for name, is_it in (*_names_mapped(pid, file, mapped_on), *_names_opened(pid, file)):
         if not name.endswith(DELETED) and name.startswith("/") and is_it(f"{outlook}{name}"):
@@ -79,7 +79,7 @@ def _names_opened(pid: int, file: File) -> Iterator[tuple[str, Callable[[str], b
 def _number_at(path: str) -> File:
     try:
         about = os.stat(path)
-    except OSError:  # nothing is there, or nobody may look
+    except OSError:  # nothing is there, or we may not look
         return 0, 0
     return about.st_dev, about.st_ino
 

@@ -46,7 +46,7 @@ F_SETLEASE: Final = 1024
 KINDS: Final = ("FLOCK", "POSIX", "OFDLCK")
 LEASE: Final = "LEASE"
 OF_PROCESSES: Final = ("POSIX",)
-"""Those that a process has for itself; the others belong to an open file, whoever shares it."""
+"""Those that a process has for itself; the others belong to an open file, for all processes that share it."""
 _TYPES: Final = {"READ": fcntl.F_RDLCK, "WRITE": fcntl.F_WRLCK, "UNLCK": fcntl.F_UNLCK}
 
 _LOCK: Final = re.compile(r"^lock:\s*\d+: (\w+)\s+(\w+)\s+(\w+)\s+-?\d+ \S+ (\d+) (\d+|EOF)$", re.MULTILINE)
@@ -67,7 +67,8 @@ def describe(held: OpenFile, kinds: Collection[str] = (*KINDS, LEASE)) -> dict[s
 
 
 def _lease(held: OpenFile, state: str, mode: str) -> tuple[int, int]:
-    """What a lease is, and what it is to become: the latter is told, and a shared one has only what is open for reading."""
+    """The kind of a lease now, and the one that it is to become. The kernel tells the latter; only a file that is open for
+    reading has a shared one."""
     target = _TYPES[mode]
     if state != "BREAKING":
         return target, target
@@ -76,7 +77,7 @@ def _lease(held: OpenFile, state: str, mode: str) -> tuple[int, int]:
 
 
 def has_lease(held: OpenFile) -> bool:
-    """Whether somebody who opens the file may have to wait for the program, which is told so by a signal."""
+    """Whether another process that opens the file may have to wait for the program. A signal tells the program so."""
     return LEASE.encode() in held.first.told
 
 
@@ -118,7 +119,7 @@ def settle(table: CallTable, held: Resource, descriptor: int, inner_pid: int) ->
 
 
 def _lease_again(table: CallTable, held: Resource, descriptor: int, inner_pid: int, wanted: tuple[int, int]) -> None:
-    """Take a lease, and break it if that was under way: nobody owns its signals just then, so none is sent."""
+    """Take a lease, and break it if that was under way: its signals have no owner just then, so none is sent."""
     lease, target = wanted
     what = f"take the lease of {held.name} on {held.facts['path']!s}"
     table.call(what, "fcntl", descriptor, F_SETLEASE, lease)

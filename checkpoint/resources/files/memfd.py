@@ -50,7 +50,7 @@ CAPABILITIES: Final = (
 
 PREFIX: Final = "/memfd:"
 ANONYMOUS: Final = "/dev/zero (deleted)"
-"""What the kernel calls shared memory without a file."""
+"""The kernel's name for shared memory without a file."""
 CONTENT_LIMIT: Final = 16 << 20
 """Bytes of one that a snapshot carries: it is copied while the program stands still."""
 HUGE: Final = 2 << 20
@@ -152,7 +152,7 @@ def make(table: CallTable, name: str, mode: int, size: int) -> int:
 
 
 def make_whole(table: CallTable, held: Resource) -> int:
-    """Make one that nobody has mapped, filled and sealed."""
+    """Make one that no process has mapped, filled and sealed."""
     facts = held.facts
     made = make(table, str(facts["name"]), number_of(facts["mode"]), number_of(facts["size"]))
     _fill(table, held, made)

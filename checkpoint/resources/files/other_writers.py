@@ -23,13 +23,13 @@ DESCRIPTORS_MAX: Final = 100_000
 
 
 def may_be_written(path: str) -> bool:
-    """Whether anybody holds the file open or mapped for writing, or it cannot be told this way."""
+    """Whether a process holds the file open or mapped for writing, or it cannot be told this way."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:
         return True
     try:
-        # Whoever opens the file in these microseconds waits for us, and we would be sent SIGIO, which kills: SIGURG does not.
+        # A process that opens the file in these microseconds waits for us, and SIGIO would tell us: it kills, SIGURG does not.
         fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_UNLCK)
@@ -62,7 +62,7 @@ def writer_of(path: str, spared: frozenset[int]) -> int:
 
 
 def told(pid: int, owners: Mapping[int, str]) -> str:
-    """Who a process is.
+    """The name of a process, for a sentence.
 
     Args:
         owners: which component a process belongs to, by pid.
@@ -80,7 +80,7 @@ def everybody() -> list[int]:
 
 
 def arguments_of(pid: int) -> bytes:
-    """Of a process, each ended by a zero byte but the last; b"" where it has ended, or is not ours to look at."""
+    """The arguments of a process, each but the last ended by a zero byte; b"" where it has ended, or we may not look at it."""
     try:
         return procfs.read_bytes(pid, "cmdline").removesuffix(b"\0")
     except CheckpointError:
@@ -88,7 +88,7 @@ def arguments_of(pid: int) -> bytes:
 
 
 def family(pid: int) -> frozenset[int]:
-    """A process and all that it descends from: whoever starts a restore may hold the files that it gives as streams."""
+    """A process and its ancestors: the process that starts a restore may hold the files that it gives as streams."""
     found = set()
     while pid > 0 and pid not in found:
         found.add(pid)

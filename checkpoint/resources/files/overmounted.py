@@ -58,7 +58,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
-    """What must be known to open it again."""
+    """The facts to open it again."""
     first, found = held.first, None
     with contextlib.suppress(ProcessGoneError, OSError):  # it has ended since it was stopped, or in a look at a running one
         found = place_of(held) if _may_be(held) else None
@@ -83,7 +83,7 @@ def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
 
 
 def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
-    """Nothing is refused here: what has no handle is a file as others are, which no path leads to."""
+    """Refuse nothing here: a file without a handle counts as any other file to which no path leads."""
     return None
 
 

@@ -66,7 +66,7 @@ PLACES: Final = ("/proc", "/sys")
 ON_DISK: Final = "files"
 """The kind of `checkpoint.resources.files.regular`."""
 UNREADABLE: Final = ("/proc/kmsg", "/sys/kernel/debug", "/sys/kernel/tracing", "/sys/fs/bpf", "/proc/sys/fs/binfmt_misc")
-"""What is used up by being read, or is no view at all."""
+"""Files that are used up by being read, or are no view at all."""
 OWN: Final = "/proc/{pid}"
 ENDED: Final = "/proc/{ended}"
 O_PATH: Final = 0o10000000
@@ -111,14 +111,14 @@ def _path_of(held: OpenFile) -> str:
 
 
 def _has_ended(held: OpenFile, number: str) -> bool:
-    """Whether a process of whom it has a file is no more: others may have got its number, but the file's name is gone then."""
+    """Whether the process that its file tells of has ended: another may have got the number, but the file's name is gone then."""
     place = f"{procfs.outlook(held.pid)}/proc"
     is_named = not held.first.target.endswith(procfs.DELETED) and os.path.exists(f"{place}/{number}")
     return not is_named and os.path.exists(f"{place}/self")
 
 
 def _known_numbers(held: OpenFile) -> Iterator[int]:
-    """Of the other processes of its component, as it knows them; what several have open is made before these are born."""
+    """The pids of the component's other processes, as it knows them; none for a shared file, which is made before their birth."""
     return (procfs.status(pid).pids[-1] for pid in held.kin.pids if not held.description)
 
 

@@ -41,8 +41,8 @@ CAPABILITIES: Final = (
         Area.FILES,
         "deleted files, directories and symbolic links",
         "carried whole, up to 16 MiB without holes. A file that still has another name, near by or in another process of "
-        "the program, is opened or mapped by that name. Pages of private mappings are carried too: what is written to the "
-        "file later does not show in pages that were never touched",
+        "the program, is opened or mapped by that name. Pages of private mappings are carried too: later "
+        "writes to the file do not show in pages that were never touched",
     ),
     refused(
         Area.FILES,
@@ -94,7 +94,7 @@ O_PATH: Final = 0o10000000
 
 
 def describe(held: OpenFile, surroundings: Surroundings) -> Resource | None:
-    """What must be known to open it again."""
+    """The facts to open it again."""
     first = held.first
     if not is_file(first):
         return None
@@ -288,7 +288,7 @@ def digest_at(path: str, version: tuple[int, int, int, int]) -> bytes:
     try:
         return _digest(path, version)
     except (OSError, _ChangedError):
-        return b""  # whoever may trace may usually read; where not, size and name must do
+        return b""  # a tracer may usually read; where not, size and name must do
 
 
 class _ChangedError(Exception):
@@ -319,7 +319,7 @@ def _digested(path: str, version: tuple[int, int, int, int]) -> bytes:
 
 
 def findings(resources: Sequence[Resource], surroundings: Surroundings) -> Iterator[Finding]:
-    """What can be told only of all files of a component: too much content in all, and which logs its readers get twice."""
+    """Findings about all files of a component together: too much content in all, and logs that their readers get twice."""
     size = sum(_size_of(fact) for held in resources for fact in held.facts.values())
     if size > CONTENTS_LIMIT:
         kept = f"up to {CONTENTS_LIMIT >> 20} are kept: use files with a name"

@@ -66,7 +66,7 @@ def is_fifo(one: Descriptor) -> bool:
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """Its capacity, and what is in it if this is the one that tells; it stays there.
+    """Its capacity, and its content if this is the one that tells; the content stays there.
 
     Raises:
         CaptureError: it cannot be looked into.
@@ -175,9 +175,9 @@ def mismatches(held: Resource) -> Iterator[str]:
 
 
 def rebuild(table: CallTable, held: Resource, rebuilding: Rebuilding) -> int:
-    """Open it as it was, without waiting for somebody at its other end, and fill it."""
+    """Open it as it was, without waiting for a process at its other end, and fill it."""
     path, content, hidden = str(held.facts["path"]), held.facts["content"], -1
-    flags = number_of(held.facts["flags"]) & ~os.O_ASYNC  # opened with it nobody would be told: `fd_signals` sets it
+    flags = number_of(held.facts["flags"]) & ~os.O_ASYNC  # open(2) with it sends no signals: `fd_signals` sets it
     if held.facts.get("deleted"):
         path = f"/proc/self/fd/{_nameless(table, held, rebuilding)}"
     elif held.facts.get("handle"):
@@ -195,7 +195,7 @@ def _open(table: CallTable, held: Resource, path: str, flags: int, content: Fact
     """Open it by a path that leads there, and fill it."""
     assert isinstance(content, bytes)
     if not content and flags & os.O_ACCMODE == os.O_RDONLY:
-        # Whoever reads and has never seen a writer waits; opened beside a writer of ours it would be told that he hung up.
+        # A reader that has never seen a writer waits; opened beside a writer of ours it would be told that this one hung up.
         made = table.open(path, flags | os.O_NONBLOCK)
         if not flags & os.O_NONBLOCK:
             table.call(f"set the flags of {held.name}", "fcntl", made, fcntl.F_SETFL, 0)

@@ -102,7 +102,7 @@ def writes(one: Descriptor) -> bool:
 
 
 def is_half(held: OpenFile) -> bool:
-    """Whether nobody has the other end of a pipe any more.
+    """Whether no process has the other end of a pipe any more.
 
     Source: pipe(7): POLLHUP for a reader without writers, POLLERR for a writer without readers.
     """
@@ -116,7 +116,7 @@ def is_half(held: OpenFile) -> bool:
 
 
 def look_into(held: OpenFile) -> tuple[int, list[bytes]]:
-    """A pipe's capacity and, for the reading end, what is in it, by packets; it stays there. The process stands still.
+    """A pipe's capacity and, for the reading end, its content, by packets; it stays there. The process stands still.
 
     Raises:
         CaptureError: it cannot be looked into.
@@ -153,10 +153,10 @@ def capacities_of_empty(ends: Sequence[int]) -> list[int]:
 
 
 def packets_in(pipe: int, capacity: int) -> list[bytes]:
-    """What is in a pipe, by its reading end, each packet for itself; what is in none is one piece. It stays there.
+    """The content of a pipe, by its reading end: each packet for itself, bytes without packets as one piece. It stays there.
 
     Raises:
-        OSError: somebody reads it meanwhile.
+        OSError: another process reads it meanwhile.
     """
     waiting = array.array("i", [0])
     fcntl.ioctl(pipe, termios.FIONREAD, waiting)
@@ -164,7 +164,7 @@ def packets_in(pipe: int, capacity: int) -> list[bytes]:
         return []
     pieces = _teed(pipe, waiting[0], capacity)
     if sum(map(len, pieces)) != waiting[0]:
-        raise BlockingIOError(errno.EAGAIN, "somebody reads it meanwhile")
+        raise BlockingIOError(errno.EAGAIN, "another process reads it meanwhile")
     return pieces
 
 
@@ -172,7 +172,7 @@ def copy_of_content(pipe: int, capacity: int) -> bytes:
     """The same of a pipe without packets.
 
     Raises:
-        OSError: somebody reads it meanwhile, or there are packets.
+        OSError: another process reads it meanwhile, or there are packets.
     """
     pieces = packets_in(pipe, capacity)
     if len(pieces) > 1:
@@ -181,7 +181,7 @@ def copy_of_content(pipe: int, capacity: int) -> bytes:
 
 
 def peek(pipe: int) -> bytes:
-    """What waits in a pipe, by its reading end; it stays there. Nothing where it cannot be looked into, as a terminal cannot."""
+    """The bytes that wait in a pipe, by its reading end; they stay there. b"" where we cannot look into it, as in a terminal."""
     try:
         capacity = fcntl.fcntl(pipe, F_GETPIPE_SZ)
         return b"".join(_teed(pipe, capacity, capacity))
@@ -232,7 +232,7 @@ def rebuild(table: CallTable, ends: Sequence[Resource], first: int) -> dict[int,
 
 
 def _fill(table: CallTable, opened: Sequence[Resource], pair: tuple[int, int]) -> None:
-    """Give a pipe its size and what is in it: every open file that reads has told the same."""
+    """Give a pipe its size and its content: every open file that reads has told the same."""
     name, capacity = opened[0].name, number_of(opened[0].facts["capacity"])
     if capacity != DEFAULT_CAPACITY:
         table.call(f"size the pipe of {name}", "fcntl", pair[0], F_SETPIPE_SZ, capacity, least=capacity)

@@ -93,12 +93,12 @@ FILLERS_MAX: Final = 256
 
 
 def is_terminal(one: Descriptor) -> bool:
-    """Whether a descriptor is an end of a pseudo-terminal, by whatever name."""
+    """Whether a descriptor is an end of a pseudo-terminal, by any name."""
     return stat.S_ISCHR(one.mode) and (one.rdev in (_MULTIPLEXER, _OWN) or os.major(one.rdev) in _SLAVE_MAJORS)
 
 
 def observe(held: OpenFile, opened: Sequence[OpenFile]) -> Mapping[str, Fact]:
-    """What it is set to, of a terminal whose master the program has; of others nothing.
+    """The settings of a terminal whose master the program has; of others nothing.
 
     Raises:
         CaptureError: it cannot be looked into.
@@ -237,7 +237,7 @@ def prepare(table: CallTable, held: Sequence[Resource], first: int, vessel_pid: 
     """Make all of them at numbers from ``first`` on: the descriptor of each, by the resource's id().
 
     Args:
-        vessel_pid: who makes them; it may have terminals of its own.
+        vessel_pid: the process that makes them; it may have terminals of its own.
     """
     return _Work(table, first, _numbers_in_use(vessel_pid)).run(held) if held else {}
 
@@ -304,7 +304,7 @@ class _Work:
                 self._ioctl(one, self._made[id(one)], termios.TIOCEXCL)
 
     def _tell_number(self, number: int, master: int, one: Resource) -> None:
-        """Have it said when the number is another one: FUTEX_CMP_REQUEUE compares a word in memory, and wakes nobody."""
+        """Have it said when the number is another one: FUTEX_CMP_REQUEUE compares a word in memory, and wakes no thread."""
         place = self._table.place(bytes(8))
         self._table.call(f"ask for the number of {one.name}", "ioctl", master, TIOCGPTN, place)
         lost = f"the pseudo-terminal /dev/pts/{number} ({one.name}) has another number here"

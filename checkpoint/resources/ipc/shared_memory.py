@@ -61,9 +61,9 @@ CAPABILITIES: Final = (
 _MAPPED: Final = re.compile(rb"^\S+ ...s \S+ (\S+ [1-9]\d*) +(/dev/shm/.*|.* \(deleted\))$", re.MULTILINE)
 """Device and inode number, and the name."""
 FOREBEARS: Final = 8
-"""Of a process that are looked at: who is born while a component is looked at has few."""
+"""Ancestors of a process that are looked at: a process that is born while we look at its component has few."""
 NAMES_TOLD: Final = 2
-"""Of several pieces of one middleware, in one sentence."""
+"""Names of several pieces of one middleware, in one sentence."""
 
 Object = tuple[int, int]
 """Device and inode number."""
@@ -125,7 +125,7 @@ def refuse(pid: int, lines: Iterable[MapsLine], kin: Collection[int] = ()) -> It
 
 
 def detached(found: Iterable[Mapped]) -> Iterator[str]:
-    """What the rule ``detach`` makes of it, for an operator."""
+    """The effect of the rule ``detach``, for an operator."""
     for pieces in _by_maker(found):
         yield (
             f'{_called(pieces)}. By the rule shared_memory = "detach" the program resumes with a copy of its own: others no '
@@ -142,7 +142,7 @@ def _by_maker(found: Iterable[Mapped]) -> Iterable[list[Mapped]]:
 
 
 def _called(pieces: list[Mapped]) -> str:
-    """Which they are, and who else has them."""
+    """Their names, and the process that maps them too."""
     names = ", ".join(one.name for one in pieces[:NAMES_TOLD])
     more = f" and {len(pieces) - NAMES_TOLD} more" if len(pieces) > NAMES_TOLD else ""
     return f"the shared memory {names}{more} is mapped by {_who(pieces[0].pid)} too"
@@ -199,7 +199,7 @@ def refuse_partial(one: Descriptor, objects: Mapping[Object, int]) -> str | None
 
 
 def describe(objects: Iterable[tuple[Object, str]]) -> tuple[Resource, ...]:
-    """That these become the program's own copy, for whoever restores it.
+    """Tell a restore that these become the program's own copy.
 
     Args:
         objects: with their names.
@@ -209,7 +209,7 @@ def describe(objects: Iterable[tuple[Object, str]]) -> tuple[Resource, ...]:
 
 
 def notes(resources: Iterable[Resource]) -> tuple[str, ...]:
-    """What an operator is told of a program that was restored."""
+    """Sentences for the operator about a program that was restored."""
     told = [name for held in resources if held.kind == KIND for name in _names(held.facts["names"])]
     if not told:
         return ()
@@ -223,7 +223,7 @@ def _names(fact: Fact) -> list[str]:
     return [str(name).removesuffix(DELETED) for name in fact]
 
 
-# --- Who has mapped what -------------------------------------------------------------------------------------------------
+# --- Which processes map which objects ----------------------------------------------------------------------------------
 
 
 def _belongs(other: int, kin: Collection[int]) -> bool:
@@ -260,7 +260,7 @@ def _objects(pid: int) -> Iterator[tuple[bytes, bytes]]:
 
 @lru_cache(maxsize=1)
 def _mappers(asker: int, second: int) -> dict[bytes, list[int]]:
-    """Who has mapped which object: processes by device and inode number.
+    """The processes that map each object, by device and inode number.
 
     Args:
         asker: a process of the component about which it is asked: each looks for itself.

@@ -97,5 +97,5 @@ def _is_terminal(held: OpenFile) -> bool:
 
 
 def of_first(opened: Sequence[OpenFile], surroundings: Surroundings) -> dict[str, int]:
-    """What leads outside from the first process of a component, by the kernel's name: its other processes have the same."""
+    """The streams of a component's first process that lead outside, by the kernel's name: its other processes have the same."""
     return {held.first.target: stream for held in opened if (stream := _stream_of(held, surroundings)) is not None}

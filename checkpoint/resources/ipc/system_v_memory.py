@@ -144,10 +144,10 @@ def _wanted(held: Resource) -> Segment:
 
 
 def _left_behind(wanted: Segment, here: Iterable[Segment]) -> Segment | None:
-    """The very segment, that nobody has attached any more: the program left it here when it died.
+    """The very segment that the program left here when it died, if no process has it attached any more.
 
-    Whoever else may use one like it would share the program's memory. One without a key is known by when it was made: of
-    this machine's there is no other with the same id at the same time.
+    A program that uses another segment like it would share the program's memory. A segment without a key is known by when it
+    was made: of this machine's there is no other with the same id at the same time.
     """
 
     def is_it(one: Segment) -> bool:
@@ -162,7 +162,7 @@ def mismatches(held: Resource) -> Iterator[str]:
     """Why it cannot be made here."""
     wanted, here = _wanted(held), system_v_ipc.segments().values()
     if wanted.key and any(one.key == wanted.key for one in here) and not _left_behind(wanted, here):
-        cure = "end what uses it, or remove it (ipcrm)"
+        cure = "end the programs that use it, or remove it (ipcrm)"
         yield f"the key {wanted.key & 0xFFFFFFFF:#x} of its System V shared memory belongs to another segment here: {cure}"
 
 
@@ -193,7 +193,7 @@ class Segments(Struct):
                 self._passing.append(self.ids[wanted.identifier])
 
     def _emptied(self, left: Segment) -> int:
-        """What the program wrote after the snapshot goes: pages that were zero then are not in it."""
+        """Empty it of later writes of the program: pages that were zero at the snapshot are not in it."""
         try:
             system_v_ipc.wipe(left)
         except OSError as error:

@@ -37,7 +37,7 @@ CAPABILITIES: Final = (
     ),
 )
 NOBODY: Final = -1
-"""Nobody has logged in; also where the kernel has no audit."""
+"""No user has logged in; also where the kernel has no audit."""
 NO_OTHERS: Final = nullcontext()
 _UNSET: Final = 0xFFFF_FFFF
 
@@ -84,7 +84,7 @@ def rebuild(
 
 
 def _say(table: CallTable, user: int, vessel_pid: int, eyes: AbstractContextManager[None]) -> list[str]:
-    wanted = "nobody" if user == NOBODY else str(user)
+    wanted = "unset" if user == NOBODY else str(user)
     reason = f"the user of its login (loginuid {wanted}) is not kept: that takes CAP_AUDIT_CONTROL here"
     if not _has_file(vessel_pid):
         return [reason]

@@ -88,7 +88,7 @@ class _Mounts:
                 self._places.append((kind, root, place, frozenset(options.split(","))))
 
     def directory(self, hierarchy: str, path: str) -> Path | None:
-        """Of a group, whether it exists or not; None where its hierarchy, or that part of it, is not mounted."""
+        """The directory of a group, whether it exists or not; None where its hierarchy, or that part of it, is not mounted."""
         for kind, root, place, options in self._places:
             is_meant = (
                 kind == "cgroup2" if hierarchy == UNIFIED else kind == "cgroup" and options.issuperset(hierarchy.split(","))
@@ -172,7 +172,7 @@ def put_back(state: Snapshot, pids: Sequence[int], owner: int | None) -> tuple[s
 
     Args:
         pids: of its processes as `Snapshot.processes` orders them.
-        owner: the user id to whom the groups must belong that are not below the usual place; None: to anybody.
+        owner: the user id that must own the groups that are not below the usual place; None: any user may.
     """
     wanted = [(pid, place) for one, pid in zip(state.processes, pids, strict=True) for place in _places(one.resources)]
     notes = [note for one, pid in zip(state.processes, pids, strict=True) for note in _thread_notes(one.resources, pid)]

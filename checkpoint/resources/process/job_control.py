@@ -57,7 +57,7 @@ def going_on() -> Resource:
 
 
 def stop_of(resources: Iterable[Resource]) -> tuple[int, int] | None:
-    """The signal, and what is untold; None for one that simply runs."""
+    """The facts ``signal`` and ``untold`` of a stopped or continued process; None for one that simply runs."""
     for held in resources:
         if held.kind == KIND:
             return number_of(held.facts["signal"]), number_of(held.facts["untold"])

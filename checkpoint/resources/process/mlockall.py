@@ -24,7 +24,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.MEMORY,
         "locked memory: mlock, also on fault, and mlockall for future mappings",
-        "locked again as far as its limit and rights allow there; otherwise a note says what is not",
+        "locked again as far as its limit and rights allow there; otherwise a note names the rest",
     ),
 )
 MCL_FUTURE: Final = 2
@@ -49,7 +49,7 @@ def describe(of_program: Iterable[Sequence[str]], of_ours: Iterable[Sequence[str
 
 
 def rebuild(table: CallTable, resources: Iterable[Resource]) -> None:
-    """Add the call that locks whatever is mapped from then on."""
+    """Add the call that locks all memory that is mapped from then on."""
     for held in resources:
         if held.kind == KIND:
             flags = MCL_FUTURE | (MCL_ONFAULT if held.facts["on_fault"] else 0)

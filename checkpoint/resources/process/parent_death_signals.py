@@ -30,7 +30,7 @@ CAPABILITIES: Final = (
 
 
 def describe(told: Iterable[tuple[int, int]]) -> tuple[Resource, ...]:
-    """Of threads as they know themselves, those that have asked for a signal.
+    """The threads that have asked for a signal, by the ids that they know themselves.
 
     Args:
         told: (tid, signal) of each, 0 for none.

@@ -136,7 +136,7 @@ def refuse_kin(threads: Threads) -> tuple[str, ...]:
 
 
 def refuse_shared_memory(pid: int, status: Status) -> Iterator[str]:
-    """Why a process that has its memory from its parent cannot be captured: what is asked of it would be asked of both."""
+    """Why a process that shares its parent's memory cannot be captured: our calls in it would act on both."""
     if status.ppid > 1:
         yield from _refuse_shared(pid, status.ppid, ((abi.KCMP_VM, "memory"),))
 
@@ -153,10 +153,10 @@ def of_dispatching(tid: int) -> str:
 
 
 class _Shared(Struct, frozen=True):
-    """What all threads of a program must have alike.
+    """The facts that all threads of a program must have alike.
 
     Attributes:
-        tracer: 0 also where that is us, who may still hold some of them: those that did not stop in time for an earlier look.
+        tracer: 0 also where we are the tracer: we may still hold threads that did not stop in time for an earlier look.
     """
 
     tracer: int
@@ -183,7 +183,7 @@ def _namespace(pid: int, tid: int, kind: str) -> str:
 
 
 def _refuse_thread(pid: int, first: _Shared, tid: int) -> tuple[str, ...]:
-    """What is wrong with one thread; nothing is with one that is about to end, which shares less and less."""
+    """The reasons against one thread; none for a thread that is about to end, which shares less and less."""
     shared = _Shared.of(pid, tid)
     own = unshared_threads.own(pid, tid)
     if shared == first and not own:

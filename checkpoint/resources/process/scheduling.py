@@ -32,7 +32,7 @@ CAPABILITIES: Final = (
     preserved(
         Area.THREADS,
         "deadline scheduling (SCHED_DEADLINE), and time slices of a thread",
-        "set again as far as rights and the other machine's load allow; otherwise a note says what is not",
+        "set again as far as rights and the other machine's load allow; otherwise a note names the rest",
     ),
 )
 

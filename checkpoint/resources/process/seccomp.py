@@ -53,7 +53,7 @@ STRICT_MODE: Final = 1
 SET_FILTER: Final = 1
 """SECCOMP_SET_MODE_FILTER."""
 FLAG_SPEC_ALLOW: Final = 4
-"""SECCOMP_FILTER_FLAG_SPEC_ALLOW: what a filter had switched off of the processor, the switches of the process tell."""
+"""SECCOMP_FILTER_FLAG_SPEC_ALLOW: the switches of the process tell which features of the processor a filter had switched off."""
 
 
 def not_ours(why: str, who: str = "it") -> str:
@@ -62,12 +62,12 @@ def not_ours(why: str, who: str = "it") -> str:
 
 
 def untold(why: str) -> str:
-    """Why one is whose filters the kernel does not tell."""
+    """Why a process is refused whose filters the kernel does not tell."""
     return f"it runs under a seccomp filter that the kernel does not tell ({why}): run it without that filter"
 
 
 def describe(threads: Iterable[tuple[int, Confinement]]) -> tuple[Resource, ...]:
-    """What each thread is confined to, by its id as it sees it itself."""
+    """The confinement of each thread, by its id as it sees it itself."""
     filters: dict[Filter, int] = {}
     told: list[Fact] = []
     for tid, found in threads:
@@ -92,7 +92,7 @@ def is_confined(resources: Iterable[Resource]) -> bool:
 
 
 def of_thread(resources: Iterable[Resource], tid: int) -> Confinement:
-    """What a thread is confined to."""
+    """The confinement of a thread."""
     for held in resources:
         if held.kind == KIND:
             filters, threads = held.facts["filters"], held.facts["threads"]

@@ -44,7 +44,7 @@ _KINDS: Final = ((abi.KCMP_FILES, CLONE_FILES), (abi.KCMP_FS, CLONE_FS))
 
 
 def describe(pid: int, parent: int) -> tuple[Resource, ...]:
-    """What a process shares with its parent, which is of the same component.
+    """The things that a process shares with its parent, which is of the same component.
 
     Raises:
         ProcessGoneError: one of them has ended.
@@ -59,8 +59,10 @@ def describe(pid: int, parent: int) -> tuple[Resource, ...]:
 
 
 def refuse(shared: Iterable[Resource], pid: int, of_threads: Iterable[Resource]) -> Iterator[str]:
-    """Why what it shares with its parent cannot be kept: who enters a root directory first takes the other along, which still
-    opens files; and its threads are born before its parent has filled the table that they take theirs from.
+    """Why it cannot keep what it shares with its parent.
+
+    The process that enters a root directory first takes the other along, which still opens files. And its threads are born
+    before its parent has filled the table of descriptors from which they take theirs.
 
     Args:
         of_threads: among them what its threads have for themselves.
@@ -76,7 +78,7 @@ def refuse(shared: Iterable[Resource], pid: int, of_threads: Iterable[Resource])
 
 
 def flags_of(resources: Iterable[Resource]) -> int:
-    """Of clone(2), for who has these."""
+    """The flags of clone(2) for a process that has these."""
     return next((number_of(held.facts["flags"]) for held in resources if held.kind == KIND), 0)
 
 

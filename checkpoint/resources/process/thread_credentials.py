@@ -50,7 +50,7 @@ class Seen(Struct, frozen=True):
 
 
 class ThreadRights:
-    """What the threads of one process may, as far as it is not what the first one may."""
+    """The rights of the threads of one process that differ from the first one's."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -58,7 +58,7 @@ class ThreadRights:
 
     @property
     def modes(self) -> Mapping[int, int]:
-        """Of seccomp(2), by thread id as we see it, before the freeze; of those that are confined."""
+        """The modes of seccomp(2) of confined threads before the freeze, by thread id as we see it."""
         return self._before.modes
 
     def prepare(self) -> None:
@@ -66,7 +66,7 @@ class ThreadRights:
         self._before = _seen(self._pid)
 
     def describe(self, confined: Collection[int]) -> tuple[Resource, ...]:
-        """What was so before and after it.
+        """The facts that were the same before and after the freeze.
 
         Args:
             confined: threads that were known to be confined while they stood still.
@@ -93,8 +93,9 @@ class ThreadRights:
 def refuse(pid: int, owner: Owner | None) -> tuple[str, ...]:
     """Why a process is not its owner's to have captured: one of its threads may something that its owner may not.
 
-    It has executed a set-user-id program, for one, since somebody looked whose it is. What counts is a look while it stands still
-    (`checkpoint.snapshot.credentials.beyond`, of the snapshot); this one is taken before, so that such a process is not touched.
+    It has executed a set-user-id program, for one, after the agent had looked whose it is. The look that counts is taken while it
+    stands still (`checkpoint.snapshot.credentials.beyond`, of the snapshot). This one comes before, so that such a process is
+    not touched.
 
     Args:
         owner: None: it may anything.
@@ -106,7 +107,7 @@ def refuse(pid: int, owner: Owner | None) -> tuple[str, ...]:
 
 
 def _above(pid: int, owner: Owner) -> list[str]:
-    """What its threads may, and their owner may not."""
+    """Rights that its threads have and their owner has not."""
     everybodys = (_credentials(procfs.status(pid)), *(theirs for _, theirs in _seen(pid).odd.values()))
     return [text for theirs in everybodys for text in above(theirs, owner)]
 

@@ -61,7 +61,7 @@ CLONE_FS: Final = 0x200
 CLONE_FILES: Final = 0x400
 SAME: Final = 0
 LESS: Final = 1
-"""Of kcmp(2)."""
+"""Results of kcmp(2)."""
 KINDS: Final = (abi.KCMP_FS, abi.KCMP_FILES)
 SHARED_TABLE: Final = 0
 """In place of a thread's descriptors: they are the first one's."""
@@ -69,11 +69,11 @@ SHARED_TABLE: Final = 0
 OF_TWINS: Final = "that two of its threads share, but not all, which is not kept yet"
 
 Own = frozenset[int]
-"""What of `KINDS` a thread has for itself."""
+"""Those of `KINDS` that a thread has for itself."""
 
 
 def own(pid: int, tid: int) -> Own:
-    """What a thread has for itself; of one that is about to end nothing is told.
+    """The kinds that a thread has for itself; of one that is about to end nothing is told.
 
     Raises:
         ProcessGoneError: it has ended.
@@ -83,7 +83,7 @@ def own(pid: int, tid: int) -> Own:
 
 
 def refuse(pid: int, tid: int, kinds: Own) -> Iterator[str]:
-    """Why what a thread has for itself cannot be kept."""
+    """Why a thread's own directory or descriptors cannot be kept."""
     _, reasons = _look_at(pid, tid, kinds)
     yield from reasons
     yield from _against_twins(pid, tid, kinds)
@@ -97,7 +97,7 @@ class _Told(Struct, frozen=True):
 
 
 class ThreadTables:
-    """What the threads of one process have for themselves, from capture to capture."""
+    """The directories and descriptors that threads of one process have for themselves, from capture to capture."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -105,7 +105,7 @@ class ThreadTables:
         self._told: dict[int, _Told] = {}
 
     def prepare(self) -> None:
-        """Look before the freeze who has anything."""
+        """Look before the freeze which threads have anything."""
         self._known = _all_own(self._pid)
 
     def look(self) -> None:
@@ -121,11 +121,12 @@ class ThreadTables:
             except ProcessGoneError:
                 continue
             except (ProbeError, OSError) as error:
-                raise CaptureError(f"cannot look at what thread {tid} of pid {self._pid} has open: {in_words(error)}") from error
+                whose = f"thread {tid} of pid {self._pid}"
+                raise CaptureError(f"cannot look at the directories and open files of {whose}: {in_words(error)}") from error
             self._told[tid] = _Told(fact, tuple(reasons))
 
     def describe(self) -> tuple[Resource, ...]:
-        """What was seen.
+        """The result of the look.
 
         Raises:
             CaptureError: one of them has just taken leave of the first thread, or what it had could not be kept.

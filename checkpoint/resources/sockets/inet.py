@@ -175,7 +175,7 @@ def _list(fact: Fact) -> list[Fact]:
 
 
 def _shutdown(held: OpenFile, looked: socket.socket, opened: Opened) -> int:
-    """What of a socket for datagrams was shut down; only poll(2) tells of one that is bound to no port, and not that it sends."""
+    """The directions in which a datagram socket is shut down. Of one without a port only poll(2) tells, and not about sending."""
     poll = select.poll()
     poll.register(looked, select.POLLRDHUP)
     seen = dict(poll.poll(0)).get(looked.fileno(), 0)
@@ -191,7 +191,7 @@ def _bound(address: Sequence[Fact]) -> list[Fact]:
 
 
 def _peer(held: OpenFile, looked: socket.socket, listings: Listings) -> list[Fact]:
-    """Whom it is, or was, connected with."""
+    """The address with which it is, or was, connected."""
     with contextlib.suppress(OSError):
         return list(looked.getpeername())
     if looked.type == socket.SOCK_STREAM:
@@ -205,7 +205,7 @@ def _peer(held: OpenFile, looked: socket.socket, listings: Listings) -> list[Fac
 
 
 def _groups(looked: socket.socket, known: Sequence[Group]) -> Iterator[list[Fact]]:
-    """Those of the known multicast groups that a socket has joined."""
+    """The known multicast groups that a socket has joined."""
     for interface, group in known:
         level = level_of(group)
         packed = bytearray(

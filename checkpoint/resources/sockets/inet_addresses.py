@@ -39,7 +39,7 @@ def unpacked(packed: bytes) -> list[Fact]:
 
 
 def level_of(group: str) -> int:
-    """By which a multicast group is joined, whatever the socket's family."""
+    """The level by which a multicast group is joined; it does not depend on the socket's family."""
     return socket.IPPROTO_IPV6 if ":" in group else socket.IPPROTO_IP
 
 

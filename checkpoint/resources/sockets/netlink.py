@@ -36,8 +36,8 @@ CAPABILITIES: Final = (
     preserved(
         Area.SOCKETS,
         "netlink sockets (routes, links, kernel events, generic netlink, diagnosis)",
-        "bound to their number again, with groups and options; the program must ask again for what a driver keeps for a "
-        "generic one",
+        "bound to their number again, with groups and options; the program must ask again for the state that a driver "
+        "keeps for a generic one",
     ),
     refused(
         Area.SOCKETS,
@@ -58,7 +58,7 @@ FAMILIES: Final[Mapping[int, str]] = {
     15: "kobject_uevent",
     16: "generic",
 }
-"""Those of which a socket is no more than its number and its groups."""
+"""Families whose sockets have no more state than a number and groups."""
 GENERIC: Final = 16
 SOL_NETLINK: Final = 270
 ADD_MEMBERSHIP: Final = 1
@@ -127,10 +127,10 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Iterable[Resource]) -> Iterator[Finding]:
-    """What is not known to come back."""
+    """Notes about state that may not come back."""
     for one in held:
         if one.kind == KIND and one.facts["protocol"] == GENERIC:
-            text = f"what a driver keeps for the generic netlink socket {one.name} is forgotten when the program comes back"
+            text = f"a restore loses the state that a driver keeps for the generic netlink socket {one.name}"
             yield Finding(KIND, one.name, NOTED, text)
 
 
@@ -140,7 +140,7 @@ def findings(held: Iterable[Resource]) -> Iterator[Finding]:
 def prepare(table: CallTable, held: Sequence[Resource], first: int, disguise: Disguise) -> dict[int, int]:
     """Make all of them at numbers from ``first`` on: the descriptor of each, by the socket's number in the snapshot.
 
-    What may be said by one depends on who opened it, too, not only on who says it.
+    The rights of a message depend on the process that opened the socket, too, not only on its sender.
 
     Source: netlink_ns_capable() in net/netlink/af_netlink.c.
     """

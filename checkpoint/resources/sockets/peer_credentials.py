@@ -41,7 +41,7 @@ SAME: Final = -1
 
 
 def observe(looked: socket.socket) -> dict[str, Fact]:
-    """Whom it tells, by our own numbers."""
+    """The process and user that it tells, by our own numbers."""
     pid, uid, gid = _CREDENTIALS.unpack(looked.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     return {"maker": [pid, uid, gid] if uid != NOBODY else []}
 
@@ -62,8 +62,8 @@ class Disguise(Struct, frozen=True):
     A connection tells the effective ids, a message (SCM_CREDENTIALS) the real ones.
 
     Attributes:
-        vessel: who it is.
-        program: who it will be.
+        vessel: its process now.
+        program: the process that it will be.
         eyes: it opens files as the program's user already.
         inner_pid: its PID as it knows it itself.
     """
@@ -75,7 +75,7 @@ class Disguise(Struct, frozen=True):
 
     @contextlib.contextmanager
     def as_maker(self, table: CallTable, one: Resource) -> Iterator[None]:
-        """Make calls for the body as who made a socket; as the program's user where nobody knows, never as ourselves."""
+        """Make calls for the body as the user that made a socket; as the program's user where that is unknown, never as ours."""
         maker = one.facts.get("maker")
         if isinstance(maker, list) and maker:
             if self._is_foreign(number_of(maker[1]), number_of(maker[2])):
@@ -91,13 +91,13 @@ class Disguise(Struct, frozen=True):
 
     @contextlib.contextmanager
     def as_program(self, table: CallTable) -> Iterator[None]:
-        """Make calls for the body as the program's user: what it sends tells who it is."""
+        """Make calls for the body as the program's user: sent messages tell their sender."""
         with self._as(table, self.program.credentials.uids[1], self.program.credentials.gids[1], ""):
             yield
 
     @contextlib.contextmanager
     def as_owner(self, table: CallTable, one: Resource) -> Iterator[None]:
-        """Make calls for the body as whom a socket belongs to; as the program's user where nobody knows."""
+        """Make calls for the body as the user that owns a socket; as the program's user where that is unknown."""
         owner = one.facts.get("user")
         if isinstance(owner, list) and owner and not self._is_foreign(number_of(owner[0]), number_of(owner[1])):
             with self._as(table, number_of(owner[0]), number_of(owner[1]), ""):
@@ -137,7 +137,7 @@ class Disguise(Struct, frozen=True):
         table.attempt(lost, "setresgid", gid, gid, SAME)
         table.attempt(lost, "setresuid", uid, uid, SAME)
         yield
-        table.attempt("", "setresuid", *self.vessel.uids[:2], SAME)  # what it has saved lets it
+        table.attempt("", "setresuid", *self.vessel.uids[:2], SAME)  # its saved ids permit it
         table.attempt("", "setresgid", *self.vessel.gids[:2], SAME)
         if self.eyes:
             table.call("set the filesystem's gid", "setfsgid", self.program.credentials.gids[3])

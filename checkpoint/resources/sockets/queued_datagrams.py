@@ -49,7 +49,7 @@ def send_again(table: CallTable, one: Resource, held: Sequence[Resource], made: 
 
 
 def _has_sent(held: Resource, source: Sequence[Fact], receiver: Resource) -> bool:
-    """Whether what came from an address was sent by this one: it is bound to that, or to its port at every address."""
+    """Whether this one sent datagrams from an address: it is bound to that, or to its port at every address."""
     address = held.facts["address"]
     assert isinstance(address, list)
     if not address or address[1] != source[1] or held.facts["protocol"] != receiver.facts["protocol"]:

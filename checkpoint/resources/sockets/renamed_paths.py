@@ -22,14 +22,14 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.model import Fact
 
 ENTRIES_MAX: Final = 4096
-"""Of a directory so many are looked through for another name."""
+"""Entries of a directory that are looked through for another name."""
 
 
 def name_beside(outlook: str, path: str, may_be: Callable[[int], bool], device: int) -> str:
     """The name that a file has in the directory of one that it had; "" without one.
 
     Args:
-        outlook: what leads to where the program's paths begin.
+        outlook: the path at which the program's paths begin.
         may_be: whether an inode of its file system's ``device`` is its.
     """
     directory = os.path.dirname(path)
@@ -48,7 +48,7 @@ def _is_socket_of(about: os.stat_result, device: int) -> bool:
 
 
 def socket_at(path: str) -> os.stat_result | None:
-    """What lies there, if it is a socket."""
+    """The stat(2) of a path, if it is a socket."""
     with contextlib.suppress(OSError):
         about = os.stat(path)
         return about if stat.S_ISSOCK(about.st_mode) else None
@@ -56,10 +56,10 @@ def socket_at(path: str) -> os.stat_result | None:
 
 
 def by_number(outlook: str, path: str, file: BoundFile | None) -> tuple[str, os.stat_result | None]:
-    """Where a file lies, and what is told of it; None if it has no name here.
+    """Where a file lies, and its stat(2); None if it has no name here.
 
-    An ordinary user may not ask a socket for its file, but for the number of that. Where it is nowhere beside the name that it
-    was bound to, nobody tells him whether it has another one far away or none.
+    An ordinary user may not ask a socket for its file, but for the number of that. Where the file is nowhere beside the name
+    that it was bound to, the kernel does not tell him whether it has another name far away or none.
 
     Args:
         path: the name that it was bound to; it counts where the number says nothing: on a file system that tells others.

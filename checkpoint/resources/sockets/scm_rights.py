@@ -42,7 +42,7 @@ KINDS: Final = (
 """Kinds that can be on their way and come back."""
 UNKNOWN: Final = -1
 OWNED: Final = ("locks", "owner", "signal")
-"""Facts of open files that are about who holds them."""
+"""Facts of open files that are about their holder."""
 
 
 def number_of(opened: Opened, ours: int) -> int:
@@ -93,7 +93,7 @@ def refuse(held: OpenFile, kind: str, owned: Collection[str]) -> str | None:
     """Why something that is on its way cannot be kept.
 
     Args:
-        owned: facts about who holds it.
+        owned: facts about its holder.
     """
     if held.lent is None or (kind in KINDS and not set(owned) & set(OWNED)):
         return None
@@ -104,5 +104,5 @@ def refuse(held: OpenFile, kind: str, owned: Collection[str]) -> str | None:
 
 
 def describe(held: OpenFile) -> dict[str, Fact]:
-    """That it is on its way."""
+    """The fact that it is on its way."""
     return {} if held.lent is None else {"travelling": True}

@@ -83,7 +83,7 @@ SO_BUF_LOCK: Final = 72
 _FORCED: Final = {socket.SO_SNDBUF: 32, socket.SO_RCVBUF: 33}
 """SO_SNDBUFFORCE and SO_RCVBUFFORCE."""
 _OF_IP: Final = (6, 7, 18, 23, 25, 26)
-"""IP_RECVOPTS, RETOPTS, PASSSEC, CHECKSUM, RECVFRAGSIZE, RECVERR_RFC4884: what comes with a datagram."""
+"""IP_RECVOPTS, RETOPTS, PASSSEC, CHECKSUM, RECVFRAGSIZE, RECVERR_RFC4884: data that come with a datagram."""
 _IP: Final = (1, 2, 4, 8, 10, 11, 12, 13, 15, 19, 20, 21, 24, 32, 33, 34, 49, 50, 51, *_OF_IP)
 """IP_TOS, TTL, OPTIONS, PKTINFO, MTU_DISCOVER, RECVERR, RECVTTL, RECVTOS, FREEBIND, TRANSPARENT, ORIGDSTADDR, MINTTL,
 BIND_ADDRESS_NO_PORT, MULTICAST_IF, MULTICAST_TTL, MULTICAST_LOOP, MULTICAST_ALL, UNICAST_IF, LOCAL_PORT_RANGE."""
@@ -131,7 +131,7 @@ _getsockopt = ctypes.CDLL(None, use_errno=True).getsockopt
 
 
 class Form(Struct, frozen=True):
-    """What socket(2) was told."""
+    """The arguments of socket(2)."""
 
     family: int
     type: int
@@ -139,7 +139,7 @@ class Form(Struct, frozen=True):
 
 
 class Queue(Struct, frozen=True):
-    """What waits to be read.
+    """The messages that wait to be read.
 
     Attributes:
         passed: of each message the descriptors of the program that are on their way in it, `UNKNOWN` for what it has not open.
@@ -182,7 +182,7 @@ class _Plain(socket.socket):
 
 @contextlib.contextmanager
 def looked_into(pid: int, number: int) -> Iterator[socket.socket]:
-    """A socket of another process, for the body; what is set on it is set there, too.
+    """A socket of another process, for the body; options set on it are set there, too.
 
     Raises:
         OSError: it was closed meanwhile.
@@ -201,7 +201,7 @@ def general_facts(held: OpenFile, looked: socket.socket, opened: Opened) -> dict
     if recalled and held.lent is None:
         return dict(recalled.settings)
     form = Form(looked.family, looked.type, looked.proto)
-    about = os.fstat(looked.fileno())  # what a descriptor is told to be is what all sockets have in common
+    about = os.fstat(looked.fileno())  # its descriptor's own stat is the same for all sockets
     facts: dict[str, Fact] = {
         "socket": held.first.inode,
         "family": int(form.family),
@@ -239,10 +239,10 @@ def refuse_filter(held: OpenFile) -> str | None:
 
 
 def ends(kind: str, name: str, what: str, surroundings: Surroundings, more: str = "") -> Finding:
-    """That a connection with others ends by a restore; it stands against a capture where the operator wants that.
+    """The finding that a restore ends a connection with others; it refuses a capture where the operator wants that.
 
     Args:
-        more: what that means for the program.
+        more: the effect on the program.
     """
     if surroundings.terms.refuses_connections:
         cure = f"{AS_SOON_AS} the program has closed the connection"
@@ -324,7 +324,7 @@ def _option(looked: socket.socket, level: int, number: int) -> bytes | None:
 
 
 def queue_of(looked: socket.socket, number: int, noted: Noted | None, identify: Identify = lambda _: UNKNOWN) -> Queue:
-    """What waits to be read; it stays there.
+    """The messages that wait to be read; they stay there.
 
     Only where several messages wait must the kernel be told to look behind the first (SO_PEEK_OFF). That is told to the program's
     own socket: never while the program runs, for it would look there, too.
@@ -370,7 +370,7 @@ def set_peek_offset(looked: socket.socket, offset: int) -> None:
 
 
 def readiness(looked: socket.socket) -> int:
-    """What poll(2) says of reading it."""
+    """The events of poll(2) for reading it."""
     poll = select.poll()
     poll.register(looked, select.POLLIN | select.POLLPRI)
     return next((events for _, events in poll.poll(0)), 0)
@@ -528,7 +528,7 @@ def fill(table: CallTable, held: Resource, ways: Sequence[Way]) -> None:
     for index, (message, way) in enumerate(zip(messages, ways, strict=True)):
         rights = passed[index] if passed else []
         assert isinstance(message, bytes) and isinstance(rights, list)
-        _send(table, f"fill {held.name} with what waited in it", way, message, [number_of(one) for one in rights])
+        _send(table, f"fill {held.name} with its waiting messages", way, message, [number_of(one) for one in rights])
     for number, sending in enlarged.items():
         if sending is not None:
             _set_send_buffer_back(table, sending, number)
@@ -560,7 +560,7 @@ def _set_send_buffer_back(table: CallTable, held: Resource, made: int) -> None:
 
 
 SHUTDOWN_HOW: Final = {1: socket.SHUT_RD, 2: socket.SHUT_WR, 3: socket.SHUT_RDWR}
-"""What shutdown(2) is told, by what the kernel tells afterwards."""
+"""The argument of shutdown(2), by the state that the kernel tells afterwards."""
 
 
 def shut_down(table: CallTable, held: Resource, made: int) -> None:

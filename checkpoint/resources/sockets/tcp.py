@@ -58,7 +58,7 @@ CAPABILITIES: Final = (
     by_rule(
         Area.SOCKETS,
         "TCP connections with others",
-        "reset: the program sees what it would see after a crash of its peer (ECONNRESET, EPOLLHUP, EPOLLERR). After an "
+        "reset: the program sees the same as after a crash of its peer (ECONNRESET, EPOLLHUP, EPOLLERR). After an "
         "end of file it reads the end of file again; a connection that it is just opening is opened anew",
         "If they are not opened anew",
     ),
@@ -90,17 +90,17 @@ _PEER_SPEAKS: Final = (ESTABLISHED, FIN_WAIT_1, FIN_WAIT_2)
 _PEER_ENDED: Final = (CLOSE_WAIT, LAST_ACK, CLOSING)
 
 PEERS_TOLD: Final = 3
-"""Of those whose connections are reset, in one sentence."""
+"""Peers that one sentence names, of those whose connections are reset."""
 
 TAKEN: Final = "carried"
-"""Everything that must be known of a connection to take it up elsewhere."""
+"""All facts of a connection that another machine needs to take it up."""
 MAY_MOVE: Final = "may_move"
 """Present of one that is taken along where the program is handed over."""
 LEFT: Final = "left"
 """Why one is not taken along that was to be."""
 
 ON_ITS_WAY: Final = "it was on its way in a unix socket; once received, it is taken along"
-"""Of one that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
+"""Reason about a connection that a message carries (SCM_RIGHTS), and that the program has no descriptor of."""
 
 READ_ENDED: Final = 1
 FAILED: Final = 2
@@ -113,12 +113,12 @@ _SENT_AT: Final = 200
 """tcpi_bytes_received; tcpi_notsent_bytes; tcpi_bytes_sent and tcpi_bytes_retrans (Linux 4.19)."""
 
 _RESET_AT_CLOSE: Final = struct.pack("<ii", 1, 0)
-"""SO_LINGER: no time is left for what is underway, so the connection is reset."""
+"""SO_LINGER: no time is left for bytes that are underway, so the connection is reset."""
 _ROOM: Final = 1 << 16
 
 
 def observe(held: OpenFile, looked: socket.socket, facts: Mapping[str, Fact], listings: Listings) -> dict[str, Fact]:
-    """What else must be known of a TCP socket that is neither fresh nor listens.
+    """The other facts of a TCP socket that is neither fresh nor listens.
 
     Args:
         facts: as `inet.observe` found them.
@@ -199,10 +199,10 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Sequence[Resource], surroundings: Surroundings, *, standing: bool) -> Iterator[Finding]:
-    """What can be told only of all connections together: which cannot be made again yet, and which end.
+    """Findings about all connections together: which cannot be made again yet, and which end.
 
     Args:
-        standing: the program stood still, so that what is said of two ends was true at the same time.
+        standing: the program stood still, so that the facts of two ends were true at the same time.
     """
     others = pairs(held)
     for one in held:
@@ -236,7 +236,7 @@ def _refuse_end(one: Resource, other: Resource) -> Iterator[str]:
 
 
 def note(held: Resource) -> str | None:
-    """What becomes of a connection whose other end is another program's; None of one that had ended, or is asked for anew."""
+    """The end of a connection with another program, as a sentence; None of one that had ended, or is asked for anew."""
     if held.facts["state"] in (CLOSED, SYN_SENT) and not _number(held, "unread"):
         return None
     why = f" ({reason})" if isinstance(reason := held.facts.get(LEFT), str) else ""
@@ -244,13 +244,13 @@ def note(held: Resource) -> str | None:
 
 
 def named(held: Resource) -> str:
-    """A connection, for a sentence: its descriptor, and with whom it is."""
+    """A connection, for a sentence: its descriptor, and the address of its peer."""
     peer = held.facts["peer"]
     return f"{held.name} with {in_words(peer)}" if isinstance(peer, list) and peer else held.name
 
 
 def notes(held: Sequence[Resource]) -> tuple[str, ...]:
-    """What a restore loses, one sentence each."""
+    """The connections that a restore loses, one sentence each."""
     others = pairs(held)
     ending = (one for one in held if one.kind == KIND and TAKEN not in one.facts and _number(one, "socket") not in others)
     return tuple(text for one in ending if (text := note(one)))
@@ -262,10 +262,10 @@ def established(held: Iterable[Resource]) -> int:
 
 
 def summary(held: Sequence[Resource]) -> tuple[str, ...]:
-    """What a restore of a whole program resets, as a sentence for its status: with whom, and what to do.
+    """The connections that a restore of a whole program resets, as a sentence for its status: their peers, and what to do.
 
     Args:
-        held: what all of its processes have.
+        held: the resources of all its processes.
     """
     others = pairs(held)
     ended = {
@@ -322,7 +322,7 @@ def _reads_the_end(held: Resource) -> bool:
 
 
 def prepare(table: CallTable, held: Sequence[Resource], first: int) -> dict[int, int]:
-    """Make all of them at numbers from ``first`` on, before anybody listens: the descriptor of each, by the socket's number."""
+    """Make all of them at numbers from ``first`` on, before any listens: the descriptor of each, by the socket's number."""
     return _Work(table, held, first).run() if held else {}
 
 
@@ -451,7 +451,7 @@ def _set(table: CallTable, made: int, option: int, value: int) -> None:
 
 
 def settle(table: CallTable, held: Sequence[Resource], made: Mapping[int, int]) -> None:
-    """Once those who listen do: options, what waits, and which side has ended."""
+    """Once the listeners listen: set options, send waiting bytes, and end sides that had ended."""
     others = pairs(held)
     for one in held:
         number, other = made[_number(one, "socket")], others.get(_number(one, "socket"))

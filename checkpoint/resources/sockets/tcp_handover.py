@@ -65,7 +65,7 @@ class Departing(Struct, frozen=True):
 
     Attributes:
         silent: those that are taken along.
-        facts: what is to be added to each resource, by the socket's number.
+        facts: additional facts for each resource, by the socket's number.
     """
 
     silent: tuple[Connection, ...] = ()
@@ -93,7 +93,7 @@ def depart(opened: Iterable[OpenFile]) -> Departing:
     """Silence and read the connections of a program that stands still.
 
     Args:
-        opened: what it has open, as it was observed.
+        opened: its open files, as they were observed.
     """
     wanted = {number_of(one.observed["socket"]): one for one in _with_others(opened)}
     between = {number: _connection(one.observed) for number, one in wanted.items()}
@@ -159,9 +159,9 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
 
 
 def heard_again(opened: Iterable[OpenFile]) -> None:
-    """What somebody silenced who died over it, and left the program running, is heard again."""
+    """Let connections be heard again that a keeper had silenced before it died and left the program running."""
     found = list(_with_others(opened))
-    with contextlib.suppress(OSError):  # then nobody could have silenced them either
+    with contextlib.suppress(OSError):  # then no keeper could have silenced them either
         for one in found:
             with copy_of(one.pid, one.first.number) as descriptor, _borrowed(descriptor) as looked:
                 tcp_repair.leave_behind(looked)
@@ -188,7 +188,7 @@ class Arriving:
     """Connections that a program takes up again: made once it has its descriptors, and heard from when it goes on.
 
     Attributes:
-        notes: what is to be done for them, and what was reset.
+        notes: steps to take for them, and connections that were reset.
         established: connections that were open at the capture.
     """
 
@@ -197,7 +197,11 @@ class Arriving:
     def __init__(
         self, arrivals: Iterable[_Arrival] = (), ended: Iterable[Connection] = (), state: Snapshot | None = None
     ) -> None:
-        """Of those that it takes up, and of those that have ended: this machine resets them, also where it was to be silent."""
+        """
+        Args:
+            arrivals: connections that it takes up.
+            ended: connections that have ended: this machine resets them, also where it was to be silent.
+        """
         self._arrivals = tuple(arrivals)
         self._ended = tuple(ended)
         self.notes = tuple(_missing(one) for one in self._arrivals if not inet_addresses.is_ours(_ends(one.resource)[0]))
@@ -208,7 +212,7 @@ class Arriving:
         self._made: list[tuple[socket.socket, _Arrival, int]] = []
 
     def connect(self, pids: Sequence[int]) -> None:
-        """Turn the sockets that the processes were given into their connections. Nobody hears of them yet.
+        """Turn the sockets that the processes were given into their connections. Their peers hear nothing yet.
 
         Args:
             pids: of the component's processes, as `checkpoint.snapshot.process_tree.views` orders them.
@@ -244,7 +248,7 @@ class Arriving:
                 made.close()
         except OSError as error:
             raise RestoreError(f"cannot resume TCP connections: {error.strerror}") from error
-        with contextlib.suppress(OSError):  # then nobody could have silenced them either
+        with contextlib.suppress(OSError):  # then no keeper could have silenced them either
             packet_drop.lift(self._ended)
 
 
@@ -256,14 +260,14 @@ def _missing(one: _Arrival) -> str:
 
 
 def arriving(state: Snapshot, *, wanted: bool, all_of_them: bool = False) -> tuple[Arriving, Snapshot]:
-    """What of a snapshot's connections can be taken up here, tried by making each of them.
+    """The connections of a snapshot that can be taken up here, tried by making each of them.
 
     Args:
         wanted: nothing has run since the capture; else none is.
-        all_of_them: refuse if one cannot; what has been silent stays silent, so that another restore may succeed.
+        all_of_them: refuse if one cannot; silent connections stay silent, so that another restore may succeed.
 
     Returns:
-        Those, which are silent from now on; and the snapshot, with the reason in the place of what cannot be taken up.
+        Those, which are silent from now on; and the snapshot, with the reason in the place of each that cannot be taken up.
 
     Raises:
         MismatchError: one cannot, and all were to be.
@@ -343,7 +347,7 @@ def _kept(held: Resource) -> Kept:
         assert isinstance(found, dict)
         return msgspec.convert(found, Kept)
     except (AssertionError, msgspec.ValidationError) as error:
-        raise RestoreError(f"cannot restore {held.name}: what the snapshot says of its connection is none: {error}") from error
+        raise RestoreError(f"cannot restore {held.name}: the snapshot does not describe its connection: {error}") from error
 
 
 def _ends(held: Resource) -> tuple[tcp_repair.Address, tcp_repair.Address]:
@@ -353,7 +357,7 @@ def _ends(held: Resource) -> tuple[tcp_repair.Address, tcp_repair.Address]:
 
 
 def _try(one: _Arrival) -> None:
-    """Make it and take it away again, which nobody hears of. Whoever had it on this machine may be about to end.
+    """Make it and take it away again; its peer hears nothing. The process that had it on this machine may be about to end.
 
     Raises:
         CannotCarryError: this machine cannot have it.

@@ -56,7 +56,7 @@ CAPABILITIES: Final = (
     by_rule(
         Area.SOCKETS,
         "unix sockets connected to another process (D-Bus, X, a logger’s stream)",
-        "the program sees what it would see if its peer had died: what it had received, then the end of file; EPIPE where it "
+        "the program sees the same as if its peer had died: the bytes that it had received, then the end of file; EPIPE where it "
         "sends. It may exit, unless it connects again; failover check says so beforehand. A socket for datagrams (/dev/log) is "
         "connected to the same name again. Connections that wait at a listener of the program end",
         "the unix socket {} with {} ends",
@@ -94,7 +94,7 @@ _EXITING: Final = (
     (".X11-unix", "clients of Xlib do so"),
     ("wayland-", "most clients of Wayland do so"),
 )
-"""What is known of clients, by a part of the name of their server."""
+"""The known behaviour of clients, by a part of the name of their server."""
 
 
 def observe(held: OpenFile, looked: socket.socket, opened: Opened, noted: sockets.Noted | None) -> dict[str, Fact]:
@@ -208,7 +208,7 @@ def refuse(held: OpenFile, surroundings: Surroundings) -> str | None:
 
 
 def findings(held: Sequence[Resource], surroundings: Surroundings) -> Iterator[Finding]:
-    """What can be told only of all sockets together: which of them end, and connections that wait to be accepted."""
+    """Findings about all sockets together: which of them end, and connections that wait to be accepted."""
     ours = [one for one in held if one.kind == KIND]
     awaited = awaited_here(ours)
     known = {number_of(one.facts["socket"]) for one in ours}
@@ -250,14 +250,14 @@ def _is_lost(facts: Mapping[str, Fact]) -> bool:
 
 
 def note(one: Resource) -> str:
-    """That a connection with another process ends."""
+    """The sentence that a connection with another process ends."""
     own, peer = _name_for_people(one, "name"), _name_for_people(one, "peer_name")
     where = peer or (f"a client of {own}" if own else "another process")
     return f"the unix socket {one.name} with {where} ends"
 
 
 def _may_exit(one: Resource) -> str:
-    """What that may do to a program that is no server."""
+    """The possible effect of that on a program that is no server."""
     peer = _name_for_people(one, "peer_name")
     if _name_for_people(one, "name") and not peer:
         return ""

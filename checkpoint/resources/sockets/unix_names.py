@@ -51,7 +51,7 @@ CAPABILITIES: Final = (
     refused(
         Area.THERE,
         "a unix socket's name that something else has, or a missing directory for it",
-        "end or remove what is there; make the directory",
+        "end the other program, or remove the file; make the directory",
         "the directory of the unix socket",
         "is something else here",
         "is another process's here",
@@ -65,7 +65,7 @@ HIDDEN: Final = "failover-socket-"
 """How directories begin that are made for the while that a name takes."""
 GONE: Final = -1
 FREED_S: Final = 1.0
-"""How long the kernel may take to find sockets that nobody can reach any more."""
+"""How long the kernel may take to find sockets that no process can reach any more."""
 AT_EMPTY_PATH: Final = 0x1000
 NOT_WAITING: Final = -1
 """Fact ``not_accepted`` of a socket whose connection does not wait to be accepted."""
@@ -78,7 +78,7 @@ def observe(held: OpenFile, looked: socket.socket, name: bytes, file: BoundFile 
 
     Args:
         name: as the kernel tells it, in full.
-        file: as the kernel tells of it, whoever asks.
+        file: as the kernel tells of it to any user.
     """
     if not name or name[:1] == b"\0":
         return {"path": "", "mode": GONE, "file_owner": [], "directory": "", "root": ""}
@@ -223,18 +223,18 @@ def _is_free(name: bytes, kind: int) -> bool:
 
 
 def is_answered(path: str) -> bool:
-    """Whether a process has the socket file open: connecting to one that nobody has any more is refused by the kernel."""
+    """Whether a process has the socket file open: the kernel refuses to connect to one that no process has any more."""
     for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_SEQPACKET):
         with socket.socket(socket.AF_UNIX, kind) as asked:
             asked.setblocking(False)
             refused = asked.connect_ex(path)
-            if refused in (0, errno.EAGAIN, errno.EPERM):  # EPERM: it hears only whom it is connected with
+            if refused in (0, errno.EAGAIN, errno.EPERM):  # EPERM: it hears only its own peer
                 return True
     return False
 
 
 def is_abandoned(path: str) -> bool:
-    """Whether a name, a whole path, can be had for a moment: it is free, or a socket's that nobody has any more.
+    """Whether a name, a whole path, can be had for a moment: it is free, or of a socket that no process has any more.
 
     Names of senders are what these say, and may lead to anything.
     """
@@ -249,7 +249,7 @@ def is_ghost(held: Resource) -> bool:
 
 
 def _is_hidden(held: Resource) -> bool:
-    """Whether it is bound where nobody looks: a ghost by a relative name, or by one that leads elsewhere from where we look.
+    """Whether its name leads us elsewhere: a ghost by a relative name, or by one that leads elsewhere from where we look.
 
     One that was so once stays so: it lay in a directory of ours, which does not tell where its name began.
     """
@@ -292,7 +292,7 @@ class Naming:
             self._bind_file(one, made)
 
     def address_of(self, one: Resource) -> bytes:
-        """What connect(2) takes to reach a socket that has a name."""
+        """The address for connect(2) to reach a socket that has a name."""
         name, opened = one.facts["name"], self._files.get(number_of(one.facts["socket"]))
         assert isinstance(name, bytes)
         return packed(name if opened is None else b"/proc/self/fd/%d\0" % opened)
@@ -353,8 +353,8 @@ class Naming:
             self._bind(one, made)
         self._keep(one, path)
         table.call(f"unlink {path}", "unlinkat", AT_FDCWD, table.place_path(path), 0)
-        itself = f"/proc/self/fd/{self._files[number_of(one.facts['socket'])]}"  # nobody else reaches it any more
-        table.attempt("", "fchmodat", AT_FDCWD, table.place_path(itself), 0o777)  # whoever connected to it may again
+        itself = f"/proc/self/fd/{self._files[number_of(one.facts['socket'])]}"  # no other process reaches it any more
+        table.attempt("", "fchmodat", AT_FDCWD, table.place_path(itself), 0o777)  # earlier clients may connect to it again
         for directory in reversed(directories):
             table.attempt("", "unlinkat", AT_FDCWD, table.place_path(directory), REMOVE_DIRECTORY)
 

@@ -109,7 +109,7 @@ class Work:
             table.close(number)
 
     def notes(self) -> tuple[str, ...]:
-        """What is otherwise than it was."""
+        """Sentences about differences."""
         ended = [one for one in self._held.values() if self._ends(one)]
         kept = (one for one in self._held.values() if one not in ended)
         return (*map(unix.note, ended), *self._disguise.notes(kept))
@@ -203,10 +203,10 @@ class Work:
         return next(alike, None)
 
     def _ask(self, listener: Resource, accepted: Resource | None, client: Resource) -> int:
-        """A client's socket, connected to a listener as who connected it.
+        """A client's socket, connected to a listener as the user that connected it.
 
         Args:
-            accepted: the other end, which tells who that was; None of one that is not there yet.
+            accepted: the other end, which tells that user; None of one that is not there yet.
         """
         table = self._table
         connecting = sockets.make(table, client)
@@ -223,7 +223,7 @@ class Work:
         return connecting
 
     def _temporary_listener(self, named: Resource, client: Resource) -> int:
-        """A listener in place of the one that an accepted end came from, made as who the client says it was."""
+        """A listener in place of the one that an accepted end came from, made as the user that the client tells."""
         table = self._table
         form = (socket.AF_UNIX, _of(named, "type") | CLOSE_ON_EXEC, 0)
         lent = table.obtain(f"make a listener for {named.name}", "socket", *form)
@@ -233,7 +233,7 @@ class Work:
         return lent
 
     def _wait_at(self, listener: Resource, client: Resource) -> None:
-        """Connect a client whose connection nobody has accepted yet."""
+        """Connect a client whose connection is not accepted yet."""
         self._keep(client, self._ask(listener, None, client))
 
     # Datagrams, and what waits

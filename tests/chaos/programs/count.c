@@ -1,4 +1,4 @@
-/* A program that nobody prepared: it commands the actuator in each step. count NAME ACTUATOR PERIOD_MS */
+/* An unmodified program: it commands the actuator in each step. count NAME ACTUATOR PERIOD_MS */
 #define _GNU_SOURCE
 #include <stdint.h>
 #include <stdio.h>

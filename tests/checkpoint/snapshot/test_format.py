@@ -300,5 +300,5 @@ def test_a_file_that_expands_to_more_than_the_limit_is_refused_before_a_page_is_
     monkeypatch.setattr(validity, "MAX_CONTENTS_SIZE", size)
     assert format.decode(encoded).copies
     monkeypatch.setattr(validity, "MAX_CONTENTS_SIZE", size - PAGE)
-    with pytest.raises(FormatError, match=f"copies: {size} bytes with what they are of, above the limit of {size - PAGE}"):
+    with pytest.raises(FormatError, match=f"copies: {size} bytes with their sources, above the limit of {size - PAGE}"):
         format.decode(encoded)

@@ -104,7 +104,7 @@ def process_state(pid: int, standing: Standing, identities: Identities) -> Proce
 
 
 def _timers(standing: Standing) -> tuple[PosixTimer, ...]:
-    """Those of timer_create(2), each naming the thread that it signals as the program does; /proc names it as we do."""
+    """The timers of timer_create(2). Each names its thread as the program does; /proc names the thread as we do."""
     inner = {other.place.tracee.pid: other.place.inner_tid for other in standing.others}
     status = standing.status
     inner |= {status.pids[0]: status.pids[-1], status.tgid: status.tgids[-1]}

@@ -12,7 +12,7 @@ from checkpoint.resources.ipc.shared_memory import Mapped, Object
 
 
 class DetachedMemory:
-    """What the processes of one component share with others by such memory, as it was found last."""
+    """The memory of this kind that the processes of one component share with others, as it was found last."""
 
     def __init__(self) -> None:
         self._found: tuple[Mapped, ...] = ()
@@ -33,11 +33,11 @@ class DetachedMemory:
         return covered
 
     def notes(self) -> Iterable[str]:
-        """What an operator is to know."""
+        """Sentences for the operator."""
         return shared_memory.detached(self._found)
 
     def resources(self) -> Iterator[Resource]:
-        """What a snapshot says."""
+        """The resources for a snapshot."""
         yield from shared_memory.describe(self._names.items())
 
 

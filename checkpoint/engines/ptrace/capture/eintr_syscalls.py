@@ -155,7 +155,7 @@ def _socket_timeout_ns(pid: int, number: int, option: int) -> int | None:
 
 
 def decide(registers: Registers, before: Wait | None, asked_ns: int, at_end: int, now_ns: int) -> tuple[Registers, Wait | None]:
-    """What becomes of a call with a timeout that a stop has ended: see the table above.
+    """Decide about a call with a timeout that a stop has ended: see the table above.
 
     Args:
         before: the last call of this thread that was made again.

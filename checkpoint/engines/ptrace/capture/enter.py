@@ -35,7 +35,7 @@ LEAVE_PAUSE_S: Final = 0.01
 
 
 class Entered(Struct, frozen=True):
-    """What one session works with; ``notes`` are sentences for the operator."""
+    """The tools of one session; ``notes`` are sentences for the operator."""
 
     pages: BorrowedPages
     tracker: Tracker

@@ -45,7 +45,7 @@ class EndedFirst:
         """The thread as a snapshot tells it.
 
         Args:
-            like: one that lives: of it are the registers that nobody reads any more.
+            like: a living thread. The state takes from it the registers that have no meaning any more.
             tid: its id as the program knows it.
             lines: the mappings that the snapshot has.
 
@@ -65,7 +65,7 @@ class EndedFirst:
         )
 
     def _place(self, lines: Sequence[MapsLine]) -> int:
-        """An instruction of the program's files that makes a system call: what is of the kernel may be another one elsewhere."""
+        """An instruction of the program's files that makes a system call: the kernel's own may differ on another machine."""
         codes = [line for line in lines if line.has_file and line.protection & CODE == CODE]
         if not any(line.start <= self._instruction < line.end for line in codes) or not self._is_call(self._instruction):
             self._instruction = next((place for line in codes if (place := self._found_in(line))), 0)

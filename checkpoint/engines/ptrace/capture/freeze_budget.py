@@ -10,13 +10,13 @@ from checkpoint.errors import CaptureError
 from checkpoint.linux import abi
 
 FIRST_REST_NS: Final = 1_000_000
-"""What a freeze takes besides copying, before one was seen."""
+"""The time of a freeze besides copying, until one is measured."""
 FIRST_PAGE_NS: Final = 2_000
-"""What copying a page takes, before it was seen."""
+"""The time to copy a page, until it is measured."""
 TELLING_COUNT: Final = 64
 """Pages from which on their copying tells what one of them takes."""
 WEIGHT: Final = 0.2
-"""Of the newest freeze in what is expected of the next."""
+"""The weight of the newest freeze in the estimate for the next."""
 LONG_COPY_NS: Final = 200_000_000
 """Where no budget is set: a freeze whose copying would take longer is given up for some more passes while the program runs."""
 LONG_CAPTURE_NS: Final = 8_000_000_000
@@ -29,7 +29,7 @@ class OverBudgetError(CaptureError):
 
 
 class FreezeBudget:
-    """Of one component.
+    """The freeze budget of one component, with estimates of its freezes.
 
     Args:
         budget_ns: how long it may stand still for a snapshot; 0: as short as can be.
@@ -113,7 +113,7 @@ class FreezeBudget:
         return bool(self._until_ns)
 
     def copied(self) -> None:
-        """The last copy of the freeze is made: what follows is the tail."""
+        """The last copy of the freeze is made: the tail follows."""
         self._copied_ns = self._clock()
 
     # After it

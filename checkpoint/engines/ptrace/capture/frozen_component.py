@@ -1,4 +1,4 @@
-"""What one freeze of a component brought home."""
+"""The result of one freeze of a component."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from checkpoint.resources.sockets.tcp_handover import Departing
 
 
 class Frozen(Struct, frozen=True):
-    """Everything that one freeze brought home; nothing in it needs the process any more.
+    """Everything that one freeze has read; nothing in it needs the process any more.
 
     Attributes:
         first: of the first process.
-        others: what was seen of the others; None where there are none.
+        others: the looks at the others; None where there are none.
         freeze_us: how long the program stood still; of several times, which a capture that is made again has, the longest.
         seen: its carried files.
         departing: its connections, where it may stand still for good.
@@ -37,7 +37,7 @@ class Frozen(Struct, frozen=True):
 
 
 def opened(first: Look, others: SeenOthers | None) -> list[OpenFile]:
-    """What any of the processes has open."""
+    """The open files of all processes."""
     looks = [first, *(look for _, look in others.looks())] if others else [first]
     return [held for look in looks for held in look.standing.opened]
 
@@ -50,5 +50,5 @@ def lines_of_all(first: Look, others: SeenOthers | None) -> Iterator[MapsLine]:
 
 
 def shared_inodes(first: Look, others: SeenOthers | None) -> set[int]:
-    """Of the files that any of the processes has mapped to be shared."""
+    """The inodes of files that any of the processes has mapped to be shared."""
     return {line.inode for line in lines_of_all(first, others) if line.shared}

@@ -58,7 +58,7 @@ class Place(Read, Struct, frozen=True):
     confinement: Confinement = FREE
 
     def every_pending(self) -> tuple[bytes, ...]:
-        """Whatever is pending anywhere."""
+        """All pending signals, of any thread and of the process."""
         return (*self.pending, *self.shared_pending, *(siginfo for other in self.others for siginfo in other.pending))
 
 
@@ -83,7 +83,7 @@ class Standing(Struct, frozen=True, dict=True):
 
     @functools.cached_property
     def told(self) -> Told:
-        """What it said about itself."""
+        """Its own answers about itself."""
         return rearmed(self.inquiry.read(self.answers), self.place.every_pending(), self.waiting)
 
     @functools.cached_property
@@ -101,8 +101,8 @@ class Onlooker:
     """Asks one process, again and again; the questions stay the same while its signals and timers do.
 
     Attributes:
-        rights: of threads that may what the first may not, or the other way round.
-        tables: what threads have for themselves.
+        rights: those of threads whose rights differ from the first thread's.
+        tables: descriptors and directories that threads have for themselves.
     """
 
     def __init__(self, threads: Threads, entered: Entered, devices: tuple[DeviceRule, ...]) -> None:
@@ -124,12 +124,12 @@ class Onlooker:
         self._inquiry_key: tuple[int, bytes] = (0, b"")
 
     def gather(self) -> Opened:
-        """What it has open; for an exact picture it stands still."""
+        """Its open files. The picture is exact only if the process stands still."""
         return gather(self._tracee.pid, self._kept)
 
     @property
     def owners(self) -> Owners:
-        """What is known of who has owners of its signals."""
+        """The known owners of its files' signals."""
         return self._kept.owners
 
     def overlooked(self, opened: Sequence[OpenFile]) -> OpenFile | None:
@@ -141,7 +141,7 @@ class Onlooker:
             return with_contents(opened, self._borrowed.noted, self._devices, self._recollection)
 
     def close(self) -> None:
-        """Close what is kept open of it."""
+        """Close the files that are kept open about it."""
         self._kept.texts.close()
         self._files.close()
         self._others.close()
@@ -161,7 +161,7 @@ class Onlooker:
                 self.overlooked(opened)
                 with_contents(opened, None, self._devices)
             self._kept.texts.forget()
-            if self._threads.is_one_of_many:  # what all of them have open is read for all of them, not by what stays open
+            if self._threads.is_one_of_many:  # open files of several processes are read for all at once, not through kept files
                 self._kept.texts.close()
         self._recollection.prepare()
         self._others.prepare()
@@ -202,7 +202,7 @@ class Onlooker:
         """Everything else. Its system calls are made inside the process: the memory has been taken before.
 
         Args:
-            opened: what it has open, if that is known already.
+            opened: its open files, if they are known already.
         """
         tracee = self._tracee
         self.tables.look()

@@ -36,7 +36,7 @@ from checkpoint.model import Rseq
 
 
 class Read:
-    """What was read of any thread that stands, the first one or another."""
+    """The state read of any thread that stands, the first one or another."""
 
     __slots__ = ()
 
@@ -44,7 +44,7 @@ class Read:
 
     @property
     def reading(self) -> Reading:
-        """What the kernel told."""
+        """The kernel's answers."""
         return self.unread.reading
 
     @property
@@ -96,7 +96,7 @@ class ThreadStanding(Struct, frozen=True, dict=True):
 
     @property
     def reading(self) -> Reading:
-        """What the kernel told of it."""
+        """The kernel's answers about it."""
         return self.place.reading
 
     def settle(self) -> None:
@@ -119,7 +119,7 @@ class ThreadStanding(Struct, frozen=True, dict=True):
 
     @property
     def name(self) -> str:
-        """Of PR_SET_NAME."""
+        """The name that PR_SET_NAME sets."""
         return os.fsdecode((self.place.comm or self.reading.text).removesuffix(b"\n"))
 
     @functools.cached_property
@@ -134,12 +134,12 @@ class ThreadStanding(Struct, frozen=True, dict=True):
 
     @property
     def timer_slack_ns(self) -> int:
-        """Of prctl(2), PR_GET_TIMERSLACK."""
+        """The answer of prctl(2), PR_GET_TIMERSLACK."""
         return self.questions.timer_slack_in(self.answers)
 
     @property
     def death_signal(self) -> int:
-        """Of prctl(2), PR_GET_PDEATHSIG; 0 for none."""
+        """The answer of prctl(2), PR_GET_PDEATHSIG; 0 for none."""
         return self.questions.death_signal_in(self.answers)
 
 
@@ -214,7 +214,7 @@ class ThreadOnlooker:
         self._asked: tuple[ThreadStanding, ...] = ()
 
     def close(self) -> None:
-        """Close what is kept open of them."""
+        """Close the files that are kept open about them."""
         self._keep_only(())
 
     def _keep_only(self, tids: Collection[int]) -> None:
@@ -222,7 +222,7 @@ class ThreadOnlooker:
             os.close(self._names.pop(tid).file)
 
     def prepare(self) -> None:
-        """Look up, while the program runs, what does not change; what is left of an earlier look."""
+        """Look up, while the program runs, what does not change and an earlier look has not found yet."""
         self._settle()
         for tid in thread_ids(self._threads.pid):
             if tid != self._threads.pid:
@@ -238,7 +238,7 @@ class ThreadOnlooker:
             standing.settle()
 
     def _named(self, tid: int) -> tuple[Life, bytes]:
-        """Who has this id now, and its comm.
+        """The thread that has this id now, and its comm.
 
         By a file that stays open: reading it again takes a third of opening it anew, and once its thread has ended it tells of no
         other one. So if it still answers after the thread's stat has been read, by name, that was the same thread's.
@@ -273,14 +273,14 @@ class ThreadOnlooker:
         return self._inner_tids[life]
 
     def name_files(self) -> list[int]:
-        """Of those that stand still: what `Readings.read` is to read of them."""
+        """Files of the threads that stand still, for `Readings.read`."""
         return [self._names.get(tracee.pid, NOTHING_KEPT).file for tracee in self._threads.others]
 
     def places(self, readings: Sequence[Unread], modes: Mapping[int, int], of_first: int) -> tuple[ThreadPlace, ...]:
         """Where they stand.
 
         Args:
-            readings: what the kernel told of each.
+            readings: the kernel's answers about each.
             modes: of seccomp(2), by thread, of those that were confined before the freeze.
             of_first: that of the first thread, which may have given its filters to all.
 

@@ -61,9 +61,9 @@ LARGE_COUNT: Final = 256
 PASS_LIMIT: Final = 3
 """Passes after the first: a program that writes faster than we copy is not caught up with by more of them."""
 BUDGET_PASS_LIMIT: Final = 12
-"""The same where what is left shall fit a budget."""
+"""The same where the rest shall fit a budget."""
 CATCHING_UP: Final = 0.8
-"""Of what the pass before copied: a pass that copies more does not catch up."""
+"""The share of the earlier pass: a pass that copies more than this share does not catch up."""
 VDSO: Final = "[vdso]"
 UNACKNOWLEDGED_LIMIT: Final = 64
 """Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
@@ -84,13 +84,13 @@ def _is_within(line: MapsLine, places: SharedPlaces) -> bool:
 
 
 class RunningCopy(Struct):
-    """What was copied while the program ran.
+    """The pages that were copied while the program ran.
 
     Attributes:
         copies: oldest first; of a page that several have, the newest counts.
         valid: the pages of ``copies`` that no later scan has named.
-        owed: what the snapshot would carry besides, by what was known when the last pass was over.
-        late: of a freeze that came to nothing: what it has named since.
+        owed: pages that the snapshot would carry besides, as far as known at the end of the last pass.
+        late: the scans of a failed freeze since then.
         start: see `MemoryCapture.start_over`.
     """
 
@@ -101,17 +101,17 @@ class RunningCopy(Struct):
     late: list[Scan] = field(default_factory=list)
 
     def add(self, copy: Copy) -> None:
-        """Take in what was read since the last scan."""
+        """Add pages that were read since the last scan."""
         self.copies.append(copy)
         self.valid = page_set.union(self.valid, copy.pages)
 
     def spoil(self, scan: Scan) -> None:
-        """Forget what a scan has named."""
+        """Forget the pages that a scan has named."""
         self.valid = page_set.difference(page_set.difference(self.valid, scan.written), scan.cleared)
 
 
 class FreezeBuffer:
-    """Memory for what is copied while the program stands still, of all processes of a component; used again each time."""
+    """Memory for pages that are copied while the program stands still, of all processes of a component; used again each time."""
 
     def __init__(self) -> None:
         self._content = bytearray()
@@ -130,7 +130,7 @@ class FreezeBuffer:
         self._wanted = 0
 
     def piece(self, size: int) -> memoryview:
-        """So many bytes of it; of new memory where what is left does not do."""
+        """A piece of this size; of new memory where the rest does not suffice."""
         begin = self._wanted
         self._wanted += size
         if self._wanted <= len(self._content):
@@ -213,11 +213,11 @@ class MemoryCapture:
         self._unacknowledged[-1] = Unacknowledged(position, last.written, last.cleared)
 
     def positions(self) -> set[Position | None]:
-        """Those that are, or can still be, acknowledged."""
+        """The positions that are, or can still be, acknowledged."""
         return {self.acknowledged, *(held.position for held in self._unacknowledged)}
 
     def start_over(self) -> None:
-        """Follow from the beginning with the next base: what was written is not known any more."""
+        """Follow from the beginning with the next base: the written pages are not known any more."""
         self._is_armed, self.acknowledged = False, None
         self._start += 1
         self._guards.forget()
@@ -230,9 +230,9 @@ class MemoryCapture:
         """Copy beforehand what is worth it, so that little is left for the freeze.
 
         Args:
-            copied: of this capture, before a freeze that came to nothing: it is carried on.
-            enough: the pages that may be left, which are copied down to however many passes that takes as long as they catch up
-                with the program; 0: as few as is worth it.
+            copied: the copy of this capture before a failed freeze: this call goes on with it.
+            enough: the number of pages that may be left. Passes go on until no more are left, as long as they catch up with the
+                program; 0: until another pass is not worth it.
         """
         self.refresh()
         is_again = copied is not None and copied.start == self._start
@@ -343,7 +343,7 @@ class MemoryCapture:
             return self._taken(copied, scan, guards, base=base)
 
     def take_unread(self) -> Taken:
-        """All that exists, still to be read where it stands; what is followed, and since when, stays as it is."""
+        """All existing pages, still to be read in place. The tracking of writes stays as it is."""
         self._refresh_if_moved()
         existing = page_set.union(self._tracker.existing(self._private), self._shared.existing(self._shared_lines))
         guards = self._guards.found_everywhere(self._mapped, self._tracker.watched)
@@ -463,7 +463,7 @@ class MemoryCapture:
         self._boards = memory_tracker.extents_of([line for line in self.lines if line.name == memory_tracker.BOARD])
 
     def _scan(self, *, everywhere: bool) -> Scan:
-        """What was written since the last scan. One that fails half-way has protected pages that it tells nobody of."""
+        """The pages written since the last scan. A scan that fails half-way has protected pages without telling which."""
         try:
             scan = self._tracker.scan(self._private, changed=self._has_moved, everywhere=everywhere)
         except CaptureError:
@@ -472,14 +472,14 @@ class MemoryCapture:
         self._has_moved = False
         board = page_set.difference(self._boards, self._boards_named) if len(self._boards) else NONE
         self._boards_named = self._boards
-        if len(board):  # what was there before is to come back as zeros
+        if len(board):  # earlier content there is to come back as zeros
             scan = Scan(scan.written, page_set.union(scan.cleared, board))
         if not self._shared_lines and not self._had_shared:
             return scan
         self._had_shared = bool(self._shared_lines)
         shared = self._shared.scan(self._shared_lines)
         orphans = memory_tracker.extents_of([line for line in self._shared_lines if memory_tracker.is_orphan(line)])
-        # What the tracker says of orphans dates from before their file was deleted.
+        # The tracker's answers about orphans date from before their file was deleted.
         cleared = page_set.difference(scan.cleared, orphans)
         return Scan(page_set.union(scan.written, shared.written), page_set.union(cleared, shared.cleared))
 
@@ -491,7 +491,7 @@ class MemoryCapture:
         self._join()
 
     def _join(self) -> None:
-        """Make one of what has no position yet."""
+        """Join the scans that have no position yet."""
         left_out, self._left_out = self._left_out, NONE
         self._unacknowledged = with_one_tail(self._unacknowledged, self._mapped, left_out)
         if len(self._unacknowledged) > UNACKNOWLEDGED_LIMIT:
@@ -499,6 +499,6 @@ class MemoryCapture:
             self._unacknowledged = [joined(oldest, next_one), *rest]
 
     def _since_acknowledged(self, *, base: bool) -> tuple[Words, Words]:
-        """What a delta must carry: the union of all scans since. A base needs what has become no snapshot yet."""
+        """The pages that a delta must carry: the union of all scans since. A base needs those that are in no snapshot yet."""
         self._join()
         return since(self._unacknowledged, self._mapped, is_base=base)

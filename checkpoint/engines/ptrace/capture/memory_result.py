@@ -18,7 +18,7 @@ from checkpoint.pages.page_set import PageMap, Words
 
 
 class Unacknowledged(Struct, frozen=True):
-    """What one scan found, kept until a position that holds it is acknowledged."""
+    """The findings of one scan, kept until a position that holds them is acknowledged."""
 
     position: Position | None
     written: Words
@@ -55,7 +55,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
 
     @functools.cached_property
     def _named(self) -> tuple[Words, Words]:
-        """What was written and cleared since the acknowledged position."""
+        """The pages that were written and cleared since the acknowledged position."""
         return since(with_one_tail(self.scans, self.mapped, self.guards), self.mapped, is_base=self.is_base)
 
     @functools.cached_property
@@ -90,7 +90,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
         return sent.addresses, self._gathered(sent), dropped
 
     def _gathered(self, sent: PageMap) -> memoryview:
-        """Their bytes, in the largest copy that nobody needs any more, if that can be."""
+        """Their bytes, in the largest copy that is not needed any more, if that can be."""
         contents = [copy.content for copy in self.copies]
         if len(contents) > 1:
             largest = max(range(len(contents) - 1), key=lambda index: page_set.total_size(self.copies[index].pages))
@@ -101,7 +101,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
 
 
 def since(scans: Sequence[Unacknowledged], mapped: Words, *, is_base: bool) -> tuple[Words, Words]:
-    """What these scans have named, in order, the last of which alone may be without position: written and cleared."""
+    """The pages that these scans have named, written and cleared. They are in order; only the last may be without position."""
     if is_base:
         scans = [one for one in scans[-1:] if one.position is None]
     if not scans:

@@ -16,7 +16,7 @@ from checkpoint.snapshot import process_tree
 
 
 class Pages(Struct, frozen=True):
-    """What a snapshot carries; the fields are those of ``checkpoint.model.Snapshot``.
+    """The pages that a snapshot carries; the fields are those of ``checkpoint.model.Snapshot``.
 
     Attributes:
         forgotten: its ``cleared``.
@@ -66,7 +66,7 @@ def _of_one(process: CapturedProcess, look: Look, *, is_base: bool) -> Pages:
     runs = page_set.page_runs(page_set.extents_of_addresses(addresses, abi.PAGE_SIZE))
     if is_base:
         forgotten: tuple[PageRun, ...] = ()
-    elif process.memory.acknowledged is None:  # what stood in its slot was another process's
+    elif process.memory.acknowledged is None:  # its slot held another process before
         forgotten = (process_tree.whole(process.slot),)
     else:
         forgotten = process_tree.shifted_runs(page_set.page_runs(page_set.union(taken.cleared, zero)), process.slot)

@@ -49,7 +49,7 @@ RAN_ON_MAX: Final = 3
 
 
 class Look(Struct, frozen=True):
-    """Everything that one freeze brought home of one process; nothing in it needs the process any more."""
+    """Everything that one freeze has read of one process; nothing in it needs the process any more."""
 
     standing: Standing
     taken: Taken
@@ -62,7 +62,7 @@ class Look(Struct, frozen=True):
 
 
 class Met(Struct, frozen=True):
-    """A process that was found, and may be stopped; whoever could not let go of it yet must keep this.
+    """A process that was found, and may be stopped. A holder that could not let go of the process yet must keep this object.
 
     Attributes:
         born: when it began, which tells it from a later process with its pid.
@@ -95,8 +95,8 @@ class CapturedProcess:
     """One process, followed from the entering to `close`.
 
     Attributes:
-        pid: by which it is looked at: its own, or its spokesman's, where its first thread has ended.
-        ended_first: who tells of that; None where the first thread lives.
+        pid: the id by which we look at it: its own, or its spokesman's, where its first thread has ended.
+        ended_first: tells the state of a first thread that has ended; None where it lives.
         slot: see `checkpoint.snapshot.process_tree`.
         born: when it began, which tells it from a later process with its pid.
         is_new: no snapshot tells of it yet.
@@ -150,7 +150,7 @@ class CapturedProcess:
         raise CaptureError(f"cannot enter pid {pid}: its threads end while failover examines it; try again")
 
     def has_lost_its_voice(self) -> bool:
-        """Whether the thread by which it is looked at has ended, and another lives by which it could be.
+        """Whether the thread by which we look at it has ended, and another one lives that can take its place.
 
         Where the first thread lives again, a spokesman has executed another program under its process's id.
 
@@ -183,7 +183,7 @@ class CapturedProcess:
 
     @property
     def files_kept(self) -> bool:
-        """Whether somebody keeps its program files by content."""
+        """Whether a store keeps its program files by content."""
         return self.order.names is not None
 
     def is_still(self, born: int) -> bool:
@@ -215,12 +215,12 @@ class CapturedProcess:
         return copied
 
     def rehearse(self) -> None:
-        """Ask, as far as that changes nothing, what `look` is going to ask, and forget the answers.
+        """Ask the questions of `look` that change nothing, and forget the answers.
 
-        What the processor has at hand, of our code, of the kernel's and of the page tables, it need not fetch while the program
+        So the processor has our code, the kernel's and the page tables in its caches, and need not fetch them while the program
         stands still; between two captures it has done other things.
         """
-        with contextlib.suppress(CheckpointError, OSError):  # whoever asks in earnest says why not
+        with contextlib.suppress(CheckpointError, OSError):  # `look` reports the cause
             self.onlooker.rehearse()
             self.memory.rehearse()
 
@@ -269,7 +269,7 @@ class CapturedProcess:
         return self.identities.vmas(look.taken.lines, self._flags.flags, look.taken.guards)
 
     def reasons(self, look: Look, kin: Collection[int] = ()) -> tuple[str, ...]:
-        """Why what it has turned into cannot be captured."""
+        """Why the process, as this look found it, cannot be captured."""
         try:
             self._flags.refresh(self.memory.lines)
             lines = look.taken.lines
@@ -297,15 +297,15 @@ class CapturedProcess:
         return tuple(reason for reason in reasons if reason)
 
     def known(self, resources: Iterable[Resource]) -> tuple[Resource, ...]:
-        """What it has open, by the names that it knows."""
+        """Its open files, by the names that it knows."""
         return tuple(map(self.identities.as_known, resources))
 
     def stopped(self) -> tuple[Resource, ...]:
-        """That it is stopped, of the first process at the last look; who waits for it is somebody else."""
+        """Whether the first process was stopped at the last look; the process that waits for it is no part of the component."""
         return job_control.describe(0 if self.order.is_guarded else self.threads.leader.stopped_by, 0)
 
     def unopened(self, look: Look) -> tuple[Resource, ...]:
-        """What no descriptor stands for: locks on what it will map, System V shared memory, what its threads may.
+        """Resources without a descriptor: locks on what it will map, System V shared memory, rights of its threads.
 
         Raises:
             CaptureError: one of its threads has just changed its rights.
@@ -332,7 +332,7 @@ class CapturedProcess:
         yield from ((other.place.inner_tid, other.death_signal) for other in standing.others)
 
     def _limits(self, standing: Standing) -> tuple[Resource, ...]:
-        """What its threads may, and what they are confined to.
+        """The rights of its threads, and what they are confined to.
 
         Raises:
             CaptureError: one of them has just changed that.

@@ -25,7 +25,7 @@ Life = tuple[int, int]
 
 
 class Confinements:
-    """Of one process."""
+    """The confinements of one process's threads."""
 
     def __init__(self, interruptions: Interruptions) -> None:
         self._interruptions = interruptions
@@ -36,7 +36,7 @@ class Confinements:
         self._known = {life: known for life, known in self._known.items() if life in lives}
 
     def suspended(self, tracee: Tracee, mode: int, life: Life) -> Confinement:
-        """Have nothing judge the calls of a thread until it is let go; what it is confined to.
+        """Suspend the filters of a thread until it is let go; answers with what it is confined to.
 
         Args:
             mode: of seccomp(2), or `FILTERED` where that is not known.
@@ -70,7 +70,7 @@ class Confinements:
 
 
 def _goes_on(found: Confinement) -> bool:
-    """Whether its filters let restart_syscall(2) through, whatever the registers hold."""
+    """Whether its filters let restart_syscall(2) through with any registers."""
     programs = [one.instructions for one in found.filters]
     return bpf.allows(programs, arch.SYSCALLS["restart_syscall"], arch.AUDIT_ARCHITECTURE, (0,) * 6)
 

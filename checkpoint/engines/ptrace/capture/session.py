@@ -240,7 +240,7 @@ class PtraceSession:
                 epoch_variable.renew(process.threads.leader.memory, stat.env_start, stat.env_end, epoch)
 
     def _speaks_by_another(self) -> bool:
-        """Where the thread has ended by which the first process is looked at, enter it by another: the next capture is a base.
+        """Enter the first process by another thread if the one by which we look at it has ended: the next capture is a base.
 
         Raises:
             UnsupportedError: it cannot be kept so (before Linux 6.9, or one of several processes); nothing was touched.
@@ -302,7 +302,7 @@ class PtraceSession:
                     raise self._over_budget(given_up) from late
 
     def _over_budget(self, given_up: int) -> CaptureError:
-        """What is said when no freeze of a capture fits the budget."""
+        """The message when no freeze of a capture fits the budget."""
         coming_ns = self._budget.overrun_in_ns()
         cure = "raise freeze_budget_ms, or set freeze_overrun_s"
         if coming_ns is not None:
@@ -313,10 +313,10 @@ class PtraceSession:
         )
 
     def _copied_running(self, order: CaptureOrder, copied: RunningCopy | None, *, base: bool) -> RunningCopy:
-        """What is copied of the first process before the freeze; those of the others are kept by the tree.
+        """The copy of the first process before the freeze; the tree keeps those of the others.
 
         Args:
-            copied: before a freeze that came to nothing.
+            copied: the copy before a failed freeze.
         """
         enough = self._enough()
         self._first.memory.readers = parallel.thread_count() if order.hold else 1  # it is not to run on by itself
@@ -330,7 +330,7 @@ class PtraceSession:
         return max(1, self._budget.page_count // (1 + len(self._tree.processes()))) if self._budget else 0
 
     def _look_from_outside(self) -> None:
-        """What was refused once is looked at without stopping it: a program that has an epoll for a week is left in peace."""
+        """Look at a refused program without stopping it: a program that keeps an epoll for a week is left in peace."""
         with contextlib.suppress(ProcessGoneError, ProbeError):
             reasons = probe.reasons_of(self.pid, self._surroundings, files_kept=self._first.files_kept)
             self._refuse(

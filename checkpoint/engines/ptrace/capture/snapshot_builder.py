@@ -1,4 +1,4 @@
-"""Build a snapshot of what a freeze brought home, while the program runs again: refusals, resources, pages, digest."""
+"""Build a snapshot from the result of a freeze, while the program runs again: refusals, resources, pages, digest."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class SnapshotBuilder:
         surroundings: Surroundings,
         detached: DetachedMemory,
     ) -> Snapshot | UnreadBase:
-        """The snapshot of what a freeze brought home.
+        """The snapshot from the result of a freeze.
 
         Raises:
             UnsupportedError: it cannot be kept, with the reasons.

@@ -89,7 +89,7 @@ class Standstill:
         return self.longest_us
 
     def raise_if_late(self, error: BaseException) -> None:
-        """Whatever goes wrong with a capture when its time is over goes wrong because of that; but an end is an end.
+        """An error of a capture whose time is over counts as lack of time; only the program's end stays its end.
 
         Raises:
             OverBudgetError: the time is over.

@@ -91,7 +91,7 @@ class Interruption:
         if self.begins_anew and not tracee.is_as_found:
             tracee.set_registers(anew)
             return anew
-        tracee.left_alone = anew  # who gives itself everything back has the kernel forget what it would go on with
+        tracee.left_alone = anew  # a thread that restores itself has the kernel forget the call that it would go on with
         return registers
 
     def remembers(self, registers: bytes) -> bool:
@@ -136,7 +136,7 @@ class Interruption:
         return _again(registers, number)
 
     def _interrupted(self, registers: Registers, number: int) -> tuple[int, Registers]:
-        """The call itself, and the registers with which it waits for what is left of its time."""
+        """The call itself, and the registers with which it waits for the rest of its time."""
         place = tuple(registers[name] for name in _OF_PLACE)
         if number == _RESTART:
             number = self._number if place == self._place else self._read_from_code(registers[arch.INSTRUCTION_POINTER] + _BEHIND)
@@ -158,7 +158,7 @@ class Interruption:
 
 
 class Interruptions:
-    """Those of all threads of one process."""
+    """The interruptions of all threads of one process."""
 
     def __init__(self, *, makes_again: bool = False) -> None:
         """
@@ -169,7 +169,7 @@ class Interruptions:
         self._by_tid: dict[int, Interruption] = {}
 
     def of(self, tracee: Tracee) -> Interruption:
-        """Of one thread."""
+        """The interruption of one thread."""
         if tracee.pid not in self._by_tid:
             self._by_tid[tracee.pid] = Interruption(tracee.memory, makes_again=self._makes_again)
         return self._by_tid[tracee.pid]

@@ -50,7 +50,7 @@ from checkpoint.snapshot import process_tree
 ENDING_S: Final = 0.2
 """How long a process that is about to end may take."""
 QUIET_LISTINGS: Final = 2
-"""Listings without anybody new that are believed: one may leave somebody out whose sibling ends just then (fs/proc/array.c)."""
+"""Listings in a row without a new process that are believed: one may omit a process whose sibling ends (fs/proc/array.c)."""
 NAMESPACES: Final = ("pid", "mnt", "user", "net", "ipc", "uts", "cgroup", "time")
 
 
@@ -82,11 +82,11 @@ class SeenProcess(Struct, frozen=True):
 
 
 class SeenOthers(Struct):
-    """What one freeze brought home of all processes besides the first.
+    """The result of one freeze, of all processes besides the first.
 
     Attributes:
-        opened: what every process has open, the first one's included.
-        taken: what was seen of each.
+        opened: the open files of every process, the first one's included.
+        taken: the look at each.
         later: those that are still to be described, by `describe`.
     """
 
@@ -98,7 +98,7 @@ class SeenOthers(Struct):
 
     @property
     def pids(self) -> frozenset[int]:
-        """Of all processes, the first one included, as we see them."""
+        """The pids of all processes, the first one included, as we see them."""
         return frozenset(self.opened)
 
     @property
@@ -107,7 +107,7 @@ class SeenOthers(Struct):
         return functools.reduce(operator.or_, (look.xstate_mask for _, look in self.taken), 0)
 
     def describe(self) -> None:
-        """Say what is still to be said; they may run.
+        """Tell the rest; they may run.
 
         Raises:
             MovedError: one is not what it was any more.
@@ -123,11 +123,11 @@ class SeenOthers(Struct):
         self.later.clear()
 
     def looks(self) -> list[tuple[CapturedProcess, Look]]:
-        """What was seen of each."""
+        """The look at each."""
         return self.taken
 
     def resources(self) -> tuple[Resource, ...]:
-        """What all of them have open."""
+        """The open files of all of them."""
         return tuple(held for seen in self.processes for held in seen.held.resources)
 
     def _inner(self, first: Look) -> dict[int, int]:
@@ -159,7 +159,7 @@ class SeenOthers(Struct):
         )
 
     def zombies(self, first: Look) -> tuple[Zombie, ...]:
-        """Those that have ended."""
+        """The processes that have ended."""
         inner = self._inner(first)
         return tuple(
             Zombie(
@@ -183,10 +183,10 @@ class SeenOthers(Struct):
 
 
 def _going_on(seen: SeenProcess, continued: Collection[int]) -> tuple[Resource, ...]:
-    """That a process goes on, of which its parent has not been told.
+    """The resource for a process that has continued while its parent has not been told so.
 
     Args:
-        continued: the children of whom that is known, as the component sees them.
+        continued: the children of which that is known, as the component sees them.
     """
     is_stopped = job_control.stop_of(seen.unopened) is not None
     return (job_control.going_on(),) if seen.status.pids[-1] in continued and not is_stopped else ()
@@ -215,13 +215,13 @@ class CapturedTree:
         self._met.clear()
 
     def follow(self, first: CapturedProcess) -> None:
-        """The first process is looked at anew."""
+        """Use a new object for the first process, which was entered anew."""
         self._first = first
         for process in self._known.values():
             process.memory.buffer, process.memory.budget = first.memory.buffer, first.memory.budget
 
     def processes(self) -> tuple[CapturedProcess, ...]:
-        """Those that are followed."""
+        """The processes that are followed."""
         return tuple(self._known.values())
 
     def acknowledge(self, position: Position) -> None:
@@ -312,7 +312,7 @@ class CapturedTree:
         """As `MemoryCapture.copy_running`, with as many pages left of each of them.
 
         Args:
-            again: what was copied for a freeze that came to nothing is carried on.
+            again: go on with the copy that was made for a failed freeze.
         """
         before, self._copied = self._copied if again else {}, {}
         for pid, process in tuple(self._known.items()):
@@ -328,13 +328,13 @@ class CapturedTree:
     # The freeze
 
     def stand_still(self) -> bool:
-        """Stop everybody else, now that the first process stands; whether there is anybody.
+        """Stop all other processes, now that the first one stands; answers whether there are any.
 
         Raises:
             MovedError: one of them does not stop.
         """
         first = self._first.threads
-        followed = self._standing or self._known  # one may have become an orphan since, whom a glance does not find
+        followed = self._standing or self._known  # one may have become an orphan since: a glance does not find it
         if not followed and not self._kin.has_others([first.pid, *(tracee.pid for tracee in first.others)]):
             return False
         ended = set(self._ended)
@@ -373,7 +373,7 @@ class CapturedTree:
         return True
 
     def thaw(self) -> None:
-        """Let everybody go."""
+        """Let all processes go."""
         standing, self._standing = self._standing, {}
         self._ended = []
         for threads in standing.values():
@@ -387,7 +387,7 @@ class CapturedTree:
     # While they stand
 
     def begin_look(self) -> SeenOthers:
-        """What all have open, and who has ended."""
+        """The open files of all, and the processes that have ended."""
         pids = [self._first.pid, *self._standing]
         try:
             opened = shared_descriptions.together({pid: gather(pid, owners=self._owners_of(pid)) for pid in pids})
@@ -397,7 +397,7 @@ class CapturedTree:
         return SeenOthers(opened, ended)
 
     def _owners_of(self, pid: int) -> Owners | None:
-        """What is known of who has owners there; None of a process that was never looked at."""
+        """The known owners of a process's files' signals; None of a process that was never looked at."""
         known = self._first if pid == self._first.pid else self._known.get(pid)
         return known.onlooker.owners if known else None
 
@@ -405,7 +405,7 @@ class CapturedTree:
         """Everything that needs them to stand still.
 
         Args:
-            first: what was seen of the first process.
+            first: the look at the first process.
             surroundings: of that.
         """
         outside = standard_streams.of_first(first.standing.opened, surroundings)
@@ -468,7 +468,7 @@ def _is_same(known: CapturedProcess) -> bool:
 
 @contextlib.contextmanager
 def _gone_if_ended(pid: int) -> Iterator[None]:
-    """Whatever goes wrong with a process that has ended goes wrong because of that."""
+    """Turn any error about a process that has ended into its end."""
     try:
         yield
     except (CheckpointError, FileNotFoundError, ProcessLookupError) as error:
@@ -546,7 +546,7 @@ def _told_of(process: CapturedProcess, look: Look, around: Surroundings, stopped
 
 
 def _joint(look: Look, seen: SeenOthers) -> tuple[Resource, ...]:
-    """What one shares with its parent, which is one of them."""
+    """The things that one shares with its parent, if that is one of them."""
     status = look.standing.status
     return shared_with_parent.describe(status.pids[0], status.ppid) if status.ppid in seen.pids else ()
 

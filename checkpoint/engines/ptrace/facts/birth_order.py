@@ -70,7 +70,7 @@ CAPABILITIES: Final = (
 
 SIGCHLD: Final = 17
 GENERATIONS_MAX: Final = 200
-"""In how many generations processes may descend from one another: whoever gives birth to one plans for its children, too."""
+"""In how many generations processes may descend from one another: the plan of a birth calls itself for the children."""
 
 
 class Birth(Struct, frozen=True):
@@ -123,7 +123,7 @@ Step = Birth | NewSession | Join | End | Reaper
 
 
 class Person(Struct, frozen=True):
-    """What matters of a process here; pids are as the component sees them."""
+    """The facts of a process that matter here; pids are as the component sees them."""
 
     pid: int
     ppid: int
@@ -134,14 +134,14 @@ class Person(Struct, frozen=True):
 
 
 class NoWayError(RestoreError):
-    """Processes that cannot be born into what they were in."""
+    """Processes that cannot be born into the sessions and groups that they were in."""
 
 
 def steps_of(state: Snapshot, is_taken: Callable[[int], bool]) -> list[Step]:
     """Every step, beginning with the first process alone.
 
     Args:
-        is_taken: whether somebody else has a pid, so that nobody can stand in for a leader who had it.
+        is_taken: whether another process has a pid, so that no process can stand in for a leader that had it.
 
     Raises:
         NoWayError: there is none.
@@ -150,7 +150,7 @@ def steps_of(state: Snapshot, is_taken: Callable[[int], bool]) -> list[Step]:
 
 
 def spare_pids(state: Snapshot, end: int) -> Iterator[int]:
-    """Pids below ``end`` that nobody of the component is known by, the highest first: those above its own are lent next."""
+    """Pids below ``end`` that no process of the component uses, the highest first: those above its own are lent next."""
     persons = [_person(state.process), *_persons(state.members, state.zombies)]
     wanted = {number for one in persons for number in (one.pid, one.pgid, one.sid)} | _thread_ids(state)
     return (number for number in range(end - 1, 1, -1) if number not in wanted)
@@ -175,13 +175,13 @@ def refuse(first: Status, members: Sequence[Member], zombies: Sequence[Zombie], 
 
     Args:
         first: of the first process.
-        is_taken: whether a pid, as they see it, is that of anybody.
+        is_taken: whether a process has this pid, as they see it.
     """
     yield from refuse_persons(first, _persons(members, zombies), is_taken)
 
 
 def refuse_persons(first: Status, others: Sequence[Person], is_taken: Callable[[int], bool]) -> Iterator[str]:
-    """The same of those of whom no more is known."""
+    """As `refuse`, for processes of which only these numbers are known."""
     try:
         steps(Person(first.pids[-1], 0, first.pgids[-1], first.sids[-1]), others, is_taken)
     except NoWayError as error:
@@ -189,7 +189,7 @@ def refuse_persons(first: Status, others: Sequence[Person], is_taken: Callable[[
 
 
 def persons(statuses: Sequence[Status]) -> list[Person]:
-    """All of these processes, but for what they are known by outside of their namespace."""
+    """All of these processes, by the numbers of their own namespace."""
     inner = {status.pids[0]: status.pids[-1] for status in statuses}
     return [Person(one.pids[-1], inner.get(one.ppid, 0), one.pgids[-1], one.sids[-1]) for one in statuses]
 
@@ -211,7 +211,7 @@ def _wanted(person: Person) -> Wanted:
 
 
 def _wanted_of(first: Person, others: Sequence[Person]) -> Iterator[Wanted]:
-    """Of all but the first, and of leaders that have ended."""
+    """The wanted states of all but the first, and of leaders that have ended."""
     yield from map(_wanted, others)
     there = {first.sid, first.pid, *(one.pid for one in others)}
     yield from (Wanted(session, 0, session) for session in sorted({one.sid for one in others} - there))
@@ -231,8 +231,8 @@ class _Plan(Struct):
 
     Attributes:
         session: the one that a process is in by now.
-        given: children that were somebody else's first, with the parents that they were given to.
-        standins: who stands for the leader of a session that has ended, and is not ended itself yet; their parents.
+        given: children that had another parent first, with the parents that they were given to.
+        standins: processes that stand for a session's ended leader, and are not ended themselves yet; their parents.
     """
 
     first: Person
@@ -252,7 +252,7 @@ class _Plan(Struct):
             self._bear_orphan(orphan)
         self._give_all()
         for person in self.others:
-            assert person.pid in self.session, "everybody has a parent, or none that lives"
+            assert person.pid in self.session, "each process has a parent, or none that lives"
         self._group()
         for pid, parent in reversed(self.standins.items()):
             self.steps.append(End(parent, pid))
@@ -278,7 +278,7 @@ class _Plan(Struct):
         return self._needs[person.pid]
 
     def _needed_by_leader(self, person: Person) -> int | None:
-        """The same of who has left that session since: what its children are of that were not given to it."""
+        """The same of a process that has left that session since: the session of its children that were not given to it."""
         older = {need for child in self._children[person.pid] if (need := self._needed(child)) not in (None, person.pid)}
         if older:
             beyond = (session for session in older if self._reaches_beyond(session, person.pid))
@@ -288,7 +288,7 @@ class _Plan(Struct):
         return next(iter(older), None)
 
     def _sessions_of_ancestors(self, person: Person) -> set[int]:
-        """Those that a process was born in, unless it was given to its parent later."""
+        """The sessions that a process was born in, unless it was given to its parent later."""
         found = set()
         while person.ppid in self._everybody:
             person = self._everybody[person.ppid]
@@ -325,10 +325,10 @@ class _Plan(Struct):
         self.steps.append(Birth(parent, pid, exit_signal, flags))
         self.session[pid] = self.session[parent]
 
-    # Who has lost somebody
+    # Processes that have lost their parent or the leader of their session
 
     def _give_all(self) -> None:
-        """Have those born that were given to their parents, as far as somebody of their session is there."""
+        """Have those born that were given to their parents; first those whose session the plan has already."""
         while self.given:
             parent, child = next((one for one in self.given if self._can_give(one[1])), self.given[0])
             self.given.remove((parent, child))
@@ -341,7 +341,7 @@ class _Plan(Struct):
     def _give(self, parent: int, child: Person) -> None:
         """By a stand-in for the parent that has ended, below the one that was given the child then."""
         session = self._needed(child)
-        assert session is not None, "who may be born anywhere is born by its parent"
+        assert session is not None, "a process that may be born anywhere is born by its parent"
         if child.flags:
             raise NoWayError(f"process {child.pid} shares its open files or directory with a parent that it was given to later")
         if session not in self._everybody and session not in self.standins:
@@ -382,7 +382,7 @@ class _Plan(Struct):
         self.steps.append(End(source, parent))
 
     def _in_session(self, session: int | None) -> int:
-        """Who may give birth in a session: its leader, a stand-in for it, or the first process for its own."""
+        """The process that may give birth in a session: its leader, a stand-in for it, or the first process for its own."""
         if session is None or session == self.session[self.first.pid]:
             return self.first.pid
         if session not in self._everybody and session not in self.standins:
@@ -394,10 +394,10 @@ class _Plan(Struct):
     # At places
 
     def made_at(self, places: Places) -> list[Step]:
-        """As `made`, with everybody born at a place, and given to its parent when all are born.
+        """As `made`, with every process born at a place, and given to its parent when all are born.
 
         Raises:
-            NoWayError: a place is of no use: its number is taken, or who is born there shares something with its parent.
+            NoWayError: a place is of no use: its number is taken, or the process shares something with its parent.
         """
         self._begin()
         below = defaultdict(list)
@@ -426,7 +426,7 @@ class _Plan(Struct):
                 self._bear_at(pid, child, below, places, ends)
 
     def _bear_at(self, source: int, pid: int, below: Mapping[int, list[int]], places: Places, ends: list[Step]) -> None:
-        """Whoever is borne by a stand-in is given to its parent at the end, when all below it have been."""
+        """Plan one birth. A stand-in's child is given to its parent at the end, when all below it have been."""
         person = self._everybody.get(pid)
         if person is None:
             if self.is_taken(pid):
@@ -452,7 +452,7 @@ class _Plan(Struct):
     # Groups
 
     def _group(self) -> None:
-        """Everybody to its group, whose leader makes it first."""
+        """Put each process into its group; the group's leader makes it first."""
         ours = {self.first.pid: self.session[self.first.pid], **self.session}
         waiting = []
         left = {person.pgid for person in self.others} & {one.pid for one in self.others if one.pgid != one.pid}
@@ -462,7 +462,7 @@ class _Plan(Struct):
                 self.steps.append(Join(person.pid, person.pid))
             if person.pid in left or (not makes_group and person.pgid not in (person.pid, self._inherited(person))):
                 waiting.append(person)
-        waiting.sort(key=lambda one: one.pid in left)  # who has left the group that it made goes last
+        waiting.sort(key=lambda one: one.pid in left)  # a process that has left the group that it made goes last
         for person in waiting:
             if person.pgid not in self._everybody and person.pgid not in self.standins:
                 source = self._in_session(ours[person.pid])

@@ -26,7 +26,7 @@ ATTEMPTS_MIN: Final = 50
 
 
 class Wanted(Struct, frozen=True):
-    """What a process must be when all are born.
+    """The state that a process must have when all are born.
 
     Attributes:
         parent: 0: none of them.
@@ -47,7 +47,7 @@ class Place(Struct, frozen=True):
     """Where a process is born.
 
     Attributes:
-        below: who bears it, or a stand-in for it.
+        below: the process that bears it, or a stand-in for it.
         session: in which; None: of a leader, in any.
     """
 
@@ -62,7 +62,7 @@ class _Search:
     """One search.
 
     Attributes:
-        first: who is there already, in its session, above all others.
+        first: the process that is there already, in its session, above all others.
     """
 
     def __init__(self, first: Wanted, others: Mapping[int, Wanted]) -> None:
@@ -105,28 +105,28 @@ class _Search:
         return self._first.pid if session == self._first.session else session
 
     def _is_tree(self, places: Places) -> bool:
-        """Whether the first process is above everybody."""
+        """Whether the first process is above all others."""
         for pid in places:
             if not any(above == self._first.pid for above in itertools.islice(self._above(places, pid), len(places) + 1)):
                 return False
         return True
 
     def _above(self, places: Places, pid: int) -> Iterator[int]:
-        """Who lies on the way up, itself first; the first process is the last."""
+        """The processes on the way up, itself first; the first process is the last."""
         yield pid
         while pid != self._first.pid:
             pid = places[pid].below
             yield pid
 
     def _wrong(self, places: Places) -> list[int]:
-        """Who has its parent nowhere above it."""
+        """The processes whose parent is nowhere above them."""
         parents = ((one.pid, one.parent) for one in self._others.values() if one.parent in self._all)
         return [
             pid for pid, parent in parents if places[pid].below != parent and parent not in self._above(places, places[pid].below)
         ]
 
     def _mended(self, places: Places, pid: int) -> Iterator[Places]:
-        """What may bring the parent of a process above it: it, or somebody above it, is born below that parent instead."""
+        """Places that may bring the parent of a process above it: it, or one above it, is born below that parent instead."""
         parent = self._all[self._all[pid].parent]
         above_parent = set(self._above(places, parent.pid))
         for moved in self._above(places, pid):

@@ -74,7 +74,7 @@ def this_machine() -> Machine:
 
 @functools.cache
 def _vdso_digest() -> bytes:
-    """Of our own, which stays the same as long as we live; a restore asks for it three times a process."""
+    """The digest of our own vdso, which stays the same as long as we live; a restore asks for it three times a process."""
     own = os.getpid()
     for line in procfs.parse_maps(procfs.read_text(own, "maps")):
         if line.name == "[vdso]":

@@ -61,7 +61,7 @@ class Identities:
         self._without_name: dict[tuple[int, int, str], tuple[int, frozenset[int]]] = {}
         self._found = Memo[tuple[Vma, ...]]()
         self._sees_sizes = False
-        """Of a shared object that is mapped nothing tells the size but itself."""
+        """Whether sizes are read: only a mapped shared object itself tells its size."""
 
     def vmas(self, lines: Sequence[MapsLine], flags: Mapping[int, tuple[str, ...]], guards: Words) -> tuple[Vma, ...]:
         """The mappings as the model has them.
@@ -92,7 +92,7 @@ class Identities:
         living = self._living_name(line)
         is_shared_huge = is_told and line.name.startswith(HUGE_NAME)
         is_file = not is_shared_huge and line.has_file and line.name not in NOT_CARRIED and not line.name.startswith("/dev/zero")
-        if is_shared_huge:  # by relatives, who can have it as ordinary memory alone
+        if is_shared_huge:  # by relatives, which can have it as ordinary memory alone
             flags = tuple(flag for flag in flags if flag not in (vm_flags.HUGE, vm_flags.GIGANTIC))
         return Vma(
             start=line.start,
@@ -107,7 +107,7 @@ class Identities:
         )
 
     def _is_told(self, line: MapsLine) -> bool:
-        """Whether it must be told which shared memory without a file this is: it is mapped elsewhere, too."""
+        """Whether the snapshot must tell which shared memory without a file this is: it is mapped in other places, too."""
         return line.shared and (bool(self.kin) or line.inode in self._mapped_twice)
 
     def of_mapping(self, line: MapsLine, living: str = "") -> FileIdentity:
@@ -133,7 +133,7 @@ class Identities:
     def _living_name(self, line: MapsLine) -> str:
         """The name by which shared memory of a file is told, where it is not the one by which it was mapped; "" for all others.
 
-        A private mapping of what was deleted is told by its pages alone.
+        A private mapping of a deleted file is told by its pages alone.
         """
         is_gone = line.name.endswith(DELETED)
         if not line.shared or not line.name.startswith("/") or not (is_gone or line.name.startswith(MEMORY_PLACE)):
@@ -160,7 +160,7 @@ class Identities:
         return self._pid, *sorted(self.kin - {self._pid})
 
     def _place(self, line: MapsLine) -> str:
-        """Where the very file that is mapped is read: its name may lead elsewhere by now, to what we may read and it may not."""
+        """A path to the very file that is mapped: its name may lead by now to another file, which we may read and it may not."""
         is_detached = (line.device, line.inode) in self.detached
         named = f"{procfs.outlook(self._pid)}{line.name.removesuffix(DELETED) if is_detached else line.name}"
         with contextlib.suppress(OSError):  # it is gone, or closed to us
@@ -249,7 +249,7 @@ def _mapped_twice(lines: Iterable[MapsLine]) -> frozenset[int]:
 
 
 def _of_shared(line: MapsLine) -> FileIdentity:
-    """What tells anonymous shared memory (MAP_SHARED) from other such memory."""
+    """The identity that tells anonymous shared memory (MAP_SHARED) from other such memory."""
     return FileIdentity(line.name.removesuffix(DELETED), line.device, line.inode, deleted=True)
 
 

@@ -33,7 +33,7 @@ CAPABILITIES: Final = (
 )
 
 COPIES: Final = 2
-"""Of everything, in a keeper that takes a base: as it was read, and in the order of the snapshot."""
+"""A keeper that takes a base holds everything twice: as it was read, and in the order of the snapshot."""
 
 GB: Final = 10**9
 _KIB: Final = 1024
@@ -49,9 +49,9 @@ def free() -> int:
 
 
 def held(pid: int) -> int:
-    """Bytes of a process's private memory, whoever has it in common since a fork; 0 of one that has ended.
+    """Bytes of a process's private memory, pages shared since a fork included; 0 of a process that has ended.
 
-    Shared memory is copied once, whoever has mapped it.
+    Shared memory is copied once, for all processes that map it.
     """
     try:
         return _added(_COPIED, procfs.read_text(pid, "status"))
@@ -76,7 +76,7 @@ def refuse_capture(pids: Iterable[int]) -> tuple[str, ...]:
 
 
 def refuse_restore(state: Snapshot) -> tuple[str, ...]:
-    """Why a base of several processes cannot be brought back here."""
+    """Why a base of several processes cannot be restored here."""
     if not state.copies:
         return ()
     size, room = len(memoryview(state.contents).cast("B")) + sum(copy.size for copy in state.copies), free()

@@ -37,7 +37,7 @@ GET_REGISTRATIONS: Final = 1 << 9
 
 NAMES: Final = {
     PR_SET_TSC: "the switch of the time stamp counter",
-    PR_MCE_KILL: "what a broken page of memory does",
+    PR_MCE_KILL: "the policy for a broken page of memory",
     PR_SET_SPECULATION_CTRL: "a limit on speculation",
     PR_SET_MEMORY_MERGE: "the merging of equal pages",
     abi.PR_SET_THP_DISABLE: "where there are no transparent huge pages",
@@ -47,7 +47,7 @@ NAMES: Final = {
 """Every switch that is kept, in the order in which they are set: the last one forbids what a restore itself does."""
 
 OF_THREADS: Final = (PR_SET_TSC, PR_MCE_KILL, PR_SET_SPECULATION_CTRL)
-"""Those that each thread has for itself. All are given what the first one has."""
+"""Switches that each thread has for itself. A restore gives all threads the first one's."""
 
 Switch = tuple[int, int, int]
 

@@ -50,7 +50,7 @@ def probe(pid: int, surroundings: Surroundings | None = None, *, files_kept: boo
         verb: what the user asked for, as a refusal says it.
 
     Raises:
-        ProbeError: there is no such process, it is no program, somebody traces it, or we may not look.
+        ProbeError: there is no such process, it is no program, another process traces it, or we may not look.
     """
     try:
         around = surroundings or surroundings_of(pid, None)
@@ -118,10 +118,10 @@ def _with_detached(kin: Iterable[int], surroundings: Surroundings) -> tuple[Surr
 
 
 def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, ...], shared_descriptions.OpenedByAll]:
-    """The processes of a component that live, and what they have open; again where some came or went meanwhile.
+    """The living processes of a component and their open files; looked up again where some came or went meanwhile.
 
     Args:
-        first: by which that of ``pid`` is looked at; it stands for it.
+        first: the id by which we look at the process ``pid``; it stands for that.
     """
     stubborn: set[int] | None = None
     for _ in range(LOOKS):
@@ -132,7 +132,7 @@ def _all_opened(pid: int, first: int, *, is_guarded: bool) -> tuple[tuple[int, .
         if kin == _kin(pid, first, is_guarded=is_guarded) and not young:
             break
         time.sleep(LOOK_PAUSE_S)
-    about_to = young - (stubborn or set())  # they will be what they are to be when somebody stops them
+    about_to = young - (stubborn or set())  # a capture that stops them later finds their new programs
     return tuple(one for one in kin if one not in about_to), {one: held for one, held in opened.items() if one not in about_to}
 
 
@@ -144,7 +144,7 @@ def _has_still_to_execute(pid: int) -> bool:
 
 
 def _opened(kin: tuple[int, ...]) -> shared_descriptions.OpenedByAll:
-    """What each of these has open; one that ends meanwhile is left out, but for the first."""
+    """The open files of each of these; one that ends meanwhile is left out, but for the first."""
     if len(kin) == 1:
         return {kin[0]: Opened(glance(kin[0]))}
     known = Kin(terminals=pseudo_terminals.masters([held for pid in kin for held in _gathered(pid)]))
@@ -172,7 +172,7 @@ def _kin(pid: int, first: int, *, is_guarded: bool) -> tuple[int, ...]:
 
 
 def _looked(opened: shared_descriptions.OpenedByAll, first: int, surroundings: Surroundings) -> dict[int, Held]:
-    """What each process has open, sorted into the kinds."""
+    """The open files of each process, sorted into the kinds."""
     around = replace(
         surroundings, pipes={**standard_streams.of_first(opened[first], surroundings), **surroundings.pipes}, is_first=False
     )
@@ -182,7 +182,7 @@ def _looked(opened: shared_descriptions.OpenedByAll, first: int, surroundings: S
 def _others_findings(
     opened: shared_descriptions.OpenedByAll, process: int, first: int, looked: Mapping[int, Held], *, detaches: bool
 ) -> Iterator[Finding]:
-    """What stands against the processes besides the first; one that ends meanwhile does not."""
+    """Reasons against the processes besides the first; none against one that ends meanwhile."""
     if first != process and len(opened) > 1:
         yield Finding("process", "threads", REFUSED, refused_threads.OF_SEVERAL)
     for pid, held in looked.items():
@@ -194,7 +194,7 @@ def _others_findings(
 
 
 def _against(pid: int, opened: shared_descriptions.OpenedByAll, detaches: bool) -> tuple[str, ...]:
-    """What stands against a process besides the first, but for what it has open."""
+    """Reasons against a process besides the first, without those of its open files."""
     try:
         reasons = list(refusals.refuse_process(pid, procfs.status(pid), tuple(opened), detaches_memory=detaches))
         mapped = _Mapped.by(pid)
@@ -225,7 +225,7 @@ def _births_refused(first: int) -> tuple[str, ...]:
 
 
 def surroundings_of(pid: int, streams: Streams | None, terms: Terms = NO_TERMS, *, may_repeat: bool = True) -> Surroundings:
-    """What the kinds of resources must know about a process, its guard and its operator's rules.
+    """The facts about a process, its guard and its operator's rules that the kinds of resources must know.
 
     Raises:
         ProbeError: that is no process.
@@ -251,10 +251,10 @@ def _require_permission(pid: int, status: Status) -> None:
 
 
 def _await_execution(pid: int) -> None:
-    """Until the program is there that a process is just becoming: who starts one is let go on by execve(2) before it has a vdso,
-    arguments or variables, the last of which the kernel notes last. A program whose file comes slowly is looked at as it is.
+    """Wait until a process has the program that it executes. execve(2) lets the starter go on before that program has a vdso,
+    arguments or variables; the kernel notes the variables last. A program whose file comes slowly is looked at as it is.
 
-    Source: create_elf_tables() in fs/binfmt_elf.c; begin_new_exec() in fs/exec.c closes what is to be closed long before.
+    Source: create_elf_tables() in fs/binfmt_elf.c; begin_new_exec() in fs/exec.c closes descriptors (close-on-exec) long before.
     """
     deadline = time.monotonic() + EXECUTION_S
     while not (stat := procfs.stat(pid)).env_end and stat.state not in "ZX" and time.monotonic() < deadline:
@@ -265,19 +265,19 @@ def _process_findings(pid: int, status: Status, kin: tuple[int, ...], files_kept
     for reason in refusals.refuse_process(pid, status, kin, files_kept=files_kept, detaches_memory=detaches):
         yield Finding("process", f"pid {pid}", REFUSED, reason)
     if status.ppid and len(status.pids) == 1:
-        text = "its PID is kept where it is free on the other side: failover run gives a program a PID namespace of its own"
+        text = "its PID is kept where it is free on the other robot: failover run gives a program a PID namespace of its own"
         yield Finding("process", f"pid {pid}", NOTED, text)
 
 
 def _root_findings(pid: int) -> Iterator[Finding]:
-    """What whoever brings it back must be allowed to do."""
+    """Rights that a restore of it needs."""
     if (root := procfs.read_link(pid, "root")) != "/":
         text = f"its root directory is {root}: to enter that again takes CAP_SYS_CHROOT (an agent of root, and a program of root)"
         yield Finding("process", "root", NOTED, text)
 
 
 def _processor_findings(pid: int) -> Iterator[Finding]:
-    """What another robot's processor must have."""
+    """The features that another robot's processor must have."""
     level = cpu_baseline.level_in(procfs.read_bytes(pid, "environ"))
     if level:
         yield Finding("process", "processor", KEPT, f"started for {level}: it can resume on such processors")
@@ -287,7 +287,7 @@ def _processor_findings(pid: int) -> Iterator[Finding]:
 
 
 class _Mapped(Struct, frozen=True):
-    """What a process has mapped.
+    """The mappings of a process.
 
     Attributes:
         flags: VmFlags by start, without those that our own write protection sets.

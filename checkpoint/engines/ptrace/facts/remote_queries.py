@@ -28,7 +28,7 @@ CHILD_SIZE: Final = 32
 
 
 class Told(Struct, frozen=True):
-    """What the process said about itself; the fields are those of ``checkpoint.model``.
+    """The answers of the process about itself; the fields are those of ``checkpoint.model``.
 
     Attributes:
         continued_child: one of its children that goes on after a stop, and of which it has not been told, as it knows it; or 0.
@@ -99,7 +99,7 @@ class Inquiry:
         return self._filled(32, lambda address: ("rt_sigaction", signal, 0, address, abi.SIGSET_SIZE))
 
     def _writes(self, size: int, name: str, *arguments: int) -> int:
-        """A call whose last argument points to what it writes; answers with that address."""
+        """A call whose last argument points to its output; answers with that address."""
         return self._filled(size, lambda address: (name, *arguments, address))
 
     def _filled(self, size: int, call: Callable[[int], tuple[str | int, ...]]) -> int:

@@ -121,8 +121,8 @@ class Brought(Struct, frozen=True):
     """Contents that are opened in place of this machine's own files, by the paths that the program knows.
 
     Attributes:
-        run: the executable, and what is mapped.
-        opened: what is open for reading.
+        run: the executable, and mapped files.
+        opened: files that are open for reading.
     """
 
     run: Mapping[str, str] = field(default_factory=dict)
@@ -130,10 +130,11 @@ class Brought(Struct, frozen=True):
 
 
 def require(state: Snapshot, options: RestoreOptions, *vessel_pids: int) -> tuple[Brought, ...]:
-    """Refuse a snapshot that cannot come back here; answers with what must come from elsewhere than its own path, by process.
+    """Refuse a snapshot that cannot come back here; answers with the files not to take from their own path, by process.
 
     Args:
-        vessel_pids: what is to become the program; they, we and our forebears may hold files that the program writes to.
+        vessel_pids: the processes that are to become the program; they, we and our ancestors may hold files that the program
+            writes to.
 
     Raises:
         MismatchError: with one reason for each difference.
@@ -159,7 +160,7 @@ def _compare(
     digest_of: DigestOf = digest_of_file,
     content_at: ContentAt | None = None,
 ) -> tuple[tuple[str, ...], Brought]:
-    """Everything in which this machine differs from what the snapshot needs, one sentence each; and what was brought for it.
+    """Everything in which this machine differs from the snapshot's needs, one sentence each; and the files brought for it.
 
     Args:
         content_at: None: its memory is not known, nor whether the vdso that it was born with can be led to ours.
@@ -178,10 +179,10 @@ def _compare(
 
 
 def lacks(outline: Snapshot, options: RestoreOptions, digest_of: DigestOf) -> tuple[str, ...]:
-    """What this machine lacks of what a program needs that still runs elsewhere, one sentence each.
+    """What this machine lacks for a program that still runs on another one, one sentence each.
 
-    What it writes to may change until it comes: of that only whether it is there is looked at, and who else writes to it. Not
-    asked is whether a vdso without its content can be led to ours (`require` does).
+    Files that the program writes may change until it comes: of those we look only whether they are there, and which other
+    processes write to them. Whether a vdso without its content can be led to ours is left to `require`.
 
     Args:
         outline: of its newest snapshot, which may be a delta.
@@ -276,7 +277,7 @@ def own_kernel_pages() -> list[procfs.MapsLine]:
 
 
 def missing_directories(state: Snapshot) -> tuple[str, ...]:
-    """What must be made so that the program's working directory is there, the outermost first; nothing where that cannot be."""
+    """The directories to make for the program's working directory, the outermost first; none where that is impossible."""
     directory = Path(state.process.working_directory)
     missing = [one for one in (directory, *directory.parents) if not os.path.lexists(one)]
     is_plain = directory.is_absolute() and ".." not in directory.parts and not procfs.is_gone(str(directory))
@@ -341,13 +342,13 @@ def _of_files(state: Snapshot, options: RestoreOptions, brought: dict[str, str],
 
 
 def of_mapped_files(state: Snapshot, options: RestoreOptions) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Why its executable, or what it maps, cannot be had here; and the contents to open for what was brought along, by path."""
+    """Why its executable, or a mapped file, cannot be had here; and the contents to open for files brought along, by path."""
     brought: dict[str, str] = {}
     return tuple(_of_files(state, options, brought, digest_of_file)), brought
 
 
 def _content(options: RestoreOptions, digest: bytes, digest_of: DigestOf) -> tuple[str, str]:
-    """The file that was brought with this digest, or "" and what is wrong with it ("" if there is none)."""
+    """The file that was brought with this digest, or "" and its fault ("" if there is no such file)."""
     if not options.contents or len(digest) != DIGEST_SIZE:
         return "", ""
     path = str(path_in(options.contents, digest))

@@ -38,7 +38,7 @@ def _may_be_proved_later(outline: Snapshot) -> bool:
 
 
 def _outlives(vma: Vma) -> bool:
-    """Whether what is written to a mapping is seen beyond the process that writes it."""
+    """Whether other processes see writes to a mapping."""
     if system_v_memory.is_segment(vma):
         return True
     return vma.shared and memory.is_file_mapping(vma) and bool(vma.protection & abi.PROT_WRITE or MAY_WRITE in vma.flags)

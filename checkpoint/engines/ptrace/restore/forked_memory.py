@@ -39,7 +39,7 @@ NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
 
 
 class Legacy(Struct, frozen=True):
-    """What one process is born with.
+    """The memory that one process is born with.
 
     Attributes:
         kept: where it stays mapped.
@@ -78,12 +78,12 @@ class Told(Struct, frozen=True):
 
 
 class Inheritance(Struct, frozen=True):
-    """What all of them are born with.
+    """The memory that all of them are born with.
 
     Attributes:
         regions: where the vessel has it mapped, as far as it is anonymous.
         of_files: the same of files.
-        sources: of whom the pages are: their numbers among his, and their addresses.
+        sources: the process that each page is of: the pages' numbers among its own, and their addresses.
         legacies: of each process.
     """
 
@@ -142,7 +142,7 @@ def of(
     elsewhere: Collection[str] = (),
     sources: Sequence[MemberPages | None] = (),
 ) -> Inheritance:
-    """What these processes have in common.
+    """The memory that these processes have in common.
 
     Args:
         taken: where the vessel has something mapped.
@@ -179,7 +179,7 @@ def _files_of_several(told: Sequence[Told]) -> Iterator[tuple[FilePlace, Mapped]
 
 
 def _file_of(vma: Vma) -> FilePlace | None:
-    """Of which file a plain mapping is, and where; None: it is not of a file, or not plain."""
+    """The file and place of a plain mapping; None: it is not of a file, or not plain."""
     file = vma.file
     if vma.kind is not VmaKind.FILE or file is None or file.deleted or vma.shared or vma.guards:
         return None
@@ -202,7 +202,7 @@ def _whole(parts: Iterable[Words]) -> Words:
 
 
 class _Part(Struct, frozen=True):
-    """Of one sort of memory: see `Inheritance`; legacies by the process."""
+    """The inheritance of one sort of memory: see `Inheritance`; legacies by the process."""
 
     regions: Words
     sources: tuple[tuple[Told, NDArray[np.intp], Words], ...]
@@ -210,7 +210,7 @@ class _Part(Struct, frozen=True):
 
 
 def _alike(told: Sequence[Told], taken: Words, mapped: Mapped) -> _Part:
-    """What is common in mappings of one sort."""
+    """The pages that mappings of one sort have in common."""
     known = _Known(np.empty(0, np.uint64), np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.bool_))
     plain = {index: page_set.difference(page_set.extents(vmas), taken) for index, vmas in mapped.items()}
     equal = {index: _compared(known, told, index, plain[index]) for index in mapped}
@@ -240,7 +240,7 @@ def _within(one: Told, some: Words) -> NDArray[np.intp]:
 
 
 def _compared(known: _Known, told: Sequence[Told], index: int, plain: Words) -> Words:
-    """Where a process has what is known, by address; what nobody has had before is known from then on."""
+    """Where a process has known pages, by address; pages at new addresses are known from then on."""
     rows = _within(told[index], plain)
     addresses = told[index].addresses[rows]
     _, theirs, ours = np.intersect1d(known.addresses, addresses, assume_unique=True, return_indices=True)

@@ -134,7 +134,7 @@ def map_program(
 
     Args:
         brought: descriptors of what is mapped in place of this machine's files, by path; they stay open.
-        present: what needs no mapping of its own.
+        present: memory that needs no mapping of its own.
         untouched: pages of objects without a name that private mappings show as they are.
     """
     carried, inherited, anonymous = Carried(runs), present.objects, present.anonymous
@@ -198,7 +198,7 @@ def map_anonymous(table: CallTable, sizes: Mapping[Object, int], place: int) -> 
 
 
 def is_anonymous_object(vma: Vma) -> bool:
-    """Whether it is shared memory without a file, of which it is told which: it is mapped elsewhere, too."""
+    """Whether it is shared memory without a file whose identity the snapshot tells: it is mapped in other places, too."""
     return vma.kind is VmaKind.ANONYMOUS and vma.shared and vma.file is not None
 
 
@@ -254,7 +254,7 @@ def make_object(table: CallTable, vmas: Sequence[Vma]) -> int:
     file = vmas[0].file
     assert file is not None
     size, mode = file.size, file.mode & 0o7777
-    if not file.mode:  # an ordinary user captured it, who is not told its size: what is mapped counts
+    if not file.mode:  # an ordinary user captured it, and could not ask its size: the mapped size counts
         size, mode = max(vma.offset + vma.size for vma in vmas), OWNERS_ALONE
     if file.path.startswith(memfd.PREFIX):
         return memfd.make(table, file.path.removeprefix(memfd.PREFIX), mode, size)
@@ -311,7 +311,7 @@ def _map(table: CallTable, vma: Vma, protection: int, descriptor: int) -> None:
 
 
 def first_protection(vma: Vma, carried: Carried) -> int:
-    """That of a mapping while its pages are written: `settle` gives it its own.
+    """The protection of a mapping while its pages are written: `settle` gives it its own.
 
     No instruction runs there by then: a processor whose caches do not see what is written among instructions (aarch64) is told
     by the kernel when a page becomes one of instructions, and not when it is written to afterwards.
@@ -357,7 +357,7 @@ def fill_from(
     Memory without a file is zero by itself: pages of zeros are left out there, where the source may tell some.
 
     Raises:
-        FormatError, ChainError: its pages are not what they were; some were written.
+        FormatError, ChainError: its pages have changed; some were written.
     """
     filled = _filled(outline, legacy, untouched)
     zero = page_set.extents(vma for vma in outline.vmas if vma.file is None) if source.tells_zeros else NONE
@@ -369,7 +369,7 @@ def fill_from(
 
 
 def _without_zeros(row: Words, content: Buffer, zero: Words) -> tuple[Words, Buffer]:
-    """What is left of pages and their bytes without pages of zeros where there are zeros already."""
+    """The pages and their bytes, without pages of zeros where there are zeros already."""
     if not len(zero):
         return row, content
     is_zero = page_set.zero_pages(content, abi.PAGE_SIZE)
@@ -385,7 +385,7 @@ def _filled(snapshot: Snapshot, legacy: Legacy, untouched: Words) -> Words:
     """Where pages are written.
 
     Droppable memory begins empty, as its program must expect at any time: seeds of random numbers lie there (vgetrandom), which
-    two lives must not have in common. What is mapped shared and may not be written to has what its file has.
+    two lives must not have in common. A shared mapping that may not be written to has the content of its file.
     """
     mapped = page_set.extents(vma for vma in snapshot.vmas if vma.kind not in KERNEL_KINDS and not _keeps_its_own(vma))
     return page_set.difference(page_set.difference(mapped, legacy.there), untouched)
@@ -412,7 +412,7 @@ def _write(memory: Memory, carried: Words, content: Buffer, filled: Words, threa
 
 
 def _cut(whole: Words, mapped: Words) -> Iterator[tuple[bool, Words]]:
-    """Pages in order, as few pieces as there are changes between what is in a set and what is not."""
+    """Pages in order, in as few pieces as there are changes between pages in a set and others."""
     if page_set.covers(mapped, whole):
         yield True, whole
         return

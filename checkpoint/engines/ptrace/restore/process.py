@@ -94,7 +94,7 @@ REFUGE_SIZE: Final = 1 << 20
 
 
 class Estate(Struct, frozen=True):
-    """What a process of a component of several finds when it is born, and shares with others (`tree`).
+    """The things that a process of a component of several finds at its birth, and shares with others (`tree`).
 
     Attributes:
         base, size: the stretch of addresses that is ours in all of them; the stub lies at its beginning.
@@ -113,13 +113,13 @@ class Estate(Struct, frozen=True):
 
 
 def options_for(state: Snapshot) -> int:
-    """Those with which a vessel is traced; its children are traced with the same."""
+    """The options with which a vessel is traced; its children are traced with the same."""
     confined = any(seccomp.is_confined(one.resources) for one in state.processes)
     return OPTIONS | (abi.PTRACE_O_SUSPEND_SECCOMP if confined else 0)
 
 
 class LaterTables(Struct, frozen=True):
-    """What comes after the pages: descriptors, marks, signals; what comes after the threads' birth; and each thread's own."""
+    """The calls after the pages: descriptors, marks, signals; those after the threads' birth; and each thread's own."""
 
     state: CallTable
     rights: CallTable
@@ -139,7 +139,7 @@ class ProcessRestore:
     Args:
         state: of this process alone.
         estate: None for a component of one process.
-        legacy: what it has in common with others.
+        legacy: the memory that it has in common with others.
         source: of its pages, where ``state`` has them without their bytes.
     """
 
@@ -273,7 +273,7 @@ class ProcessRestore:
         self._complete(later)
 
     def _carried(self) -> Sequence[PageRun] | Words:
-        """Of which pages there is content: what they lie in must be writable until it is there."""
+        """The pages with content: their mappings must be writable until it is there."""
         return self._state.runs
 
     def _choose_place(self, mappings: tuple[procfs.MapsLine, ...]) -> int:
@@ -392,11 +392,11 @@ class ProcessRestore:
         return table
 
     def _make_directories(self, table: CallTable) -> None:
-        """What leads to its working directory."""
+        """Make the directories that lead to its working directory."""
         process_state.make_directories(table, checks.missing_directories(self._state))
 
     def _open_brought(self, table: CallTable) -> dict[str, int]:
-        """Open what was brought along: descriptors of what is run, by path; what is only read joins the nameless objects."""
+        """Open files that were brought along: descriptors of those to run, by path; those only read join the nameless objects."""
         flags = os.O_RDONLY | os.O_CLOEXEC
         run = {path: table.open(content, flags) for path, content in self._brought.run.items()}
         for held in self._state.resources:
@@ -437,7 +437,7 @@ class ProcessRestore:
         self.notes += rebuild_all(table, self._state, self._options, vessel.inner_pid, self._objects, vessel.pid, given)
 
     def _rights_table(self, table: CallTable, vessel: Vessel) -> CallTable:
-        """What comes after the birth of the threads, which takes a right."""
+        """The calls after the birth of the threads, since that birth takes a right."""
         state, thread, elapsed_ns = self._state, self._thread, self._options.elapsed_ns
         process = state.process
         mlockall.rebuild(table, state.resources)  # which takes a right, or a limit
@@ -457,7 +457,7 @@ class ProcessRestore:
         return table
 
     def _thread_table(self, table: CallTable, thread: ThreadState, vessel: Vessel) -> CallTable:
-        """What each thread must say for itself; its notes about rights are those of the first."""
+        """The calls that each thread must make for itself; its notes about rights are those of the first."""
         process = self._state.process
         credentials = snapshot_credentials.of_thread(self._state.resources, thread.tid, process.credentials)
         process_state.thread_marks(table, thread)
@@ -502,7 +502,7 @@ class ProcessRestore:
             self._take_place(one, thread)
 
     def _ours(self) -> Words:
-        """What is to be unmapped at the end: not this kernel's vdso, where that stays in the refuge beside the area."""
+        """The ranges to unmap at the end: not this kernel's vdso, where that stays in the refuge beside the area."""
         base, size = self._stub.base, -(-self._area_size // abi.PAGE_SIZE) * abi.PAGE_SIZE
         all_of_it = np.array([[base, base + size]], np.uint64)
         if not self._own_functions:
@@ -513,7 +513,7 @@ class ProcessRestore:
         return VdsoCalls(self._tracee, self._start_registers, self._vdso, self._vdso_size)
 
     def _queue_traps(self, calls: VdsoCalls, place: int) -> None:
-        """Queue each SIGTRAP that was pending, by whom it waits for; blocked, it disturbs none of the calls to come.
+        """Queue each pending SIGTRAP, from the thread that it waits for; blocked, it disturbs none of the calls to come.
 
         Args:
             place: of ours still, for a siginfo.

@@ -30,7 +30,7 @@ _MM_MAP: Final = struct.Struct("<12Q2I")
 SS_ONSTACK: Final = 1
 
 DIRECTORY_MODE: Final = 0o755
-"""Of a working directory that is missing; the umask takes from it."""
+"""The mode of a working directory that was missing; the umask takes bits from it."""
 
 RLIM_INFINITY: Final = (1 << 64) - 1
 RAISED_LIMITS: Final = (1, 2, 7, 8, 9)
@@ -190,7 +190,7 @@ def limits(table: CallTable, process: ProcessState, vessel: Vessel) -> tuple[str
 
 
 def last_marks(table: CallTable, process: ProcessState) -> None:
-    """What a change of user undoes, so it comes last: dumpable, and the signal at the parent's death (ours until now)."""
+    """Set, last, what a change of user undoes: dumpable, and the signal at the parent's death (ours until now)."""
     if process.dumpable in (0, 1):
         table.call("set dumpable", "prctl", abi.PR_SET_DUMPABLE, process.dumpable)
     table.call("set the signal at the parent's death", "prctl", abi.PR_SET_PDEATHSIG, process.parent_death_signal)

@@ -38,12 +38,12 @@ from checkpoint.store.base_on_disk import StoredBase
 
 
 class RestoredProgram(Struct):
-    """A program that was brought back; see ``checkpoint.engine.Restored``.
+    """A restored program; see ``checkpoint.engine.Restored``.
 
     Attributes:
         threads: all of its first process; they stand still for us until `resume`.
         others: those of its other processes.
-        arriving: its connections, of which nobody hears until then.
+        arriving: its connections; their other ends hear nothing until then.
     """
 
     threads: Threads

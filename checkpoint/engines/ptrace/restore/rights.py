@@ -42,7 +42,7 @@ _CAPABILITY_VERSION_3: Final = 0x20080522
 
 
 def own_eyes(table: CallTable, process: ProcessState, vessel: Vessel) -> None:
-    """From here on open files as the program's user, who may have put other ones in their place: see `RestoreOptions`.
+    """From here on open files as the program's user, since he may have put other files in their place: see `RestoreOptions`.
 
     Other rights by which views of the kernel and of other processes open are laid down until `adopt`, too.
 

@@ -25,7 +25,7 @@ Found = dict[Object, Resource]
 
 
 def made_once(views: Sequence[Snapshot]) -> tuple[tuple[Snapshot, ...], Found]:
-    """The processes, which only open what several of them have, and what is to be made of that before they are born."""
+    """The processes, which only open objects that several of them have; and those objects, to be made before any is born."""
     views = _filled_once(views)
     mapped = {object_of(vma) for view in views for vma in view.vmas if is_object_mapping(vma)}
     found = {key: held for key, held in _of_several(views).items() if key not in mapped}
@@ -33,7 +33,7 @@ def made_once(views: Sequence[Snapshot]) -> tuple[tuple[Snapshot, ...], Found]:
 
 
 def _of_several(views: Sequence[Snapshot]) -> Found:
-    """Those that more than one process has open."""
+    """The objects that more than one process has open."""
     told = [_of(view.resources) for view in views]
     found: Found = {}
     for ours in told:

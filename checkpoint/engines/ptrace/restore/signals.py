@@ -34,12 +34,12 @@ def packed_action(action: SignalAction) -> bytes:
 
 
 def trap_action(actions: Iterable[SignalAction]) -> SignalAction:
-    """What SIGTRAP did in the program."""
+    """The action of SIGTRAP in the program."""
     return next((action for action in actions if action.signal == _SIGTRAP), SignalAction(_SIGTRAP, 0, 0, 0, 0))
 
 
 def pending_signals(table: CallTable, process: ProcessState, inner_pid: int) -> None:
-    """Queue what was pending for the process: every signal is blocked in the vessel, so they wait for the program.
+    """Queue the pending signals of the process: every signal is blocked in the vessel, so they wait for the program.
 
     The signal of a periodic timer is queued by the timer itself, which `posix_timers` lets expire at once; SIGTRAP, by which
     tables end, by `pending_traps`.
@@ -49,7 +49,7 @@ def pending_signals(table: CallTable, process: ProcessState, inner_pid: int) -> 
 
 
 def pending_of_thread(table: CallTable, process: ProcessState, thread: ThreadState, inner_pid: int, tid: int) -> None:
-    """Queue what was pending for one thread; it alone may do so.
+    """Queue the pending signals of one thread; it alone may do so.
 
     Source: do_rt_tgsigqueueinfo() in kernel/signal.c: a thread may send a signal as if by the kernel to itself alone.
     """

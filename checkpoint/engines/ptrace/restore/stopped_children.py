@@ -27,7 +27,7 @@ STOPS_AGAIN: Final = 16
 def stop(tracee: Tracee, number: int) -> None:
     """Stop a vessel that stands still for us by a signal.
 
-    Signals of a terminal do not stop a group that nobody of its session looks after; SIGSTOP does, and stands for them then.
+    Signals of a terminal do not stop an orphaned process group; SIGSTOP does, and stands for them then.
 
     Raises:
         RestoreError: it cannot be stopped.

@@ -34,7 +34,7 @@ CLONE_SIGHAND: Final = 0x800
 CLONE_THREAD: Final = 0x10000
 CLONE_SYSVSEM: Final = 0x40000
 FLAGS: Final = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD | CLONE_SYSVSEM
-"""What pthread_create(3) shares; what it sets (thread-local storage, addresses for its id) comes with registers and table."""
+"""Things that pthread_create(3) shares; those that it sets (thread-local storage, id addresses) come with registers and table."""
 
 ANY_ID: Final = 0
 PTRACE_EVENT_FORK: Final = 1
@@ -43,7 +43,7 @@ _ARGUMENTS: Final = struct.Struct("<10Q")
 
 
 class IdInUseError(RestoreError):
-    """Somebody has the id that a thread or process was to have."""
+    """Another thread or process has the wanted id."""
 
 
 def spawn(leader: Tracee, registers: bytes, base: int, tid: int) -> Tracee:
@@ -69,7 +69,7 @@ def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_si
         flags: of clone(2): what both share.
 
     Raises:
-        IdInUseError: somebody has that id.
+        IdInUseError: another thread or process has that id.
     """
     process = parent.child(_birth(parent, registers, base, (flags, exit_signal, pid), f"process {pid}"))
     process.wait(call_table.RUN_TIMEOUT_S)
@@ -77,7 +77,7 @@ def spawn_process(parent: Tracee, registers: bytes, base: int, pid: int, exit_si
 
 
 def spawn_any(parent: Tracee, registers: bytes, base: int) -> Tracee:
-    """Have a process give birth to one with whatever id, of whose end it is told by no signal. As `spawn`."""
+    """Have a process give birth to one with any id; no signal tells the parent of its end. As `spawn`."""
     process = parent.child(_birth(parent, registers, base, (0, 0, ANY_ID), "stand-in for a process that has ended"))
     process.wait(call_table.RUN_TIMEOUT_S)
     return process
@@ -113,7 +113,7 @@ def open_what_is_left(
 
 
 def _birth(parent: Tracee, registers: bytes, base: int, wanted: tuple[int, int, int], what: str) -> int:
-    """The id, as we see it, of who was born.
+    """The id, as we see it, of the thread or process that was born.
 
     Args:
         wanted: flags of clone3(2), exit signal, id.

@@ -102,7 +102,7 @@ def timer_numbers_can_be_chosen() -> bool:
 
 
 def _create_timer(table: CallTable, timer: PosixTimer, tid: int) -> None:
-    """Make one timer; ``tid`` is whom it signals if it signals a thread."""
+    """Make one timer; ``tid`` is the thread that it signals, if it signals one."""
     event = struct.pack("<Qiii", timer.value & _WORD_MAX, timer.signal, timer.notify, tid).ljust(64, b"\0")
     number = table.place(struct.pack("<i", timer.timer_id))
     table.call(f"create timer {timer.timer_id}", "timer_create", timer.clock, table.place(event), number)

@@ -92,7 +92,7 @@ class TreeRestore:
         self._terminals: dict[int, pseudo_terminals.Controlling] = {}
 
     def end(self) -> None:
-        """Kill all processes; one that was born here is reaped for its parent, who may have ended before."""
+        """Kill all processes; one that was born here is reaped for its parent, which may have ended before."""
         for restoring in self._restoring[1:]:
             restoring.end()
         for tracee in reversed(self._born.values()):
@@ -113,7 +113,7 @@ class TreeRestore:
         return [self._born[one.process.pid].pid for one in self._state.processes]
 
     def notes(self) -> tuple[str, ...]:
-        """What differs, each once."""
+        """The differences, each once."""
         return tuple(dict.fromkeys(note for notes in (self._notes, *(one.notes for one in self._restoring)) for note in notes))
 
     def run(self) -> None:
@@ -177,13 +177,13 @@ class TreeRestore:
             (reason,),
         )
 
-    # What they share
+    # Things that they share
 
     def _make_estate(self, vessel: Vessel, resources: dict[int, Resource]) -> Estate:
-        """Make what they share in the first vessel.
+        """Make the things that they share in the first vessel.
 
         Args:
-            resources: what is told of each open file that is shared, by its number.
+            resources: the resource of each open file that is shared, by its number.
         """
         mappings, views = procfs.parse_maps(procfs.read_text(self._first.pid, "maps")), self._views
         vmas = [vma for view in views for vma in view.vmas]
@@ -226,13 +226,13 @@ class TreeRestore:
         self._make_nameless(table, vessel, estate, made, resources)
         inheritance.leave_files(table)
         if table.end - base > AREA_SIZE:
-            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
+            raise RestoreError(f"cannot restore: files and memory that its processes share take more than {AREA_SIZE >> 20} MiB")
         self._notes += stub.run(table)
         inheritance.put_in(self._first.memory)
         return estate
 
     def _numbers(self, resources: Collection[int], count: int) -> Iterator[int]:
-        """Descriptors for what is shared: above all that any process wants, and that are open while it is made.
+        """Descriptors for shared things: above all that any process wants, and that are open while it is made.
 
         Args:
             count: of objects that are mapped.
@@ -266,7 +266,7 @@ class TreeRestore:
         self._notes += rebuild.rebuild_all(table, bag, self._options, vessel.inner_pid, made, vessel.pid)
 
     def _open_brought(self, table: CallTable, resources: dict[int, Resource]) -> dict[memory.Object, int]:
-        """Open what was brought along of files that several processes have open for reading."""
+        """Open files that were brought along and that several processes have open for reading."""
         contents = {path: content for one in self._brought for path, content in one.opened.items()}
         found: dict[memory.Object, int] = {}
         for held in resources.values():
@@ -307,14 +307,14 @@ class TreeRestore:
                 del self._born[pid]
 
     def _stand_in(self, mother: Tracee, base: int) -> tuple[Tracee, int]:
-        """Somebody of any pid, and that: whoever is born or restored beside us may have taken some."""
+        """A stand-in of any pid, and that pid: processes that are born or restored beside us may have taken some."""
         for pid in self._spare:
             with contextlib.suppress(threads.IdInUseError):
                 return threads.spawn_process(mother, self._registers, base, pid, 0, self._born_with), pid
         raise RestoreError(f"cannot restore {self._state.component}: no pid is left for a stand-in of one that has ended")
 
     def _take_terminal(self, pid: int) -> None:
-        """Give a session its controlling terminal, which all who are born into it from now on have as well."""
+        """Give a session its controlling terminal; all processes that are born into it from now on have it as well."""
         if found := self._terminals.get(pid):
             with self._opened(pid, found) as slave:
                 self._call(pid, f"take the controlling terminal of session {pid}", "ioctl", slave, termios.TIOCSCTTY, 0)
@@ -409,7 +409,7 @@ def _places(begin: int, sizes: object) -> Iterator[int]:
 
 
 def first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
-    """What is told of each open file that several processes have, or that leads from one to another."""
+    """The resource of each open file that several processes have, or that leads from one to another."""
     found: dict[int, Resource] = {}
     for view in views:
         for held in view.resources:
@@ -420,7 +420,7 @@ def first_told(views: tuple[Snapshot, ...]) -> dict[int, Resource]:
 
 
 def _at(held: Resource, number: int) -> Resource:
-    """The same, to be made at one number only; who owns its signals, and what it watches, is said by its process."""
+    """The same, to be made at one number only; its process tells the owner of its signals, and what it watches."""
     facts = {name: fact for name, fact in held.facts.items() if name not in ("signal", "owner", "locks", "description")}
     if held.kind == epoll.KIND:
         facts["watched"] = []

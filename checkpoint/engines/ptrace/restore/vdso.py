@@ -105,7 +105,7 @@ def with_own_image(state: Snapshot) -> tuple[Snapshot, tuple[Vma, ...]]:
 
 
 def _as_memory(vma: Vma) -> Vma:
-    """A mapping of the kernel's as one that we can make; nobody may read its data until `run_out` is done."""
+    """A mapping of the kernel's as one that we can make; its data are not readable until `run_out` is done."""
     if vma.kind not in KERNEL_KINDS:
         return vma
     protection = abi.PROT_READ | abi.PROT_EXEC if vma.kind is VmaKind.VDSO else 0
@@ -186,7 +186,7 @@ def stands_in(registers: bytes, image: Vma) -> bool:
 
 
 def jumps(state: Snapshot, content_at: ContentAt, own: int, functions: Sequence[Function]) -> list[tuple[int, bytes]]:
-    """What to write where in the image that the program was born with: to each function, how this kernel does the same.
+    """The bytes to write into the image that the program was born with: each function jumps to this kernel's own.
 
     Args:
         own: where this kernel's image lies.

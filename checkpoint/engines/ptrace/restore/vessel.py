@@ -1,4 +1,4 @@
-"""What a vessel is and may do, before it becomes the program."""
+"""The facts and rights of a vessel, before it becomes the program."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ CAP_CHECKPOINT_RESTORE: Final = 40
 
 
 class Vessel(Struct, frozen=True):
-    """What the vessel is before it becomes the program.
+    """The facts of a vessel before it becomes the program.
 
     Attributes:
         inner_pid: its PID as it sees it itself.
-        credentials: who it runs as.
+        credentials: the user that it runs as.
         affinity: processors that it may use.
         hard_limits: by RLIMIT number; -1 is infinity.
     """
@@ -53,7 +53,7 @@ class Vessel(Struct, frozen=True):
 
 
 def look_at_vessel(pid: int) -> Vessel:
-    """What a vessel is and may do."""
+    """Read the facts and rights of a vessel."""
     status = procfs.status(pid)
     credentials = Credentials(status.uids, status.gids, status.groups, status.capabilities)
     return Vessel(pid, status.pids[-1], credentials, frozenset(os.sched_getaffinity(pid)), _hard_limits(pid))

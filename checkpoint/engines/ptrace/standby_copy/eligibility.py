@@ -23,11 +23,11 @@ from checkpoint.resources.process import exited_processes, job_control, shared_w
 from checkpoint.snapshot import carried_files, process_tree
 
 SHARE: Final = 2
-"""What is free must hold a copy so many times."""
+"""Free memory must hold a copy so many times."""
 
 
 def hindrances(state: Snapshot) -> Iterator[str]:
-    """Why a program can have no ready copy, one sentence each: others would see what is made, or it is not covered yet."""
+    """Why a program can have no ready copy, one sentence each: others would see its effects, or it is not covered yet."""
     if carried_files.without(state) is not state:
         yield "files travel with it"
     for view in process_tree.views(replace(state, cleared=(), runs=(), copies=(), differences=(), contents=b"")):
@@ -61,7 +61,7 @@ def _of_process(state: Snapshot, *, is_kin: bool) -> Iterator[str]:
 
 
 def _of_kin(state: Snapshot) -> Iterator[str]:
-    """What must come before the births of others, and may be another one at the takeover."""
+    """Reasons by state that must be set before others are born, and may have changed at the takeover."""
     if shared_with_parent.flags_of(state.resources) & shared_with_parent.CLONE_FILES:
         yield "processes of it share a table of descriptors"
     if job_control.stop_of(state.resources):
@@ -89,7 +89,7 @@ def require_covered(state: Snapshot) -> None:
 
 
 def require_room(base: Snapshot) -> None:
-    """Refuse a copy that takes more than its share of what is free: what runs here needs room more than what may have to.
+    """Refuse a copy that takes more than its share of free memory: programs that run here need it more than one that may.
 
     Raises:
         UnsupportedError: with the reason.

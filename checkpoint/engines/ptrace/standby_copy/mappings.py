@@ -44,7 +44,7 @@ MADV_REMOVE: Final = 9
 NO_PAGES: Final[Words] = np.empty((0, 2), np.uint64)
 
 Backing = tuple[object, ...]
-"""What a mapping is of, and how it lies there."""
+"""The object that a mapping is of, and how it lies there."""
 
 
 class Change(Struct, frozen=True):
@@ -56,8 +56,8 @@ class Change(Struct, frozen=True):
         dropped, removed: pages of private and of shared mappings that stay, to be as they were when they were mapped.
         protections: (start, end, protection) that other parts need while pages are written.
         carried: pages that the new state holds.
-        rescued_pages: those that must outlive that they are mapped afresh.
-        stiff: what is mapped since birth still, see `between`.
+        rescued_pages: those that keep their content although they are mapped afresh.
+        stiff: mappings that exist since birth, see `between`.
     """
 
     gone: Words
@@ -71,11 +71,11 @@ class Change(Struct, frozen=True):
 
     @classmethod
     def between(cls, before: Sequence[Vma], held: Words, delta: Snapshot, stiff: Words = NO_PAGES) -> Change:
-        """What leads from mappings, and the pages held in them, to a delta's.
+        """The changes that lead from mappings, and the pages held in them, to a delta's.
 
         Args:
-            stiff: what a process was born with: the kernel joins it with nothing that is mapped beside it later. A mapping of
-                which some is new is mapped afresh as a whole (mremap(2) takes one mapping only).
+            stiff: mappings with which a process was born: the kernel does not join them with later mappings beside them. A
+                mapping that is new in part is mapped afresh as a whole (mremap(2) takes one mapping only).
 
         Raises:
             RestoreError: shared memory has grown in its place.
@@ -106,7 +106,7 @@ class Change(Struct, frozen=True):
         )
 
     def fresh_files(self) -> list[Vma]:
-        """Of what is to be mapped, what is mapped from files that have names."""
+        """The mappings to make that are of files with names."""
         return [vma for vma in self.fresh if is_file_mapping(vma)]
 
     def add_calls(
@@ -131,7 +131,7 @@ class Change(Struct, frozen=True):
             table.call(f"protect {start:#x}", "mprotect", start, end - start, protection)
 
     def rescued(self, memory: Memory) -> list[tuple[Words, bytearray]]:
-        """What the pages hold that must outlive this change."""
+        """The content of the pages that must outlive this change."""
         return [(self.rescued_pages, memory.read_pages(self.rescued_pages))] if len(self.rescued_pages) else []
 
 
@@ -157,7 +157,7 @@ def held_of_objects(vmas: Iterable[Vma], held: Words) -> dict[Object, Words]:
 
 
 def _ours(vmas: Iterable[Vma]) -> list[Vma]:
-    """Those that a restore maps, in address order."""
+    """The mappings that a restore makes, in address order."""
     return sorted((vma for vma in vmas if vma.kind not in KERNEL_KINDS), key=lambda vma: vma.start)
 
 
@@ -166,7 +166,7 @@ def _extents(vmas: Iterable[Vma]) -> Words:
 
 
 def backing(vma: Vma) -> Backing:
-    """What it is of, the same for all parts that could be one mapping."""
+    """The object that it is of, the same for all parts that could be one mapping."""
     marks = "gd" in vma.flags, "nr" in vma.flags
     if is_file_mapping(vma):
         assert vma.file is not None
@@ -176,7 +176,7 @@ def backing(vma: Vma) -> Backing:
 
 
 def _moved(old: Sequence[Vma], new: Sequence[Vma]) -> tuple[Words, Words]:
-    """What is mapped no longer, or as something else; and what is mapped afresh."""
+    """Ranges that are not mapped any more, or as something else; and ranges that are mapped afresh."""
     before, after = _by_backing(old), _by_backing(new)
     kept = NO_PAGES
     for key, extents in after.items():
@@ -207,7 +207,7 @@ def _pieces(vma: Vma, wanted: Words) -> list[Vma]:
 def _protections(
     old: Sequence[Vma], held: Carried, new: Sequence[Vma], carried: Carried, fresh: Words
 ) -> Iterable[tuple[int, int, int]]:
-    """Where what stays mapped needs another protection than it has, and what is mapped as a part needs that of its whole."""
+    """Where a kept mapping needs another protection than it has, and a mapped part needs that of its whole."""
     starts = [vma.start for vma in old]
     had = [first_protection(vma, held) for vma in old]
     for vma in new:

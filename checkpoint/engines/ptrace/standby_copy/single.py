@@ -60,8 +60,8 @@ TIME_NAMESPACE: Final = "/proc/self/ns/time"
 """There is none on a kernel without CONFIG_TIME_NS."""
 
 AHEAD_NS: Final = 60_000_000_000
-"""How far the clocks of a copy may be ahead of where the program's have got to, before it is laid again: nobody knows how long a
-checkpoint was on its way."""
+"""How far the clocks of a copy may be ahead of where the program's have got to, before it is laid again: it is not known how long
+a checkpoint was on its way."""
 
 
 @contextmanager
@@ -85,11 +85,11 @@ def ended_on_error(copy: Copy, what: str) -> Iterator[None]:
 
 
 class Plan(Struct, frozen=True):
-    """What a delta does to the copy of one process, worked out before any of it is done.
+    """The changes of a delta to the copy of one process, worked out before any of them is made.
 
     Attributes:
         delta: tells its pages whole.
-        rescued: pages that must outlive that they are mapped afresh, and what they hold.
+        rescued: pages that keep their content although they are mapped afresh, and that content.
     """
 
     delta: Snapshot
@@ -126,7 +126,7 @@ class ReadyCopy(ProcessRestore):
 
     @property
     def state(self) -> Snapshot:
-        """What it stands at, without its pages."""
+        """The state that it stands at, without its pages."""
         return self._state
 
     @property
@@ -136,7 +136,7 @@ class ReadyCopy(ProcessRestore):
 
     @property
     def vessel(self) -> Vessel:
-        """What it was when it was laid."""
+        """The state with which it was laid."""
         return self._vessel
 
     @property
@@ -202,7 +202,7 @@ class ReadyCopy(ProcessRestore):
         self.torn = False
 
     def planned(self, delta: Snapshot) -> Plan:
-        """What a delta does to it, of which nothing is done yet.
+        """The changes of a delta to it; none is made yet.
 
         Args:
             delta: of this process, and tells its pages whole.
@@ -300,7 +300,7 @@ class ReadyCopy(ProcessRestore):
             raise RestoreError(f"the ready copy of {self._state.component} is torn: build it again from the chain")
 
     def _require_same_birth(self, delta: Snapshot) -> None:
-        """What was fixed when the vessel was born and laid out."""
+        """The facts that were fixed when the vessel was born and laid out."""
         ours, theirs = self._state, delta
         fixed = (
             ("its pid", ours.process.pid == theirs.process.pid),
@@ -347,7 +347,7 @@ class ReadyCopy(ProcessRestore):
     # --- Files ---
 
     def _checked(self, state: Snapshot) -> Brought:
-        """Where what is mapped comes from; remembers how the files looked.
+        """The files that its mappings come from; remembers how they looked.
 
         Raises:
             MismatchError: this machine lacks some.
@@ -369,7 +369,7 @@ class ReadyCopy(ProcessRestore):
         return tuple(path for path, key in self._known.items() if path not in opened and _look_of(path) == key)
 
     def _open_with_our_rights(self, table: CallTable, brought: Brought) -> dict[str, int]:
-        """Open what was brought along, in a place of ours, though the vessel may look with its user's eyes already."""
+        """Open files that were brought along, in a place of ours; the vessel may have its user's rights already."""
         if not brought.run and not brought.opened:
             return {}
         self._brought = brought
@@ -379,10 +379,10 @@ class ReadyCopy(ProcessRestore):
     def _is_open(self, path: str) -> bool:
         return any(held.facts.get("path") == path and _object_of(held.facts) in self._objects for held in self._state.resources)
 
-    # --- What is kept of the program ---
+    # --- Parts of the program that are kept ---
 
     def rows_at(self, addresses: Words) -> Rows:
-        """What it holds at these addresses.
+        """Its bytes at these addresses.
 
         Raises:
             ChainError: there is no page.
@@ -400,7 +400,7 @@ class ReadyCopy(ProcessRestore):
         self.position = snapshot.position
 
     def _remember_sections(self) -> None:
-        """What registering rseq will forget: the critical sections in which threads stand."""
+        """Remember the critical sections in which threads stand, because registering rseq clears them."""
         self._sections.clear()
         for thread in self._state.threads:
             if thread.rseq is not None:
@@ -409,7 +409,7 @@ class ReadyCopy(ProcessRestore):
 
 
 def paths_open_in(state: Snapshot) -> frozenset[str]:
-    """What any of its processes has open, by name."""
+    """The names of the files that any of its processes has open."""
     return frozenset(str(held.facts.get("path", "")) for one in state.processes for held in one.resources)
 
 
@@ -420,7 +420,7 @@ def _monotonic_offset_ns(pid: int) -> int:
 
 
 def _look_of(path: str) -> tuple[int, ...]:
-    """What changes with a file's content; nothing where it is not there."""
+    """Facts that change with a file's content; () where it is not there."""
     try:
         about = os.stat(path)
     except OSError:

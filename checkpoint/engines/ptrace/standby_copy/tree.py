@@ -60,7 +60,7 @@ PUNCH_HOLE: Final = 1 | 2
 """FALLOC_FL_KEEP_SIZE, FALLOC_FL_PUNCH_HOLE."""
 
 SIZE_KEPT_S: Final = 5.0
-"""How long what it takes is believed: who asks the kernel what is shared has it walk through all page tables."""
+"""How long a figure of its memory is believed: asking the kernel for shared memory makes it walk through all page tables."""
 
 
 class MemberCopy(ReadyCopy):
@@ -82,7 +82,7 @@ class MemberCopy(ReadyCopy):
 
     @property
     def descriptors(self) -> frozenset[int]:
-        """What is open in the common table, by what this one knows."""
+        """The open descriptors of the common table, as far as this one knows."""
         return frozenset(self._descriptors)
 
     @property
@@ -103,11 +103,11 @@ class MemberCopy(ReadyCopy):
         self._map_and_fill(tuple(line for line in mappings if not self._is_estate(line)))
 
     def know_open(self, descriptors: Iterable[int]) -> None:
-        """What is open in the common table now."""
+        """Learn the descriptors that are open in the common table now."""
         self._descriptors = set(descriptors)
 
     def own_table(self, others: Iterable[MemberCopy]) -> None:
-        """Part with the common table of descriptors, and close what others have in it."""
+        """Part with the common table of descriptors, and close those that others have in it."""
         table = CallTable(self._stub.base)
         table.call("have a table of descriptors alone", "unshare", shared_with_parent.CLONE_FILES)
         for other in others:
@@ -146,7 +146,7 @@ class FamilyCopy(TreeRestore):
 
     @property
     def state(self) -> Snapshot:
-        """What it stands at, without its pages."""
+        """The state that it stands at, without its pages."""
         return self._state
 
     @property
@@ -255,7 +255,7 @@ class FamilyCopy(TreeRestore):
             brought = self._open_brought(table, resources)
         self._make_nameless(table, vessel, estate, brought | dict(self._estate.objects), resources)
         if table.end - table.base > AREA_SIZE:
-            raise RestoreError(f"cannot restore: what its processes share takes more than {AREA_SIZE >> 20} MiB")
+            raise RestoreError(f"cannot restore: files and memory that its processes share take more than {AREA_SIZE >> 20} MiB")
         self._notes += self._stub.run(table)
         return estate
 
@@ -321,7 +321,7 @@ class FamilyCopy(TreeRestore):
 
 
 def _shape_of(state: Snapshot) -> tuple[object, ...]:
-    """Who is there, as far as it was fixed when they were born."""
+    """The processes, as far as they were fixed at birth."""
     first = state.process
     members = tuple(
         (

@@ -41,7 +41,7 @@ def refusal(name: str, folder: Path, path: str = "/usr/bin:/bin") -> str:
         ("mapper.py", "no directory of its PATH has mapper.py; start the one in {} by python3 mapper.py (PATH is /usr/bin:/bin)"),
         ("tool", "no directory of its PATH has tool; start the one in {} by ./tool (PATH is /usr/bin:/bin)"),
         ("./nosuch", "No such file or directory"),
-        ("./lost", "No such file or directory: the file is there, but not what it names as its interpreter /opt/none/python3"),
+        ("./lost", "No such file or directory: the file is there, but not its interpreter /opt/none/python3"),
         ("./maps", "Permission denied: it is a directory"),
         ("./mapper.py", "Permission denied: it is not executable; start it by python3 ./mapper.py, or chmod +x ./mapper.py"),
         (
