@@ -34,6 +34,7 @@ from agent.worker.control.arguments import (
 from agent.worker.control.output_relay import OutputRelay
 from agent.worker.control.queries import Lines, Questions
 from agent.worker.control.quotas import check_components
+from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.network.remote_orders import Order
 from checkpoint.device_rules import RULES_MAX, rule_from, travelling
@@ -65,10 +66,10 @@ class Worker(Lines, Protocol):
 class Verbs(Questions):
     """Every verb of the control socket."""
 
-    def __init__(self, worker: Worker) -> None:
-        super().__init__(worker)
+    def __init__(self, worker: Worker, gate: RightsGate | None = None) -> None:
+        super().__init__(worker, gate)
         self._worker = worker
-        self._output_relay = OutputRelay(worker)
+        self._output_relay = OutputRelay(worker, gate)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -106,7 +107,7 @@ class Verbs(Questions):
     async def _permitted(self, order: Order, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Carry an order out here, if its user may give it."""
         name = await self._known(str(arguments.get("name", "")))
-        await self._check_right(by, name)
+        await self._check_right(by, name, "operate")
         return await order({**arguments, "name": name}, by)
 
     async def _order(self, verb: str, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -327,8 +328,10 @@ class Verbs(Questions):
         """The component's output as far as no takeover can take it back; all of it once it has ended."""
         wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
-        await self._check_right(say.caller.uid, name)
-        totals = await self._output_relay.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
+        await self._check_right(say.caller.uid, name, "read")
+        totals = await self._output_relay.pass_on(
+            say, name, wanted.offsets, committed=True, follow=wanted.follow, permitted=self._rules() is not None
+        )
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 
@@ -411,14 +414,19 @@ class Verbs(Questions):
 
     async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:
         """Have the core decide, by the right of this user. Raises RefusedError: it says no."""
-        answer = await self._worker.command(lambda number: replace(make(number), by=asking(by)))
+        asks = None if self._rules() is not None else asking(by)  # the rules have been asked
+        answer = await self._worker.command(lambda number: replace(make(number), by=asks))
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return answer
 
-    async def _check_right(self, uid: int, name: str) -> None:
-        """Raises RefusedError: the component is another user's."""
-        check_right(uid, name, (await self._view(name)).get("owner"))
+    async def _check_right(self, uid: int, name: str, right: str) -> None:
+        """Raises RefusedError: the rules say no; or, without rules, the component is another user's."""
+        owner = (await self._view(name)).get("owner")
+        if (gate := self._rules()) is None:
+            check_right(uid, name, owner)
+        else:
+            await gate.check(uid, right, name, owner)
 
     async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
         """A name for something new: as given, under this robot's own path, or made from the command.

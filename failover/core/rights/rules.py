@@ -50,7 +50,8 @@ class Subject(Struct, frozen=True):
 
     Attributes:
         name: with the source that vouches for it: ``uid:1000``, ``ldap:user1``, ``robot:robot2``.
-        groups: as that source tells them. None can stand for a relation (``@…``) or a subject's name: rules ask for those elsewhere.
+        groups: as that source tells them. None of them can stand for a relation (``@…``) or for a subject's name.
+        uid: of the user on the robot; None where there is none.
         is_owner: the path names what this user started.
         stands_above: root and the agent's own user on the robot itself, who could change the file of rules.
         copy: "" for groups that were asked for now; else what to say of the copy that they are from.
@@ -58,6 +59,7 @@ class Subject(Struct, frozen=True):
 
     name: str
     groups: frozenset[str] = frozenset()
+    uid: int | None = None
     is_owner: bool = False
     stands_above: bool = False
     copy: str = ""
