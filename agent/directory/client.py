@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Final
 
 from agent.directory.messages import Answer, Question
+from agent.system.systemd_units import in_a_unit
 from checkpoint.keeper.messages import Channel, ChannelError, pair
 
 PATIENCE_S: Final = 20.0
@@ -18,7 +21,13 @@ PATIENCE_S: Final = 20.0
 class DirectoryProcess:
     """One child after another; questions one at a time."""
 
-    def __init__(self, team_directory: Path, state_directory: Path) -> None:
+    def __init__(self, team_directory: Path, state_directory: Path, starter: str = "") -> None:
+        """
+        Args:
+            starter: of services of their own, see `agent.system.systemd_units`; "": it is our child.
+        """
+        self._starter = starter
+        self._numbers = itertools.count(1)
         self._places = (str(team_directory), str(state_directory))
         self._child: subprocess.Popen[bytes] | None = None
         self._channel: Channel[Answer] | None = None
@@ -53,12 +62,16 @@ class DirectoryProcess:
         self.close()
         ours, theirs = pair()
         ours.settimeout(PATIENCE_S)
+        way: list[str] = []
+        if self._starter:
+            name = f"{os.getpid()}-{next(self._numbers)}"
+            way = [
+                self._starter,
+                "--pipe",
+                *in_a_unit(self._starter, "directory", name)[1:],
+            ]  # our stdin is the service's
         with theirs:
-            self._child = subprocess.Popen(
-                [sys.executable, "-m", "agent.directory.process", *self._places, str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                process_group=0,
-            )
+            command = [*way, sys.executable, "-m", "agent.directory.process", *self._places, "0"]
+            self._child = subprocess.Popen(command, stdin=theirs.fileno(), process_group=0)
         self._channel = Channel(ours, Answer)
         return self._channel

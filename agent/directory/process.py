@@ -1,6 +1,6 @@
 """The directory process: takes a question, asks the server, answers; nothing else. Ends when the worker does.
 
-Started as `python -m agent.directory.process TEAM_DIRECTORY STATE_DIRECTORY DESCRIPTOR`, with all modules of Python, for python-ldap
+Started as `python -m agent.directory.process TEAM_DIRECTORY STATE_DIRECTORY DESCRIPTOR`, with all modules of Python: python-ldap
 needs some that `agent.system.child_main` leaves out. Where the agent is root, it reads the service account's password and then
 gives up all rights but those of its own user.
 """
@@ -37,12 +37,13 @@ def main() -> int:
         if found is None or found.config.source != "ldap":
             raise DirectoryError(f"{team}/{rights.RIGHTS_FILE} names no directory server")
         config = found.config.ldap
-        secret = _secret(config)
-        folder = _folder(Path(state) / FOLDER, config)
+        server = LdapServer(config, _secret(config))
+        server.load()
+        _settle(Path(state) / FOLDER, config)
     except (DirectoryError, FailoverError, OSError) as error:
         print(f"failover directory: {error}", file=sys.stderr)
         return 1
-    answers = Answers(config, LdapServer(config, secret), folder / COPIES, time.monotonic, time.time)
+    answers = Answers(config, server, Path(COPIES), time.monotonic, time.time)
     while True:
         try:
             question, _ = channel.receive()
@@ -61,21 +62,20 @@ def _secret(config: LdapConfig) -> str:
     return path.read_text().strip()
 
 
-def _folder(folder: Path, config: LdapConfig) -> Path:
-    """The place of the copies, and the rights of this process: its own user's alone."""
+def _settle(folder: Path, config: LdapConfig) -> None:
+    """Be in the folder of the copies, which lies in one of root's, with the rights of this process's own user alone."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    os.chdir(folder)
     if os.geteuid() == 0 and config.user:
         try:
             user = pwd.getpwnam(config.user)
         except KeyError:
             raise DirectoryError(f"user = {config.user!r} of [rights.ldap]: this robot has no such user") from None
-        os.chown(folder, user.pw_uid, user.pw_gid)
-        for file in folder.iterdir():
+        for file in (".", *os.listdir()):
             os.chown(file, user.pw_uid, user.pw_gid, follow_symlinks=False)
         os.setgroups([])
         os.setresgid(user.pw_gid, user.pw_gid, user.pw_gid)
         os.setresuid(user.pw_uid, user.pw_uid, user.pw_uid)
-    return folder
 
 
 if __name__ == "__main__":

@@ -34,6 +34,11 @@ class LdapServer:
         self._secret = secret
         self._host = urlsplit(config.server).hostname or ""
 
+    def load(self) -> None:
+        """Have the library in memory while its files can be read; one that is missing is told with the first answer."""
+        with contextlib.suppress(DirectoryError):
+            _library()
+
     def groups(self, user: str, password: str | None) -> frozenset[str]:
         """The groups of a user, who is authenticated first where there is a password.
 
@@ -45,11 +50,7 @@ class LdapServer:
             raise WrongPasswordError("an empty password is never tried: a server may take it for nobody, and say yes")
         if not user or not user.isprintable() or "\0" in (password or ""):
             raise UnknownUserError(f"{user!r} is no name of a user, or the password holds a zero byte")
-        try:
-            import ldap
-            import ldap.filter
-        except ImportError as error:
-            raise DirectoryError(f"python-ldap is missing ({error}); install failover[ldap], or Debian's python3-ldap") from error
+        ldap = _library()
         try:
             with self._connected(ldap) as connection:
                 self._bind(ldap, connection, self._config.account, self._secret)
@@ -117,6 +118,16 @@ class LdapServer:
         """DN → name of the groups that a filter selects."""
         entries = connection.search_s(self._config.base, ldap.SCOPE_SUBTREE, f"(&{CLASSES}{wanted})", ["cn"])
         return {dn: values["cn"][0].decode(errors="replace") for dn, values in entries if dn and values.get("cn")}
+
+
+def _library() -> Any:
+    """The module ``ldap``. Raises DirectoryError: it is not installed."""
+    try:
+        import ldap
+        import ldap.filter
+    except ImportError as error:
+        raise DirectoryError(f"python-ldap is missing ({error}); install failover[ldap], or Debian's python3-ldap") from error
+    return ldap
 
 
 def _sentence(error: Any) -> str:

@@ -26,6 +26,7 @@ from agent.main_loop import messages
 from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, Told, ToWorker
 from agent.system import syscalls
 from agent.system.log_setup import set_up_log
+from agent.system.systemd_units import starter
 from agent.worker.control.queries import QUESTIONS, Questions
 from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import ControlServer
@@ -79,7 +80,7 @@ class Switchboard:
         self.settings = settings
         config = settings.config
         self._runtime = Path(config.runtime_directory)
-        self.gate = RightsGate(Path(config.team_directory), Path(config.state_directory))
+        self.gate = RightsGate(Path(config.team_directory), Path(config.state_directory), starter())
         self._main_loop = main_loop
         self._outgoing: asyncio.Queue[messages.ToMainLoop] = asyncio.Queue()
         self._numbers = itertools.count(1)

@@ -44,9 +44,13 @@ RIGHT_OF: Final = {
 class RightsGate:
     """The rules of one robot."""
 
-    def __init__(self, team_directory: Path, state_directory: Path) -> None:
+    def __init__(self, team_directory: Path, state_directory: Path, starter: str = "") -> None:
+        """
+        Args:
+            starter: of services of their own, for the process that asks the directory.
+        """
         self._path = team_directory / rights.RIGHTS_FILE
-        self._places = team_directory, state_directory
+        self._places = team_directory, state_directory, starter
         self._read_at: tuple[int, int, int] | None = None
         self._rights: Rights | None = None
         self._mistake = ""

@@ -259,7 +259,7 @@ def test_copies_are_their_owners_alone_and_hold_no_password(slapd: Slapd, tmp_pa
 
 def test_the_process_answers_as_its_own_user_and_is_replaced_when_it_dies(slapd: Slapd, tmp_path: Path) -> None:
     state = Path(tempfile.mkdtemp(prefix="rights-state-"))
-    state.chmod(0o755)
+    state.chmod(0o700)  # as root's own is
     secret = tmp_path / "secret"
     secret.write_text(SECRET)
     secret.chmod(0o600)
