@@ -14,8 +14,8 @@ from agent.directory.messages import Answer, Question
 from agent.system.systemd_units import in_a_unit
 from checkpoint.keeper.messages import Channel, ChannelError, pair
 
-PATIENCE_S: Final = 20.0
-"""Above what all requests of one question take when the server answers just in time; a process that needs longer hangs."""
+PATIENCE_S: Final = 60.0
+"""Above what a question may take (`agent.directory.bounded`); a process that needs longer hangs."""
 
 
 class DirectoryProcess:

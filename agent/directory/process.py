@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from agent.directory.answers import Answers
+from agent.directory.bounded import REQUESTS, BoundedServer
 from agent.directory.messages import Question
 from agent.directory.server import LdapServer
 from agent.errors import DirectoryError
@@ -39,11 +40,12 @@ def main() -> int:
         config = found.config.ldap
         server = LdapServer(config, _secret(config))
         server.load()
+        bounded = BoundedServer(server, REQUESTS * config.timeout_s)
         _settle(Path(state) / FOLDER, config)
     except (DirectoryError, FailoverError, OSError) as error:
         print(f"failover directory: {error}", file=sys.stderr)
         return 1
-    answers = Answers(config, server, Path(COPIES), time.monotonic, time.time)
+    answers = Answers(config, bounded, Path(COPIES), time.monotonic, time.time)
     while True:
         try:
             question, _ = channel.receive()

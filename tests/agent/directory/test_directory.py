@@ -17,6 +17,7 @@ import msgspec
 import pytest
 
 from agent.directory.answers import FREE_TRIES, Answers
+from agent.directory.bounded import REQUESTS, BoundedServer
 from agent.directory.client import DirectoryProcess
 from agent.directory.messages import Question
 from agent.directory.server import LdapServer, UnknownUserError, WrongPasswordError
@@ -81,8 +82,9 @@ class Clocks:
 
     def answers(self, slapd: Slapd, path: Path, **other: object) -> Answers:
         """Answers by these clocks, that go on with the copies at ``path``."""
-        server = server_of(slapd, **other)
-        return Answers(config_of(slapd, **other), server, path / "copies", lambda: self.now_s, lambda: self.calendar_s)
+        config = config_of(slapd, **other)
+        server = BoundedServer(server_of(slapd, **other), REQUESTS * config.timeout_s)
+        return Answers(config, server, path / "copies", lambda: self.now_s, lambda: self.calendar_s)
 
 
 # --- Who is it -------------------------------------------------------------------------------------------------------
