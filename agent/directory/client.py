@@ -14,7 +14,7 @@ from agent.directory.messages import Answer, Question
 from agent.system.systemd_units import in_a_unit
 from checkpoint.keeper.messages import Channel, ChannelError, pair
 
-PATIENCE_S: Final = 60.0
+PATIENCE_S: Final = 300.0
 """Above what a question may take (`agent.directory.bounded`); a process that needs longer hangs."""
 
 

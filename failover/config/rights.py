@@ -76,7 +76,7 @@ class LdapConfig:
             raise ValueError('base is empty; write the DN below which people and groups are, as "dc=example,dc=org"')
         if not _ATTRIBUTE.fullmatch(self.attribute):
             raise ValueError(f"attribute = {self.attribute!r} is no name of an attribute, such as uid or sAMAccountName")
-        for key, least, most in (("timeout_s", 0.05, 10), ("refresh_s", 1, 86_400), ("cache_h", 0, 8_760)):
+        for key, least, most in (("timeout_s", 0.05, 60), ("refresh_s", 1, 86_400), ("cache_h", 0, 8_760)):
             if not least <= getattr(self, key) <= most:
                 raise ValueError(f"{key} = {getattr(self, key)} is not within {least:g} and {most:g}")
 

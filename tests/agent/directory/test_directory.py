@@ -66,7 +66,7 @@ def config_of(slapd: Slapd, **other: object) -> LdapConfig:
         "account": SERVICE,
         "ca_file": str(slapd.certificate),
     }
-    return msgspec.convert({**known, "timeout_s": 10, **other}, LdapConfig)
+    return msgspec.convert({**known, "timeout_s": 60, **other}, LdapConfig)
 
 
 def server_of(slapd: Slapd, **other: object) -> LdapServer:
@@ -268,7 +268,7 @@ def test_the_process_answers_as_its_own_user_and_is_replaced_when_it_dies(slapd:
     told = config_of(slapd, password_file=str(secret))
     keys = ("server", "base", "account", "ca_file", "password_file")
     lines = [f'{key} = "{getattr(told, key)}"' for key in keys]
-    (tmp_path / RIGHTS_FILE).write_text('[rights]\nsource = "ldap"\n[rights.ldap]\ntimeout_s = 10\n' + "\n".join(lines) + "\n")
+    (tmp_path / RIGHTS_FILE).write_text('[rights]\nsource = "ldap"\n[rights.ldap]\ntimeout_s = 60\n' + "\n".join(lines) + "\n")
 
     async def asked() -> None:
         process = DirectoryProcess(tmp_path, state)
