@@ -5,12 +5,10 @@ A file of its own beside team.toml: an agent reads it again when it has changed,
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
-from urllib.parse import urlsplit
 
 from failover.config import strict_toml
 from failover.core.rights import hours
@@ -67,6 +65,8 @@ class LdapConfig:
         """Refuse what cannot work, or would send a password in the clear. Raises ValueError."""
         if not self.server:
             return
+        from urllib.parse import urlsplit  # here and below: a robot without a directory does not load them
+
         parts = urlsplit(self.server)
         if parts.scheme not in ("ldap", "ldaps") or not parts.hostname:
             raise ValueError(f"server = {self.server!r} is no address; write ldaps://HOST or ldap://HOST:PORT")
@@ -149,6 +149,8 @@ def _rule(path: Path, number: int, said: RuleConfig) -> Rule:
 
 def is_loopback(host: str) -> bool:
     """Whether what is said to this host stays on this machine."""
+    import ipaddress
+
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from typing import Final
 
 from failover.errors import RightsError
@@ -63,7 +62,11 @@ def _opened(pattern: tuple[str, ...], places: set[int]) -> set[int]:
 
 
 def _split(text: str, what: str) -> list[str]:
-    normal = unicodedata.normalize("NFKC", text.translate(_SEPARATORS))
+    normal = text.translate(_SEPARATORS)
+    if not normal.isascii():
+        import unicodedata  # half a megabyte, for paths that need it
+
+        normal = unicodedata.normalize("NFKC", normal)
     steps = normal.removeprefix("/").split("/")
     try:
         size = len(text.encode())
