@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import signal
@@ -20,6 +21,10 @@ SERVICE: Final = "cn=service,dc=lab"
 SECRET: Final = "of the service account"
 ADMIN, ADMIN_SECRET = "cn=admin,dc=lab", "of the administrator"
 MANY: Final = 10_000
+COMMANDS: Final = ("slapd", "slapadd", "openssl")
+WHERE: Final = f"{os.environ['PATH']}:/usr/sbin"
+REQUIRED: Final = "FAILOVER_TEST_LDAP"
+"""With the value ``required`` in the environment, what is missing here is an error."""
 
 CONFIGURATION: Final = """
 {schemas}
@@ -39,6 +44,21 @@ index objectClass,uid,member,uniqueMember,memberUid eq
 access to attrs=userPassword by anonymous auth by * none
 access to * by users read by * none
 """
+
+
+def why_not() -> str:
+    """Why there can be no such server here; "" if there can.
+
+    Raises:
+        RuntimeError: there must be one, because the environment says so.
+    """
+    lacks = [command for command in COMMANDS if shutil.which(command, path=WHERE) is None]
+    if importlib.util.find_spec("ldap") is None:
+        lacks.append("python-ldap")
+    reason = f"needs {', '.join(lacks)}: ./run test as root installs what it lacks" if lacks else ""
+    if reason and os.environ.get(REQUIRED) == "required":
+        raise RuntimeError(reason)
+    return reason
 
 
 def people(many: int) -> str:
@@ -126,7 +146,7 @@ class Slapd:
         self.process.send_signal(number)
 
     def _started(self, name: str, *words: str) -> subprocess.Popen[bytes]:
-        command = shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin")
+        command = shutil.which(name, path=WHERE)
         assert command is not None
         user = ORDINARY if os.geteuid() == 0 else None
         groups: list[int] | None = [] if user else None

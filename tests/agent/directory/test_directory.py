@@ -24,12 +24,10 @@ from agent.directory.server import LdapServer, UnknownUserError, WrongPasswordEr
 from agent.errors import DirectoryError
 from failover.config.rights import RIGHTS_FILE, LdapConfig
 from failover.core.rights.rules import NEVER_BY_DEFAULT, VERBS, Subject, decide, make_rule
-from tests.agent.directory.slapd import ADMIN, ADMIN_SECRET, MANY, PASSWORD, SECRET, SERVICE, Slapd, dn, make_certificate
+from tests.agent.directory.slapd import ADMIN, ADMIN_SECRET, MANY, PASSWORD, SECRET, SERVICE, Slapd, dn, make_certificate, why_not
 from tests.failover.core.rights.table import CASES, GROUPS, MONDAY_NOON, RULES, expected
 
-ldap = pytest.importorskip("ldap", reason="python-ldap is not installed: failover[ldap]")
-
-pytestmark = [pytest.mark.command("slapd"), pytest.mark.command("slapadd"), pytest.mark.command("openssl")]
+pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "-")
 
 
 @pytest.fixture(scope="module")
@@ -209,6 +207,8 @@ def test_a_server_that_is_back_is_asked_again(alive: Slapd, tmp_path: Path) -> N
 def test_a_user_who_is_removed_at_the_server_is_gone_after_the_refresh_and_leaves_no_copy(alive: Slapd, tmp_path: Path) -> None:
     clocks = Clocks()
     answers = clocks.answers(alive, tmp_path, refresh_s=300)
+    import ldap
+
     admin = ldap.initialize(f"ldap://127.0.0.1:{alive.port}")
     admin.simple_bind_s(ADMIN, ADMIN_SECRET)
     person = [("objectClass", [b"inetOrgPerson"]), ("cn", [b"gone"]), ("sn", [b"gone"]), ("userPassword", [b"secret"])]
