@@ -15,7 +15,7 @@ from typing import Final, Protocol
 
 import msgspec
 
-from agent.directory.messages import Answer, Question
+from agent.directory.messages import Answer, Question, spelled_age
 from agent.directory.server import UnknownUserError, WrongPasswordError
 from agent.errors import DirectoryError
 from checkpoint.errors import UNDECODABLE
@@ -89,7 +89,7 @@ class Answers:
             return Answer(refusal=f"{tries} wrong passwords of {user}: try again in {until - self._now_s():.0f} s")
         copy = self._copies.get(user)
         if copy and not strict and self._now_s() < self._fresh.get(user, 0.0) and copy.takes(password):
-            return Answer(copy.groups)
+            return Answer(copy.groups, away=self._away[1], age_s=self._calendar_s() - copy.at)
         away, reason = self._away
         if strict or self._now_s() >= away or copy is None:
             try:
@@ -124,17 +124,20 @@ class Answers:
 
     def _by_copy(self, question: Question, copy: Copy | None, reason: str) -> Answer:
         """While the server is away."""
+        none = "the directory does not answer, and"
         if question.verb in NEVER_BY_DEFAULT and not self._config.offline_program:
-            return Answer(refusal=f"{question.verb} needs a live answer of the directory, and there is none: {reason}")
+            sentence = f"{question.verb} needs a live answer of the directory, and there is none"
+            return Answer(refusal=f"{sentence}: {reason}", away=reason)
         if copy is None:
-            return Answer(refusal=f"the directory does not answer, and there is no copy of {question.user}: {reason}")
+            return Answer(refusal=f"{none} there is no copy of {question.user}: {reason}", away=reason)
         age_s = self._calendar_s() - copy.at
         if not 0 <= age_s <= self._config.cache_h * 3_600:
             why = "from the future: this robot's calendar is wrong" if age_s < 0 else f"older than {self._config.cache_h} h"
-            return Answer(refusal=f"the directory does not answer, and the copy of {question.user} is {why}: {reason}")
+            return Answer(refusal=f"{none} the copy of {question.user} is {why}: {reason}", away=reason)
         if not copy.takes(question.password):
             return self._counted(question, f"not the password of {question.user} that the directory last took: {reason}")
-        return Answer(copy.groups, copy=f"rights by a copy {_age(age_s)} old, for the directory does not answer: {reason}")
+        told = f"rights by a copy {spelled_age(age_s)} old, for the directory does not answer: {reason}"
+        return Answer(copy.groups, copy=told, away=reason, age_s=age_s)
 
     def _counted(self, question: Question, sentence: str) -> Answer:
         """One wrong password more."""
@@ -178,7 +181,3 @@ def _read(path: Path) -> dict[str, Copy]:
 
 def _digest(password: str, salt: bytes) -> bytes:
     return hashlib.scrypt(password.encode("utf-8", "surrogatepass"), salt=salt, dklen=32, **SCRYPT)
-
-
-def _age(age_s: float) -> str:
-    return f"{age_s / 3_600:.0f} h" if age_s >= 5_400 else f"{age_s / 60:.0f} min"

@@ -54,7 +54,8 @@ class DirectoryProcess:
             return channel.receive()[0]
         except (ChannelError, TimeoutError, OSError) as error:
             self.close()
-            return Answer(refusal=f"the directory process gave no answer ({error}); see the agent's log")
+            reason = f"the directory process gave no answer ({error}); see the agent's log"
+            return Answer(refusal=reason, away=reason)
 
     def _opened(self) -> Channel[Answer]:
         if self._channel is not None and self._child is not None and self._child.poll() is None:

@@ -288,7 +288,8 @@ VERBS: Final = (
         "who may do what: the rules, and why one user may or may not",
         """
         rights.toml of the team directory says which groups may do what, where and when (docs/rights.md). Without it root, the
-        agent's user and each component's owner have the rights. No agent is needed. failover rights ACT --help explains an act.
+        agent's user and each component's owner have the rights. An agent is needed only for groups that a directory server tells.
+        failover rights ACT --help explains an act.
 
           failover rights list
           failover rights why user1 call University/Lab/Robotino/Engines/3/PWM

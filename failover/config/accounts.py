@@ -39,6 +39,14 @@ def subject_of(uid: int, groups: Mapping[str, Sequence[str]]) -> Subject:
         return Subject(f"uid:{uid}", uid=uid)
 
 
+def uid_of(user: str) -> int | None:
+    """The account's number; None without an account."""
+    try:
+        return pwd.getpwnam(user).pw_uid
+    except (KeyError, ValueError):
+        return None
+
+
 def name_of(uid: int) -> str:
     """The account's name; "" without an account."""
     try:

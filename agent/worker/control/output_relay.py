@@ -7,6 +7,7 @@ the output, and any request to a robot without checkpoints, is read at the robot
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any, Final, Protocol
 
 from agent.config import Settings
@@ -28,6 +29,12 @@ POLL_S: Final = 0.02
 
 PIECE_SIZE: Final = 128 << 10
 """Bytes read from another robot at a time: less than the replication link's largest message."""
+
+CHECK_S: Final = 1.0
+"""How long a client that watches reads on by a right that it may have lost."""
+
+Check = Callable[[], Awaitable[bool]]
+"""Whether a rule lets the client read on; raises `RefusedError` where the rules say no. False: there are no rules."""
 
 LIVING: Final = ("alive", "suspect")
 
@@ -51,19 +58,22 @@ class OutputRelay:
         self._gate = gate
 
     async def pass_on(
-        self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool, permitted: bool = False
+        self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool, check: Check | None = None
     ) -> tuple[int, int]:
         """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record.
 
         Args:
             committed: only what no takeover can take back; all of it once it has ended.
-            permitted: a rule lets this user read it, whoever it belongs to.
+            check: asked again and again whether a rule lets this user read it, whoever it belongs to; raises where it does not.
 
         Raises:
-            RefusedError: another robot has them, and went away.
+            RefusedError: another robot has them, and went away; or the user may not read on.
         """
         at = dict(zip(STREAMS, offsets, strict=True))
+        now_s, permitted, again_s = asyncio.get_running_loop().time, False, 0.0
         while True:
+            if check is not None and now_s() >= again_s:
+                permitted, again_s = await check(), now_s() + CHECK_S
             over, elsewhere = await self._standing(name)
             whole = over or not committed or (not follow and await self._has_ended(name))
             sent = False

@@ -16,14 +16,16 @@ from agent.config import Settings
 from agent.errors import RefusedError
 from agent.main_loop.messages import Told
 from agent.system.permissions import may, without_output
-from agent.worker.control.arguments import NameArguments, StatusArguments, WhyArguments, arguments_of
+from agent.worker.control.arguments import NameArguments, RightsArguments, StatusArguments, WhyArguments, arguments_of
 from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.control.status_view import version
 from agent.worker.control.why_view import Telling
 from agent.worker.network.remote_orders import Errands, Order
 from failover.client.health import is_healthy
+from failover.config import accounts
 from failover.core import acts, events
+from failover.core.rights.rules import Subject
 from failover.core.types import State
 
 SIGHT_PATIENCE_S: Final = 2.0
@@ -82,6 +84,7 @@ class Questions:
             "ping": self.ping,
             "status": self.status,
             "why": self.why,
+            "rights": self.rights,
             **dict.fromkeys(WORK, self._no_work),
         }
 
@@ -145,6 +148,7 @@ class Questions:
             _join(mine, {robot: picture for robot, picture in zip(living, answers, strict=True) if picture})
             mine["healthy"] = is_healthy(mine)
         mine["components"] = await self._shown(uid, mine["components"])
+        mine["rights"] = self._gate.standing() if self._gate is not None else ""
         return mine
 
     async def _shown(self, uid: int, components: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -152,8 +156,7 @@ class Questions:
         if (gate := self._rules()) is None:
             return [_shown_to(uid, one) for one in components]
         asker = await gate.subject(uid, "see")
-        seen = [one for one in components if gate.decision(asker, "see", one["name"], one.get("owner"))]
-        return [one if gate.decision(asker, "read", one["name"], one.get("owner")) else without_output(one) for one in seen]
+        return [_by_rules(gate, asker, one) for one in components if gate.decision(asker, "see", one["name"], one.get("owner"))]
 
     async def _reachable(self) -> list[str]:
         """The robots that live and can be asked."""
@@ -181,6 +184,19 @@ class Questions:
             hidden = {one for one in names if one and not gate.decision(asker, "see", one, (await self._view(one)).get("owner"))}
             told = {**told, "story": [line for line in told["story"] if line["component"] not in hidden]}
         return told if may(say.caller.uid, None) else {**told, "story": without_output(told["story"])}
+
+    async def rights(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """May a user do something, and by which rule? Of another user root may ask, and users with the right ``grant``."""
+        wanted = arguments_of(RightsArguments, "rights", arguments)
+        if (gate := self._rules()) is None:
+            raise RefusedError("this robot has no rights.toml; failover rights why decides that without an agent")
+        uid = say.caller.uid
+        if not may(uid, None) and await asyncio.to_thread(accounts.name_of, uid) != wanted.user:
+            await gate.check(uid, "grant", wanted.path)
+        owner = (await self._view("/" + wanted.path.removeprefix("/"))).get("owner")
+        answer, subject = await gate.explained(wanted.user, wanted.right, wanted.path, owner)
+        told = {"allow": answer.allow, "because": answer.because, "groups": sorted(subject.groups)}
+        return told | {"place": answer.rule.place if answer.rule is not None else ""}
 
     async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""
@@ -224,6 +240,13 @@ def _shown_to(uid: int, one: dict[str, Any]) -> dict[str, Any]:
     """A component as a user may see it; a name may be another user's at another robot, while that has not heard the news."""
     elsewhere = {robot: _shown_to(uid, seen) for robot, seen in one.get("elsewhere", {}).items()}
     seen = one if may(uid, one.get("owner")) else without_output(one)
+    return {**seen, "elsewhere": elsewhere} if "elsewhere" in one else seen
+
+
+def _by_rules(gate: RightsGate, asker: Subject, one: dict[str, Any]) -> dict[str, Any]:
+    """The same by the rules of rights."""
+    elsewhere = {robot: _by_rules(gate, asker, seen) for robot, seen in one.get("elsewhere", {}).items()}
+    seen = one if gate.decision(asker, "read", one["name"], one.get("owner")) else without_output(one)
     return {**seen, "elsewhere": elsewhere} if "elsewhere" in one else seen
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from agent.directory.client import DirectoryProcess
-from agent.directory.messages import Question
+from agent.directory.messages import Question, spelled_age
 from agent.errors import RefusedError
 from agent.system.permissions import may
 from failover.config import accounts, rights
@@ -28,6 +29,7 @@ RIGHT_OF: Final = {
     "ping": "see",
     "status": "see",
     "why": "see",
+    "rights": "see",
     "logs": "read",
     "run": "start",
     "protect": "start",
@@ -55,6 +57,8 @@ class RightsGate:
         self._rights: Rights | None = None
         self._mistake = ""
         self._directory: DirectoryProcess | None = None
+        self._answered_at: float | None = None
+        self._away = ""
 
     @property
     def has_rules(self) -> bool:
@@ -79,7 +83,41 @@ class RightsGate:
         if config.source == "file":
             found = await asyncio.to_thread(accounts.subject_of, uid, config.groups)
             return replace(found, stands_above=may(uid, None))
-        return await self._by_directory(uid, verb)
+        return await self._by_directory(await asyncio.to_thread(accounts.name_of, uid), uid, verb)
+
+    async def explained(self, user: str, verb: str, path: str, owner: int | None) -> tuple[Decision, Subject]:
+        """May a user, named as the robot's accounts or the directory name it, do this; and who that is.
+
+        Raises:
+            RefusedError: who it is cannot be known.
+        """
+        uid = await asyncio.to_thread(accounts.uid_of, user)
+        if uid is not None:
+            subject = await self.subject(uid, verb)
+        elif self._rights is None or self._rights.config.source == "file":
+            raise RefusedError(f"this robot has no user {user!r}; see getent passwd", "RightsError")
+        else:
+            subject = await self._by_directory(user, None, verb)
+        return self.decision(subject, verb, path, owner), subject
+
+    def standing(self) -> str:
+        """One sentence for the status: by which rules and whose groups rights are decided, what is wrong; "" without a file."""
+        if not self.has_rules:
+            return ""
+        if self._mistake or self._rights is None:
+            return f"no user but root has any: {self._mistake}; mend the file, failover-agent check names the next mistake"
+        config, many = self._rights.config, len(self._rights.rules)
+        told = f"{many} rule{'s' * (many != 1)} of {self._path}; groups"
+        if config.source == "file":
+            return f"{told} of this machine"
+        told = f"{told} by {config.ldap.server}"
+        ago = spelled_age(time.monotonic() - self._answered_at) if self._answered_at is not None else None
+        if not self._away:
+            return f"{told}, {'not asked yet' if ago is None else f'which answered {ago} ago'}"
+        since = f"for {ago}" if ago is not None else "since the agent began, or the file changed"
+        copies = f"copies of {config.ldap.cache_h} h at most serve" if config.ldap.cache_h else "no copy serves (cache_h = 0)"
+        but = "" if config.ldap.offline_program else ", never for program and grant"
+        return f"{told}, which has not answered {since} ({self._away}): {copies}{but}; start the server, or mend [rights.ldap]"
 
     def decision(self, subject: Subject, verb: str, path: str, owner: int | None) -> Decision:
         """May this subject do this there?
@@ -111,17 +149,21 @@ class RightsGate:
             self._directory.close()
             self._directory = None
 
-    async def _by_directory(self, uid: int, verb: str) -> Subject:
-        name = await asyncio.to_thread(accounts.name_of, uid)
+    async def _by_directory(self, name: str, uid: int | None, verb: str) -> Subject:
+        """A user by its name in the directory; ``uid``: its number on this robot, None where it has no account here."""
+        is_above = uid is not None and may(uid, None)
         if not name:
-            return Subject(f"uid:{uid}", uid=uid, stands_above=may(uid, None))
+            return Subject(f"uid:{uid}", uid=uid, stands_above=is_above)
         if self._directory is None:
             self._directory = DirectoryProcess(*self._places)
         answer = await self._directory.ask(Question(name, verb))
-        if answer.refusal and not answer.is_stranger:
+        self._away = answer.away
+        if not answer.away:
+            self._answered_at = time.monotonic() - answer.age_s
+        if answer.refusal and (uid is None or not answer.is_stranger):
             raise RefusedError(f"no right can be given to {name}: {answer.refusal}", "PermissionError")
         named = f"uid:{uid}" if answer.is_stranger else f"ldap:{name}"
-        return Subject(named, frozenset(answer.groups), uid=uid, stands_above=may(uid, None), copy=answer.copy)
+        return Subject(named, frozenset(answer.groups), uid=uid, stands_above=is_above, copy=answer.copy)
 
     def _refresh(self) -> None:
         """Read the file if it is another one than the last that was read."""
@@ -137,6 +179,7 @@ class RightsGate:
             return
         self.close()  # it has read the older one
         self._read_at, self._rights, self._mistake = at, None, ""
+        self._answered_at, self._away = None, ""
         try:
             self._rights = rights.read(self._path.parent)
         except FailoverError as error:

@@ -329,8 +329,15 @@ class Verbs(Questions):
         wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
         await self._check_right(say.caller.uid, name, "read")
+
+        async def permitted() -> bool:
+            if self._rules() is None:
+                return False
+            await self._check_right(say.caller.uid, name, "read")
+            return True
+
         totals = await self._output_relay.pass_on(
-            say, name, wanted.offsets, committed=True, follow=wanted.follow, permitted=self._rules() is not None
+            say, name, wanted.offsets, committed=True, follow=wanted.follow, check=permitted
         )
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}

@@ -1,4 +1,4 @@
-"""rights list, rights why: the rules, and what they say to one question, by the file and the groups of this machine."""
+"""rights list, rights why: the rules, and what they say to one question; the agent tells groups that a directory server knows."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from failover.cli.connection import connect
 from failover.cli.output import render
 from failover.config import accounts
 from failover.config import rights as rights_file
 from failover.config.rights import Rights
 from failover.core.rights import hours
 from failover.core.rights.rules import Decision, Rule, Subject, decide, without_rules
-from failover.errors import RequestError
+from failover.errors import NoAgentError
 
 
 def show(arguments: argparse.Namespace) -> int:
@@ -43,14 +44,32 @@ def show(arguments: argparse.Namespace) -> int:
 def why(arguments: argparse.Namespace) -> int:
     """One question, the answer and its reason. Exit status 1: it is denied."""
     found = rights_file.read(Path(arguments.directory))
-    subject = _subject(arguments.user, found, arguments.groups)
-    answer = _answer(found, subject, arguments)
-    if arguments.json:
-        told = {"allow": answer.allow, "because": answer.because, "groups": sorted(subject.groups)}
-        render.as_json(told | {"place": answer.rule.place if answer.rule is not None else ""})
+    if found is not None and found.config.source == "ldap" and arguments.groups is None:
+        told = _asked(arguments)
     else:
-        print(answer.because)
-    return 0 if answer else 1
+        subject = _subject(arguments.user, found, arguments.groups)
+        answer = _answer(found, subject, arguments)
+        told = {"allow": answer.allow, "because": answer.because, "groups": sorted(subject.groups)}
+        told |= {"place": answer.rule.place if answer.rule is not None else ""}
+    if arguments.json:
+        render.as_json(told)
+    else:
+        print(told["because"])
+    return 0 if told["allow"] else 1
+
+
+def _asked(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The agent's answer, which knows the directory server.
+
+    Raises:
+        NoAgentError: there is none; says what to do without.
+    """
+    try:
+        with connect(arguments) as agent:
+            return agent.ask("rights", user=arguments.user, right=arguments.right, path=arguments.path)
+    except NoAgentError as error:
+        sentence = f"the agent asks the directory server for the groups of {arguments.user}, and {error}"
+        raise NoAgentError(f"{sentence}; without an agent name groups to try: --groups a,b") from error
 
 
 def _answer(found: Rights | None, subject: Subject, arguments: argparse.Namespace) -> Decision:
@@ -61,16 +80,10 @@ def _answer(found: Rights | None, subject: Subject, arguments: argparse.Namespac
 
 
 def _subject(user: str, found: Rights | None, groups: str | None) -> Subject:
-    """The user as this machine knows it, or with the groups that were given.
-
-    Raises:
-        RequestError: its groups cannot be known here.
-    """
+    """The user as this machine knows it, or with the groups that were given."""
     of_ldap = found is not None and found.config.source == "ldap"
     if groups is not None:
         return Subject(f"{'ldap' if of_ldap else 'user'}:{user}", frozenset(filter(None, groups.split(","))))
-    if of_ldap:
-        raise RequestError(f"the groups of {user} are known to the directory server; name those to try with --groups a,b")
     return accounts.subject_named(user, found.config.groups if found is not None else {})
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import shutil
 import signal
 import socket
 import subprocess
+import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 ORDINARY: Final = 65534
 """Its user, where the tests have root's rights."""
+
+AS_ORDINARY: Final = ("setpriv", f"--reuid={ORDINARY}", f"--regid={ORDINARY}", "--clear-groups")
 
 SCHEMAS: Final = ("core", "cosine", "nis", "inetorgperson")
 PASSWORD: Final = "right for {}"
@@ -105,8 +110,9 @@ def group(name: str, *members: str) -> str:
 class Slapd:
     """One server. ``port``: plain and StartTLS; ``port_tls``: ldaps; ``certificate``: what its clients must trust."""
 
-    def __init__(self, place: Path, many: int) -> None:
+    def __init__(self, place: Path, many: int, within: Sequence[str] = ()) -> None:
         self.place = place
+        self._within = tuple(within)
         self.port, self.port_tls = _free_port(), _free_port()
         self.certificate = place / "certificate"
         self.process: subprocess.Popen[bytes] | None = None
@@ -128,11 +134,10 @@ class Slapd:
         self.process = self._started("slapd", "-d", "0", "-f", str(self.place / "slapd.conf"), "-h", urls)
         while True:
             assert self.process.poll() is None, (self.place / "said").read_text()
-            try:
-                socket.create_connection(("127.0.0.1", self.port_tls)).close()
+            probe = [*self._within, "bash", "-c", f": </dev/tcp/127.0.0.1/{self.port_tls}"]
+            if subprocess.run(probe, stderr=subprocess.DEVNULL, check=False).returncode == 0:
                 return
-            except ConnectionRefusedError:
-                time.sleep(0.02)
+            time.sleep(0.02)
 
     def kill(self) -> None:
         """As a power cut does."""
@@ -148,10 +153,27 @@ class Slapd:
     def _started(self, name: str, *words: str) -> subprocess.Popen[bytes]:
         command = shutil.which(name, path=WHERE)
         assert command is not None
-        user = ORDINARY if os.geteuid() == 0 else None
-        groups: list[int] | None = [] if user else None
-        said = (self.place / "said").open("ab")
-        return subprocess.Popen([command, *words], stdout=said, stderr=said, user=user, group=user, extra_groups=groups)
+        become = [*self._within, *AS_ORDINARY] if os.geteuid() == 0 else []
+        with (self.place / "said").open("ab") as said:
+            return subprocess.Popen([*become, command, *words], stdout=said, stderr=said)
+
+
+@contextlib.contextmanager
+def filled(many: int, within: Sequence[str] = ()) -> Iterator[Slapd]:
+    """A server that serves, with so many groups of one user.
+
+    Args:
+        within: what to put before its command line, to have it in another network.
+    """
+    place = Path(tempfile.mkdtemp(prefix="slapd-"))
+    place.chmod(0o755)
+    server = Slapd(place, many, within)
+    try:
+        server.start()
+        yield server
+    finally:
+        server.kill()
+        shutil.rmtree(place)
 
 
 def make_certificate(place: Path) -> None:

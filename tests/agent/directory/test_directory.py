@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import re
 import shutil
@@ -24,7 +23,19 @@ from agent.directory.server import LdapServer, UnknownUserError, WrongPasswordEr
 from agent.errors import DirectoryError
 from failover.config.rights import RIGHTS_FILE, LdapConfig
 from failover.core.rights.rules import NEVER_BY_DEFAULT, VERBS, Subject, decide, make_rule
-from tests.agent.directory.slapd import ADMIN, ADMIN_SECRET, MANY, PASSWORD, SECRET, SERVICE, Slapd, dn, make_certificate, why_not
+from tests.agent.directory.slapd import (
+    ADMIN,
+    ADMIN_SECRET,
+    MANY,
+    PASSWORD,
+    SECRET,
+    SERVICE,
+    Slapd,
+    dn,
+    filled,
+    make_certificate,
+    why_not,
+)
 from tests.failover.core.rights.table import CASES, GROUPS, MONDAY_NOON, RULES, expected
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "-")
@@ -42,18 +53,6 @@ def alive() -> Iterator[Slapd]:
     """A server of the test's own, which it may kill and start."""
     with filled(1) as server:
         yield server
-
-
-@contextlib.contextmanager
-def filled(many: int) -> Iterator[Slapd]:
-    """A server that serves, with so many groups of one user."""
-    place = Path(tempfile.mkdtemp(prefix="slapd-"))
-    place.chmod(0o755)
-    server = Slapd(place, many)
-    server.start()
-    yield server
-    server.kill()
-    shutil.rmtree(place)
 
 
 def config_of(slapd: Slapd, **other: object) -> LdapConfig:

@@ -76,4 +76,7 @@ def test_the_commands_tell_the_rules_and_one_answer(tmp_path: Path) -> None:
     assert (yes.returncode, json.loads(yes.stdout)["allow"]) == (0, True)
     assert (no.returncode, json.loads(no.stdout)["allow"]) == (1, False)
     stranger = typed("why", "no-such-user", "see", "a")
+    written(tmp_path, LDAP.format("ldaps://10.0.0.7"))
+    alone = typed("why", "anna", "see", "a", "--socket", str(tmp_path / "none"))
+    assert alone.returncode == 3 and "name groups to try: --groups a,b" in json.loads(alone.stdout)["message"]
     assert stranger.returncode == 1 and "has no user 'no-such-user'" in json.loads(stranger.stdout)["message"]

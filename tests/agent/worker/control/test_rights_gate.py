@@ -131,6 +131,31 @@ def test_a_change_of_the_file_holds_from_the_next_question_on(asked: Asked, tmp_
     assert asked("ping")["robot"] == "robot1"
 
 
+def test_the_status_says_by_which_rules_and_what_is_wrong_with_them(asked: Asked, tmp_path: Path) -> None:
+    path = tmp_path / RIGHTS_FILE
+    root = os.geteuid()
+    assert asked("status", uid=root)["rights"] == ""
+    path.write_text(RULES)
+    assert asked("status", uid=root)["rights"] == f"2 rules of {path}; groups of this machine"
+    path.write_text(RULES.replace("[rights.groups]", "[rights.grups]"))
+    told = asked("status", uid=root)["rights"]
+    assert re.match(rf"no user but root has any: {re.escape(str(path))}:2: unknown key 'grups'.*; mend the file", told), told
+
+
+def test_why_is_answered_with_the_rule_that_decides(asked: Asked, tmp_path: Path) -> None:
+    own = {"user": "nobody", "right": "read", "path": "/lab/robot1/mine"}
+    with pytest.raises(RefusedError, match=r"has no rights\.toml"):
+        asked("rights", **own)
+    (tmp_path / RIGHTS_FILE).write_text(RULES)
+    answer = asked("rights", **own)
+    assert answer["allow"] and answer["place"] == f"{tmp_path / RIGHTS_FILE}:10" and "watchers" in answer["groups"]
+    assert not asked("rights", **own | {"path": "/lab/robot1/open"})["allow"]
+    with pytest.raises(RefusedError, match="may not grant"):
+        asked("rights", **own | {"user": "root"})
+    with pytest.raises(RefusedError, match="has no user 'no-such-user'"):
+        asked("rights", uid=os.geteuid(), **own | {"user": "no-such-user"})
+
+
 def test_root_is_never_shut_out_of_the_robots_own_console(asked: Asked, tmp_path: Path) -> None:
     everything = '[[rights.rules]]\ngroups = ["@all"]\ndeny = true\nverbs = ["*"]\npaths = ["**"]\n'
     away = '[rights]\nsource = "ldap"\n[rights.ldap]\nserver = "ldap://127.0.0.1:1"\nbase = "dc=x"\ntls = "none"\n'
