@@ -7,6 +7,7 @@ of the team.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import os
 from collections.abc import Callable
@@ -106,12 +107,15 @@ class Questions:
         """The path that a verb is about, and the owner of the component there; this robot where no component is named."""
         own = f"/{self._lines.settings.team.team}/{self._lines.settings.config.robot}"
         name = str(arguments.get("name", ""))
+        if not name and verb == "run":
+            argv = arguments.get("argv")
+            name = named_after(argv[0] if isinstance(argv, list) and argv else "")
         if not name:
             return own, None
-        if verb in ("run", "protect"):
-            name = name if name.startswith("/") else f"{own}/{name}"
-        else:
-            name = await self._known(name)
+        if verb not in ("run", "protect"):
+            with contextlib.suppress(RefusedError):  # the verb refuses it, once the rules have: its sentence tells names
+                name = await self._known(name)
+        name = name if name.startswith("/") else f"{own}/{name}"
         return name, (await self._view(name)).get("owner")
 
     def errands(self) -> dict[str, Order]:
@@ -234,6 +238,11 @@ class Questions:
             raise RefusedError(f"{wanted!r} could be {', '.join(sorted(fitting))}; give the whole name", "UnknownComponentError")
         known = ", ".join(sorted(name for name, state in names.items() if state is not State.RELEASED)) or "nothing"
         raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
+
+
+def named_after(command: object) -> str:
+    """The last part of a component's name that is made from its command."""
+    return os.path.basename(str(command)) or "program"
 
 
 def _shown_to(uid: int, one: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import os
 from collections.abc import Callable, Iterable
 from typing import Any, Final, Protocol
 
@@ -32,9 +31,9 @@ from agent.worker.control.arguments import (
     arguments_of,
 )
 from agent.worker.control.output_relay import OutputRelay
-from agent.worker.control.queries import Lines, Questions
+from agent.worker.control.queries import Lines, Questions, named_after
 from agent.worker.control.quotas import check_components
-from agent.worker.control.rights_gate import RightsGate
+from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.network.remote_orders import Order
 from checkpoint.device_rules import RULES_MAX, rule_from, travelling
@@ -132,6 +131,8 @@ class Verbs(Questions):
             raise RefusedError(f"run: {error}") from error
         inheritance = inheritance_for(say.caller, wanted.user)
         name = await self._fresh_name(wanted.name, wanted.argv[0], say.caller.uid)
+        if not wanted.name and (gate := self._rules()) is not None:  # it has got a number, perhaps
+            await gate.check(say.caller.uid, RIGHT_OF["run"], name)
         launch = Launch(
             tuple(wanted.argv),
             tuple(self._environment(name, wanted).items()),
@@ -445,7 +446,7 @@ class Verbs(Questions):
         told = await self._worker.ask("status")
         known = {one.name: one for one in told.status.components} if told.status else {}
         if not wanted:
-            stem = own + (os.path.basename(command) or "program")
+            stem = own + named_after(command)
             numbered = (stem, *(f"{stem}-{number}" for number in range(2, len(known) + 3)))
             free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
             wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)

@@ -116,6 +116,19 @@ def test_an_order_is_refused_with_the_sentence_why(asked: Asked, tmp_path: Path,
         asked("stop", name="mine")
 
 
+def test_a_program_without_a_name_is_decided_by_the_name_that_it_gets(asked: Asked, tmp_path: Path) -> None:
+    (tmp_path / RIGHTS_FILE).write_text(RULES)
+    with pytest.raises(RefusedError, match=rf"uid:{NOBODY} may not start /lab/robot1/mapper: no rule"):
+        asked("run", argv=["/usr/bin/mapper"])
+
+
+def test_a_refusal_tells_no_names_to_a_user_who_may_not_see_them(asked: Asked, tmp_path: Path) -> None:
+    (tmp_path / RIGHTS_FILE).write_text(RULES)
+    with pytest.raises(RefusedError, match=r"may not operate /lab/robot1/unknown") as refused:
+        asked("stop", name="unknown")
+    assert "secret" not in str(refused.value)
+
+
 def test_a_change_of_the_file_holds_from_the_next_question_on(asked: Asked, tmp_path: Path) -> None:
     path = tmp_path / RIGHTS_FILE
     path.write_text(RULES)
