@@ -35,6 +35,10 @@ class LaneError(AgentError):
     """The replication link could not be opened, or a peer on it broke the rules."""
 
 
+class DirectoryError(AgentError):
+    """The organisation's directory cannot be asked who a user is, or its answer cannot be used."""
+
+
 class RefusedError(AgentError):
     """A request on the control socket cannot be served.
 

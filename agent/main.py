@@ -55,6 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
             return _mend(settings, arguments)
         if command == "check":
             _check_pair(settings)
+            _check_rights(Path(settings.config.team_directory))
             peers = ", ".join(settings.peers) or "none"
             print(f"{config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
             return 0
@@ -104,6 +105,13 @@ def _check_pair(settings: configuration.Settings) -> None:
             f"{public[:8]}…, the team has {enrolled[:8]}…, so no other robot would accept this one; bring the right key or the "
             f"newest team.toml here, or make a new pair by failover team enrol {robot} HOST --replace"
         )
+
+
+def _check_rights(directory: Path) -> None:
+    """Raises FileMistakeError: rights.toml has a mistake, so that root alone has rights here. An agent runs all the same."""
+    from failover.config import rights
+
+    rights.read(directory)
 
 
 def _run(settings: configuration.Settings) -> int:

@@ -105,6 +105,18 @@ class NameFormatError(FailoverError):
     """A name of a robot, a team or a component is not of the documented form."""
 
 
+class RightsError(FailoverError):
+    """A rule, a verb or a path of rights is not of the documented form; names the cure.
+
+    Attributes:
+        key: the key of the rule that is wrong ("groups", "verbs", "paths", "hours"); "" for the rule as a whole.
+    """
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
+
+
 class StateError(FailoverError):
     """Something about the state that a program keeps (``failover.state``) does not work.
 

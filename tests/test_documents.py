@@ -20,6 +20,7 @@ from agent.worker.control import status_view
 from agent.worker.network.replication_link import LinkState
 from failover.cli import parser
 from failover.config.board import BoardConfig, ItemConfig
+from failover.config.rights import LdapConfig, RightsConfig, RuleConfig
 from failover.config.team import Robot
 
 ROOT = Path(__file__).parent.parent
@@ -133,6 +134,9 @@ def defaults(kind: type[Any]) -> dict[str, object]:
         ("team.toml: who belongs", Robot),
         ("team.toml: the board", BoardConfig),
         ("team.toml: one item of the board", ItemConfig),
+        ("rights.toml: who may do what", RightsConfig),
+        ("rights.toml: one rule", RuleConfig),
+        ("rights.toml: the directory server", LdapConfig),
     ],
 )
 def test_every_key_and_its_default_are_told(heading: str, kind: type[Any]) -> None:

@@ -56,6 +56,7 @@ DOORS = {
     "ptrace": ("checkpoint/linux/trace/tracee.py",),
     "zstandard": ("checkpoint/snapshot/compression.py",),
     "zmq": ("agent/worker/network/replication_link.py",),
+    "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),
     "rich": ("failover/cli/output/render.py",),
@@ -240,6 +241,7 @@ def test_each_dependency_enters_through_its_door() -> None:
 DATACLASSES = {
     "failover/task/period.py": "a field that is not shown",
     "failover/config/board.py": "read from TOML by its fields",
+    "failover/config/rights.py": "read from TOML by its fields",
     "failover/config/team.py": "read from TOML by its fields",
     "failover/state/record_libraries.py": "programs have some",
     "failover/config/strict_toml.py": "reads TOML into them",

@@ -25,11 +25,18 @@ STARTED: Final = "SYSTEMD_EXEC_PID"
 STOP_S: Final = 5
 """How long a shutdown waits for a component to obey SIGTERM; one that is frozen never does, and the default is 90 s."""
 
-Kind = Literal["guard", "keeper", "hook"]
+Kind = Literal["guard", "keeper", "hook", "directory"]
 
 PROPERTIES: Final[dict[Kind, tuple[str, ...]]] = {
     "guard": ("Delegate=yes", f"TimeoutStopSec={STOP_S}s", "OOMScoreAdjust=-900", "UMask=0077"),
     "keeper": (f"TimeoutStopSec={STOP_S}s", "LimitNOFILE=65536", "UMask=0077"),
+    "directory": (
+        f"TimeoutStopSec={STOP_S}s",
+        "UMask=0077",
+        "NoNewPrivileges=yes",
+        "PrivateDevices=yes",
+        "ProtectHome=read-only",
+    ),
     "hook": (f"TimeoutStopSec={STOP_S}s", "KillSignal=SIGKILL"),
 }
 """Without its guard a program ends, so memory is taken from others first; a keeper is replaced; of a hook nothing outlives its

@@ -26,7 +26,9 @@ from agent.main_loop import messages
 from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, Told, ToWorker
 from agent.system import syscalls
 from agent.system.log_setup import set_up_log
+from agent.system.systemd_units import starter
 from agent.worker.control.queries import QUESTIONS, Questions
+from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import ControlServer
 from agent.worker.network.connections import BULK, AllConnections
 from agent.worker.network.link_monitor import Wires
@@ -69,6 +71,7 @@ class Switchboard:
 
     Attributes:
         verbs: what people may ask of it.
+        gate: who may.
     """
 
     verbs: Questions
@@ -77,6 +80,7 @@ class Switchboard:
         self.settings = settings
         config = settings.config
         self._runtime = Path(config.runtime_directory)
+        self.gate = RightsGate(Path(config.team_directory), Path(config.state_directory), starter())
         self._main_loop = main_loop
         self._outgoing: asyncio.Queue[messages.ToMainLoop] = asyncio.Queue()
         self._numbers = itertools.count(1)
@@ -149,7 +153,7 @@ class Switchboard:
         self._say(await self.prepare())
         self._wires.watch()
         self._connections.open()
-        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.table())
+        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.gated())
         await server.open()
         syscalls.give_back()  # what the start has left
         try:
@@ -157,6 +161,7 @@ class Switchboard:
         finally:
             loop.remove_reader(self._main_loop.fileno())
             await server.close()
+            self.gate.close()
             self._wires.close()
             await self.errands.close()
             await self.stop_work()

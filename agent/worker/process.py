@@ -97,7 +97,7 @@ class Worker(Switchboard):
             sockets, state / "logs", self._process_pool, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
         self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
-        self.connect(Verbs(self))
+        self.connect(Verbs(self, self.gate))
 
     async def prepare(self) -> Inventory:
         """Open the store, find what outlived the last agent."""

@@ -27,7 +27,7 @@ class Witness(Switchboard):
 
     def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         super().__init__(settings, main_loop)
-        self.connect(Questions(self))
+        self.connect(Questions(self, self.gate))
 
     async def prepare(self) -> Inventory:
         """Nothing is kept here and nothing runs here."""

@@ -284,6 +284,20 @@ VERBS: Final = (
         "failover.cli.verbs.team:show",
     ),
     Verb(
+        "rights",
+        "who may do what: the rules, and why one user may or may not",
+        """
+        rights.toml of the team directory says which groups may do what, where and when (docs/rights.md). Without it root, the
+        agent's user and each component's owner have the rights. An agent is needed only for groups that a directory server tells.
+        failover rights ACT --help explains an act.
+
+          failover rights list
+          failover rights why user1 call University/Lab/Robotino/Engines/3/PWM
+        """,
+        arguments.rights,
+        "failover.cli.verbs.rights:show",
+    ),
+    Verb(
         "board",
         "the team's board: the robots' items with value, age and rate; get and put one",
         """

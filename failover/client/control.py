@@ -25,6 +25,7 @@ verb           arguments                                                result, 
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
 ``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
 ``why``        ``name`` "", ``robot`` "", ``age_ms_max`` 0               see `WHY`
+``rights``     ``user``, ``right``, ``path``, all *must*                ``{allow, because, groups, place}``
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*                                          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
@@ -55,6 +56,7 @@ insecure: links are neither authenticated nor encrypted
 realtime: the main loop runs at real-time priority with its memory locked
 rule, promise: the rule by which the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
+rights: one sentence: by which rules and whose groups rights are decided here, and what is wrong; "" without rights.toml
 memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of main loop and worker, and of the keepers of
     components that run here; remembered: of these, what pages are remembered in, of all components together, and its bound
     (xor_cache of agent.toml); None of a witness

@@ -39,6 +39,9 @@ def misfit(value: object, hint: Any, at: tuple[str, ...] = ()) -> tuple[tuple[st
 def _entries(value: object, hint: Any) -> Iterator[tuple[str, object, Any]]:
     """What a value is made of, each with its own type: keys that are chosen from a list before the entries that they name."""
     kinds = typing.get_args(hint) if _is_union(hint) else (hint,)
+    if isinstance(value, list):
+        tables = [inner for kind in kinds for inner in typing.get_args(kind) if dataclasses.is_dataclass(inner)]
+        yield from ((str(number), entry, inner) for number, entry in enumerate(value) for inner in tables[:1])
     if not isinstance(value, Mapping):
         return
     for kind in kinds:

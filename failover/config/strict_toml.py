@@ -83,6 +83,10 @@ def _unknown(table: Mapping[str, Any], kind: Any, at: tuple[str, ...]) -> Iterat
             for name, entry in value.items() if named else [("", value)]:
                 if isinstance(entry, dict):
                     yield from _unknown(entry, inner, (*at, key, name) if named else (*at, key))
+        elif inner is not None and isinstance(value, list):
+            for number, entry in enumerate(value):
+                if isinstance(entry, dict):
+                    yield from _unknown(entry, inner, (*at, key, str(number)))
 
 
 def _plain(hint: Any) -> Any:
@@ -94,11 +98,11 @@ def _plain(hint: Any) -> Any:
 
 
 def _nested(hint: Any) -> Any:
-    """The dataclass that a table, or every entry of a table of tables, must be; None for plain values."""
+    """The dataclass that a table, or every entry of a table or an array of tables, must be; None for plain values."""
     hint = _plain(hint)
     if dataclasses.is_dataclass(hint):
         return hint
-    arguments = typing.get_args(hint)
+    arguments = [argument for argument in typing.get_args(hint) if argument is not Ellipsis]
     entry = _plain(arguments[-1]) if arguments else None
     return entry if dataclasses.is_dataclass(entry) else None
 
@@ -125,14 +129,19 @@ def _wrong_value(path: Path, text: str, message: str) -> str:
 def line_of(text: str, keys: tuple[str, ...]) -> int:
     """The line on which a key stands, from 1; of its table, or the nearest, if the key itself is not found.
 
-    Inner names that are not known exactly (msgspec says only "some entry") match any table.
+    Inner names that are not known exactly (msgspec says only "some entry") match any table. A table of an array (``[[rules]]``)
+    has its number, from 0, as its last name: ("rules", "2").
     """
     table: tuple[str, ...] = ()
+    numbers: dict[tuple[str, ...], int] = {}
     best = 1
     for number, line in enumerate(text.splitlines(), 1):
         header = _TABLE.match(line)
         if header is not None:
             table = _split(header["path"])
+            if line.lstrip().startswith("[["):
+                numbers[table] = numbers.get(table, -1) + 1
+                table = (*table, str(numbers[table]))
             if table == keys:
                 return number
             best = number if best == 1 and _is_near(table, keys) else best

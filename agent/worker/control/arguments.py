@@ -16,6 +16,9 @@ SIGNAL_MAX: Final = 64
 PID_MAX: Final = (1 << 31) - 1
 """The largest value of a pid_t."""
 
+USER_SIZE_MAX: Final = 256
+"""Characters of a user's name: what useradd(8) takes."""
+
 Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
 """Text that the kernel can be told: a string of C ends with a NUL."""
 
@@ -73,6 +76,14 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     devices: dict[Text, Text] = {}
     connections: Connections = ""
     shared_memory: SharedMemory = ""
+
+
+class RightsArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``rights``."""
+
+    user: Annotated[str, msgspec.Meta(min_length=1, max_length=USER_SIZE_MAX)]
+    right: str
+    path: str
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -7,16 +7,18 @@ the output, and any request to a robot without checkpoints, is read at the robot
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any, Final, Protocol
 
 from agent.config import Settings
 from agent.errors import RefusedError
 from agent.guard.output_logs import STREAMS, OutputLogs
 from agent.main_loop.messages import Told
-from agent.system.permissions import check_right
+from agent.system.permissions import ROOT, check_right
 from agent.worker.components.paths import Places, log_directory
 from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.arguments import PieceArguments, arguments_of
+from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import Conversation
 from agent.worker.network.remote_orders import Errands
 from checkpoint.model import OutputPiece
@@ -27,6 +29,12 @@ POLL_S: Final = 0.02
 
 PIECE_SIZE: Final = 128 << 10
 """Bytes read from another robot at a time: less than the replication link's largest message."""
+
+CHECK_S: Final = 1.0
+"""How long a client that watches reads on by a right that it may have lost."""
+
+Check = Callable[[], Awaitable[bool]]
+"""Whether a rule lets the client read on; raises `RefusedError` where the rules say no. False: there are no rules."""
 
 LIVING: Final = ("alive", "suspect")
 
@@ -45,27 +53,32 @@ class Worker(Protocol):
 class OutputRelay:
     """Reads streams, here or elsewhere."""
 
-    def __init__(self, worker: Worker) -> None:
+    def __init__(self, worker: Worker, gate: RightsGate | None = None) -> None:
         self._worker = worker
+        self._gate = gate
 
     async def pass_on(
-        self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool
+        self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool, check: Check | None = None
     ) -> tuple[int, int]:
         """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record.
 
         Args:
             committed: only what no takeover can take back; all of it once it has ended.
+            check: asked again and again whether a rule lets this user read it, whoever it belongs to; raises where it does not.
 
         Raises:
-            RefusedError: another robot has them, and went away.
+            RefusedError: another robot has them, and went away; or the user may not read on.
         """
         at = dict(zip(STREAMS, offsets, strict=True))
+        now_s, permitted, again_s = asyncio.get_running_loop().time, False, 0.0
         while True:
+            if check is not None and now_s() >= again_s:
+                permitted, again_s = await check(), now_s() + CHECK_S
             over, elsewhere = await self._standing(name)
             whole = over or not committed or (not follow and await self._has_ended(name))
             sent = False
             for stream in STREAMS:
-                piece = await self._read(name, elsewhere, stream, at[stream], not whole, say.caller.uid)
+                piece = await self._read(name, elsewhere, stream, at[stream], not whole, say.caller.uid, permitted)
                 if piece.content:
                     await say.output(stream, piece.offset, piece.content)
                     at[stream] = piece.offset + len(piece.content)
@@ -81,13 +94,20 @@ class OutputRelay:
         if wanted.stream not in STREAMS:
             raise RefusedError(f"piece: {wanted.stream} is no stream; 1 is standard output, 2 standard error")
         view, _ = await self._view(wanted.name)
-        check_right(by, wanted.name, view.owner if view is not None else None)
+        owner = view.owner if view is not None else None
+        if self._gate is not None and self._gate.has_rules:
+            await self._gate.check(by, "read", wanted.name, owner)
+            by = ROOT
+        else:
+            check_right(by, wanted.name, owner)
         piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name), by)
         return {"offset": piece.offset, "content": piece.content}
 
-    async def _read(self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
+    async def _read(
+        self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int, permitted: bool
+    ) -> OutputPiece:
         if not robot:
-            return self._read_here(name, stream, offset, committed, by)
+            return self._read_here(name, stream, offset, committed, ROOT if permitted else by)
         told = await self._worker.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
         return OutputPiece(stream, told["offset"], told["content"])
 

@@ -7,6 +7,8 @@ of the team.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import os
 from collections.abc import Callable
 from typing import Any, Final, Protocol
@@ -15,13 +17,16 @@ from agent.config import Settings
 from agent.errors import RefusedError
 from agent.main_loop.messages import Told
 from agent.system.permissions import may, without_output
-from agent.worker.control.arguments import NameArguments, StatusArguments, WhyArguments, arguments_of
+from agent.worker.control.arguments import NameArguments, RightsArguments, StatusArguments, WhyArguments, arguments_of
+from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.control.status_view import version
 from agent.worker.control.why_view import Telling
 from agent.worker.network.remote_orders import Errands, Order
 from failover.client.health import is_healthy
+from failover.config import accounts
 from failover.core import acts, events
+from failover.core.rights.rules import Subject
 from failover.core.types import State
 
 SIGHT_PATIENCE_S: Final = 2.0
@@ -65,8 +70,13 @@ class Lines(Protocol):
 class Questions:
     """The verbs of the control socket that every member has."""
 
-    def __init__(self, lines: Lines) -> None:
+    def __init__(self, lines: Lines, gate: RightsGate | None = None) -> None:
+        """
+        Args:
+            gate: the rules of rights; None: there are none.
+        """
         self._lines = lines
+        self._gate = gate
         self._telling = Telling(lines)
 
     def table(self) -> dict[str, Verb]:
@@ -75,8 +85,38 @@ class Questions:
             "ping": self.ping,
             "status": self.status,
             "why": self.why,
+            "rights": self.rights,
             **dict.fromkeys(WORK, self._no_work),
         }
+
+    def gated(self) -> dict[str, Verb]:
+        """The same, each behind the rules of rights."""
+        return {name: functools.partial(self._gated, name, verb) for name, verb in self.table().items()}
+
+    async def _gated(self, name: str, verb: Verb, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Do what is asked, if the rules let this user; without rules each verb has its own."""
+        if (gate := self._rules()) is not None:
+            path, owner = await self._about(name, arguments)
+            await gate.check(say.caller.uid, RIGHT_OF[name], path, owner)
+        return await verb(say, arguments)
+
+    def _rules(self) -> RightsGate | None:
+        return self._gate if self._gate is not None and self._gate.has_rules else None
+
+    async def _about(self, verb: str, arguments: dict[str, Any]) -> tuple[str, int | None]:
+        """The path that a verb is about, and the owner of the component there; this robot where no component is named."""
+        own = f"/{self._lines.settings.team.team}/{self._lines.settings.config.robot}"
+        name = str(arguments.get("name", ""))
+        if not name and verb == "run":
+            argv = arguments.get("argv")
+            name = named_after(argv[0] if isinstance(argv, list) and argv else "")
+        if not name:
+            return own, None
+        if verb not in ("run", "protect"):
+            with contextlib.suppress(RefusedError):  # the verb refuses it, once the rules have: its sentence tells names
+                name = await self._known(name)
+        name = name if name.startswith("/") else f"{own}/{name}"
+        return name, (await self._view(name)).get("owner")
 
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: how things stand here."""
@@ -111,8 +151,16 @@ class Questions:
             answers = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
             _join(mine, {robot: picture for robot, picture in zip(living, answers, strict=True) if picture})
             mine["healthy"] = is_healthy(mine)
-        mine["components"] = [_shown_to(uid, one) for one in mine["components"]]
+        mine["components"] = await self._shown(uid, mine["components"])
+        mine["rights"] = self._gate.standing() if self._gate is not None else ""
         return mine
+
+    async def _shown(self, uid: int, components: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """The components that a user may see, as the user may see them."""
+        if (gate := self._rules()) is None:
+            return [_shown_to(uid, one) for one in components]
+        asker = await gate.subject(uid, "see")
+        return [_by_rules(gate, asker, one) for one in components if gate.decision(asker, "see", one["name"], one.get("owner"))]
 
     async def _reachable(self) -> list[str]:
         """The robots that live and can be asked."""
@@ -134,7 +182,25 @@ class Questions:
         wanted = arguments_of(WhyArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
         told = await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
+        if (gate := self._rules()) is not None:
+            asker = await gate.subject(say.caller.uid, "see")
+            names = {line["component"] for line in told["story"]}
+            hidden = {one for one in names if one and not gate.decision(asker, "see", one, (await self._view(one)).get("owner"))}
+            told = {**told, "story": [line for line in told["story"] if line["component"] not in hidden]}
         return told if may(say.caller.uid, None) else {**told, "story": without_output(told["story"])}
+
+    async def rights(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """May a user do something, and by which rule? Of another user root may ask, and users with the right ``grant``."""
+        wanted = arguments_of(RightsArguments, "rights", arguments)
+        if (gate := self._rules()) is None:
+            raise RefusedError("this robot has no rights.toml; failover rights why decides that without an agent")
+        uid = say.caller.uid
+        if not may(uid, None) and await asyncio.to_thread(accounts.name_of, uid) != wanted.user:
+            await gate.check(uid, "grant", wanted.path)
+        owner = (await self._view("/" + wanted.path.removeprefix("/"))).get("owner")
+        answer, subject = await gate.explained(wanted.user, wanted.right, wanted.path, owner)
+        told = {"allow": answer.allow, "because": answer.because, "groups": sorted(subject.groups)}
+        return told | {"place": answer.rule.place if answer.rule is not None else ""}
 
     async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""
@@ -174,10 +240,22 @@ class Questions:
         raise RefusedError(f"no component is called {wanted!r}; this team protects {known}", "UnknownComponentError")
 
 
+def named_after(command: object) -> str:
+    """The last part of a component's name that is made from its command."""
+    return os.path.basename(str(command)) or "program"
+
+
 def _shown_to(uid: int, one: dict[str, Any]) -> dict[str, Any]:
     """A component as a user may see it; a name may be another user's at another robot, while that has not heard the news."""
     elsewhere = {robot: _shown_to(uid, seen) for robot, seen in one.get("elsewhere", {}).items()}
     seen = one if may(uid, one.get("owner")) else without_output(one)
+    return {**seen, "elsewhere": elsewhere} if "elsewhere" in one else seen
+
+
+def _by_rules(gate: RightsGate, asker: Subject, one: dict[str, Any]) -> dict[str, Any]:
+    """The same by the rules of rights."""
+    elsewhere = {robot: _by_rules(gate, asker, seen) for robot, seen in one.get("elsewhere", {}).items()}
+    seen = one if gate.decision(asker, "read", one["name"], one.get("owner")) else without_output(one)
     return {**seen, "elsewhere": elsewhere} if "elsewhere" in one else seen
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import os
 from collections.abc import Callable, Iterable
 from typing import Any, Final, Protocol
 
@@ -32,8 +31,9 @@ from agent.worker.control.arguments import (
     arguments_of,
 )
 from agent.worker.control.output_relay import OutputRelay
-from agent.worker.control.queries import Lines, Questions
+from agent.worker.control.queries import Lines, Questions, named_after
 from agent.worker.control.quotas import check_components
+from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.network.remote_orders import Order
 from checkpoint.device_rules import RULES_MAX, rule_from, travelling
@@ -65,10 +65,10 @@ class Worker(Lines, Protocol):
 class Verbs(Questions):
     """Every verb of the control socket."""
 
-    def __init__(self, worker: Worker) -> None:
-        super().__init__(worker)
+    def __init__(self, worker: Worker, gate: RightsGate | None = None) -> None:
+        super().__init__(worker, gate)
         self._worker = worker
-        self._output_relay = OutputRelay(worker)
+        self._output_relay = OutputRelay(worker, gate)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -106,7 +106,7 @@ class Verbs(Questions):
     async def _permitted(self, order: Order, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Carry an order out here, if its user may give it."""
         name = await self._known(str(arguments.get("name", "")))
-        await self._check_right(by, name)
+        await self._check_right(by, name, "operate")
         return await order({**arguments, "name": name}, by)
 
     async def _order(self, verb: str, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -131,6 +131,8 @@ class Verbs(Questions):
             raise RefusedError(f"run: {error}") from error
         inheritance = inheritance_for(say.caller, wanted.user)
         name = await self._fresh_name(wanted.name, wanted.argv[0], say.caller.uid)
+        if not wanted.name and (gate := self._rules()) is not None:  # it has got a number, perhaps
+            await gate.check(say.caller.uid, RIGHT_OF["run"], name)
         launch = Launch(
             tuple(wanted.argv),
             tuple(self._environment(name, wanted).items()),
@@ -327,8 +329,17 @@ class Verbs(Questions):
         """The component's output as far as no takeover can take it back; all of it once it has ended."""
         wanted = arguments_of(LogsArguments, "logs", arguments)
         name = await self._known(wanted.name)
-        await self._check_right(say.caller.uid, name)
-        totals = await self._output_relay.pass_on(say, name, wanted.offsets, committed=True, follow=wanted.follow)
+        await self._check_right(say.caller.uid, name, "read")
+
+        async def permitted() -> bool:
+            if self._rules() is None:
+                return False
+            await self._check_right(say.caller.uid, name, "read")
+            return True
+
+        totals = await self._output_relay.pass_on(
+            say, name, wanted.offsets, committed=True, follow=wanted.follow, check=permitted
+        )
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 
@@ -411,14 +422,19 @@ class Verbs(Questions):
 
     async def _command(self, by: int, make: Callable[[int], events.Command]) -> acts.Answer:
         """Have the core decide, by the right of this user. Raises RefusedError: it says no."""
-        answer = await self._worker.command(lambda number: replace(make(number), by=asking(by)))
+        asks = None if self._rules() is not None else asking(by)  # the rules have been asked
+        answer = await self._worker.command(lambda number: replace(make(number), by=asks))
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return answer
 
-    async def _check_right(self, uid: int, name: str) -> None:
-        """Raises RefusedError: the component is another user's."""
-        check_right(uid, name, (await self._view(name)).get("owner"))
+    async def _check_right(self, uid: int, name: str, right: str) -> None:
+        """Raises RefusedError: the rules say no; or, without rules, the component is another user's."""
+        owner = (await self._view(name)).get("owner")
+        if (gate := self._rules()) is None:
+            check_right(uid, name, owner)
+        else:
+            await gate.check(uid, right, name, owner)
 
     async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
         """A name for something new: as given, under this robot's own path, or made from the command.
@@ -430,7 +446,7 @@ class Verbs(Questions):
         told = await self._worker.ask("status")
         known = {one.name: one for one in told.status.components} if told.status else {}
         if not wanted:
-            stem = own + (os.path.basename(command) or "program")
+            stem = own + named_after(command)
             numbered = (stem, *(f"{stem}-{number}" for number in range(2, len(known) + 3)))
             free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
             wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)

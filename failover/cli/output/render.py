@@ -129,6 +129,8 @@ def plain_tree(status: dict[str, Any]) -> str:
     lines += team_tree.ready_copies(status)
     if status.get("fencing"):
         lines.append(f"fencing: {status['fencing']}")
+    if status.get("rights"):
+        lines.append(f"rights: {status['rights']}")
     return "\n".join([*lines, *(f"note: {line}" for line in team_tree.remarks(status))])
 
 
@@ -214,6 +216,8 @@ def _rich_tree(status: dict[str, Any]) -> Any:
     parts += [Text(spoken(line), style="dim") for line in (*team_tree.memory(status), *team_tree.ready_copies(status))]
     if status.get("fencing"):
         parts.append(Text(spoken(f"fencing: {status['fencing']}"), style="dim"))
+    if status.get("rights"):
+        parts.append(Text(spoken(f"rights: {status['rights']}"), style="dim"))
     return Group(*parts, *(Text(spoken(line), style="yellow") for line in team_tree.remarks(status)))
 
 
