@@ -19,8 +19,8 @@ from failover.boards import directory
 
 HERE: Final = Path(__file__).parent
 PERIOD_NS: Final = 10_000_000
-COUNT: Final = 10_000
-ROUNDS: Final = 5
+COUNT: Final = 3_000
+ROUNDS: Final = 3
 """The loops take turns, so that load beside them hits all alike."""
 PRIORITY: Final = 50
 BARE: Final = "clock_nanosleep in a bare loop"

@@ -147,7 +147,7 @@ struct ft_task {
     char name[FT_NAME_MAX_ + 1];
     ft_terms wanted;
     char *after[FT_AFTER_MAX];
-    bool is_at_agents, is_declared, has_ordered, is_missed;
+    bool is_at_agents, is_declared, is_known, has_ordered, is_missed;
     int state;
     ft_bank_ terms, ordered;
     ft_course_ course;
@@ -563,14 +563,60 @@ static inline void ft_start_course_(ft_task *task)
     ft_publish_(task);
 }
 
+/* The row of the task; FT_TASKS_MAX_: it is not declared. */
+static inline uint32_t ft_find_row_(ft_task *task)
+{
+    uint32_t row = 0;
+    while (row < FT_TASKS_MAX_ && !(ft_is_declared_(task->map, row) && ft_is_named_(task->map, row, task->name)))
+        row++;
+    return row;
+}
+
+/* Become the process that runs a row. One that resumes waits up to 5 s for a former life of itself to end. */
+static inline bool ft_take_row_(ft_task *task, uint32_t row)
+{
+    const struct timespec pause = {0, 10000000};
+    for (int turn = 0; !fb_take_(task->file, FT_ROW_LOCKS_ + row); turn++) {
+        if (task->pid == 0 || turn == 500)
+            return false;
+        nanosleep(&pause, NULL);
+    }
+    return true;
+}
+
+/* Keep the terms of a task that others declared: where this program resumes on another robot it declares them there. */
+static inline void ft_remember_(ft_task *task)
+{
+    const ft_bank_ *terms = &task->terms;
+    if (task->is_declared)
+        return;
+    task->wanted.period_ns = (int64_t)terms->period;
+    task->wanted.phase_ns = (int64_t)terms->phase;
+    task->wanted.deadline_ns = (int64_t)terms->deadline;
+    task->wanted.at_ns = (int64_t)terms->at + (terms->period != 0 ? 0 : task->skew);
+    task->wanted.budget_ns = (int64_t)terms->budget;
+    task->wanted.overrun = terms->overrun;
+    task->wanted.is_strict = (terms->flags & FT_STRICT_) != 0;
+    for (int place = 0; place < FT_AFTER_MAX; place++) {
+        free(task->after[place]);
+        task->after[place] = place < terms->count ? strdup((const char *)ft_row_(task->map, terms->after[place]) + FT_NAME_) : NULL;
+        task->wanted.after[place] = task->after[place];
+    }
+    task->is_known = true;
+}
+
 /* Find or declare the row, and become the process that runs it. 1: the table was made anew meanwhile. */
 static inline int ft_attach_(ft_task *task)
 {
     uint64_t generation;
+    uint32_t found;
     int outcome = ft_map_(task);
     if (outcome != 0)
         return outcome;
-    if (task->is_declared) {
+    found = ft_find_row_(task);
+    if (found < FT_TASKS_MAX_ && !ft_take_row_(task, found))
+        return ft_taken_(task, found);
+    if (task->is_declared || (task->is_known && found == FT_TASKS_MAX_)) {
         outcome = fb_take_table_(task->file, task->directory);
         if (outcome != 0)
             return outcome;
@@ -584,9 +630,7 @@ static inline int ft_attach_(ft_task *task)
         if (outcome != 0)
             return outcome;
     }
-    for (task->row = 0; task->row < FT_TASKS_MAX_; task->row++)
-        if (ft_is_declared_(task->map, task->row) && ft_is_named_(task->map, task->row, task->name))
-            break;
+    task->row = ft_find_row_(task);
     if (task->row == FT_TASKS_MAX_)
         return fb_fail_(ENOENT, "the schedule %.400s has no task %s; declare it, or give its terms", task->directory, task->name);
     if (!fb_take_(task->file, FT_ROW_LOCKS_ + task->row))
@@ -595,8 +639,10 @@ static inline int ft_attach_(ft_task *task)
     outcome = ft_read_terms_(task->map, task->row, &task->terms, &task->adopted);
     if (outcome == 0 && task->terms.kind > FT_ONE_SHOT_)
         outcome = fb_fail_(ENOTSUP, "task %s is sporadic: only Python runs such tasks", task->name);
-    if (outcome == 0)
+    if (outcome == 0) {
+        ft_remember_(task);
         ft_start_course_(task);
+    }
     return outcome;
 }
 
@@ -716,6 +762,12 @@ static inline void ft_order_(ft_task *task)
     task->adopted = serial;
     if (outcome != 0 || terms.kind > FT_ONE_SHOT_)
         return; /* damaged: the task goes on as before */
+    if (!task->is_declared) {
+        ft_bank_ in_force = task->terms;
+        task->terms = terms;
+        ft_remember_(task);
+        task->terms = in_force;
+    }
     if ((terms.flags & FT_AT_NEXT_) != 0 && task->state != FT_DONE_) {
         task->ordered = terms;
         task->has_ordered = true;

@@ -530,11 +530,13 @@ def trace(room: argparse.ArgumentParser) -> None:
     room.add_argument("-o", "--output", metavar="FILE", required=True, help="where to write it")
     room.add_argument("--for", dest="span", metavar="TIME", default="10s", help="how long to look (default: 10s)")
     _place_of_board(room)
+    _json(room)
 
 
 def wait_activation(room: argparse.ArgumentParser) -> None:
     """Of ``failover wait-activation``."""
     room.add_argument("-q", "--quiet", action="store_true", help="say nothing")
+    _json(room)
 
 
 HISTOGRAM_DESCRIPTION: Final = """

@@ -367,6 +367,7 @@ VERBS: Final = (
         The activation before ends, and the next one begins when this returns. It says number, instant at which the activation was
         due, lateness (both in nanoseconds), and how many were missed before it. Exit status 1: there is no next one.
 
+          failover wait-activation
           while failover wait-activation -q; do df / >> disk.log; done
         """,
         arguments.wait_activation,

@@ -18,6 +18,7 @@ from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout, orders
 from failover.core.schedule.activation import State
 from failover.core.schedule.orders import Change
+from failover.core.schedule.terms import Declaration, Terms
 from tests.include.board_programs import place_for_board
 from tests.include.programs import STRICT, STRICT_CC, has, program
 
@@ -115,6 +116,32 @@ def test_on_a_robot_without_a_board_c_and_python_share_the_agents_place(tmp_path
     assert layout.read_live(file.table, 0).counts.ended == 2
     assert (file.header.flags, oct((place / SCHEDULE_NAME).stat().st_mode & 0o777)) == (0, "0o660")
     file.close()
+
+
+def test_a_task_in_c_that_others_declared_takes_its_terms_along_to_another_schedule(place: Path) -> None:
+    with failover.board(), failover.scheduled("keep", period=1000):
+        file = opened(place)
+        declared = Declaration("c", Terms(period_ns=5 * MS, phase_ns=2 * MS, budget_ns=MS), ("odometry",))
+        file.give(lambda rows, held: orders.added(rows, [declared], held))
+        with loop("c", "-", 0, 0, 0, "-", 0, 0) as process:
+            line(process)
+            file.give(lambda rows, held: orders.changed(rows, [Change("c", {"period_ns": 10 * MS})], held))
+            row = file.row_of("c") or 0
+            while layout.read_live(file.table, row).adopted != layout.serial_of(file.table, row):
+                line(process)
+            (place / SCHEDULE_NAME).unlink()  # as where the program resumes on another robot
+            file.words[layout.GENERATION_AT // 8] = layout.GONE
+            file.close()
+            while not (place / SCHEDULE_NAME).exists():
+                line(process)
+            while ended_of(place, "c") < 3:
+                line(process)
+            file = opened(place)
+            rows = {row.name: row.terms for row in file.rows().values()}
+            file.close()
+            terms = rows["c"]
+            assert terms is not None and "odometry" in rows
+            assert (terms.period_ns, terms.phase_ns, terms.budget_ns, len(terms.after)) == (10 * MS, 2 * MS, MS, 1)
 
 
 def test_the_last_program_in_c_leaves_nothing(place: Path) -> None:

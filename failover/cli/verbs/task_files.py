@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from failover.cli.output import render
 from failover.cli.verbs.tasks import given, opened
 from failover.config.quantities import span_ms
 from failover.core.schedule import orders, pman_conf
@@ -38,6 +39,9 @@ def write_trace(arguments: argparse.Namespace) -> int:
         json.dump(trace.as_events(traced), written, separators=(",", ":"))
     count, tasks = len(traced.activations), len({one.row for one in traced.activations})
     unseen = sum(traced.unseen.values())
+    if arguments.json:
+        render.as_json({"file": arguments.output, "activations": count, "tasks": tasks, "unseen": unseen})
+        return 0
     more = f"; {unseen} more began and ended between two looks" if unseen else ""
     print(f"{arguments.output}: {count} activations of {tasks} tasks{more}")
     return 0

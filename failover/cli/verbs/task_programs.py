@@ -17,6 +17,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from failover.boards import boottime
+from failover.cli.output import render
 from failover.cli.verbs.tasks import parsed, terms_of
 from failover.core.schedule.activation import Tick
 from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
@@ -166,6 +167,9 @@ def wait_activation(arguments: argparse.Namespace) -> int:
         told = link.recv(PACKET_SIZE)
     except (BrokenPipeError, ConnectionResetError):
         return 1
-    if told and not arguments.quiet:
+    if told and arguments.json:
+        numbers = (int(word) for word in told.split())
+        render.as_json(dict(zip(("number", "due_ns", "late_ns", "missed"), numbers, strict=True)))
+    elif told and not arguments.quiet:
         print(told.decode())
     return 0 if told else 1

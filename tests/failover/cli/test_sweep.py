@@ -27,6 +27,10 @@ FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/z
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")
 TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
 BOARDS = ([], ["get", "ball"], ["put", "ball", "1"], ["top"], ["users"], ["header"], ["import", "missing"], ["import", "junk"])
+TASKS = (
+    *(["ps"], ["trace", "-o", "out", "--for", "1s"], ["task", "add", "x", "period_ms=9"], ["task", "set", "x", "period_ms=9"]),
+    *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
+)
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
@@ -53,7 +57,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        statuses.append(main.main([*verb, *asked, *rest] if verb not in (("team",), ("board",)) else [*argv, *asked]))
+        statuses.append(main.main([*verb, *asked, *rest] if verb not in (("team",), ("board",), ("task",)) else [*argv, *asked]))
         said = capsys.readouterr()
         if asked:
             assert said.err == ""
@@ -101,6 +105,18 @@ def test_with_a_board_that_is_none(act: list[str], at: str, capsys: pytest.Captu
     assert sorted(Path("directory").iterdir()) == []
 
 
+@pytest.mark.parametrize("at", ["nowhere", "directory", "junk"])
+@pytest.mark.parametrize("argv", TASKS, ids=" ".join)
+def test_with_a_schedule_that_is_none(argv: list[str], at: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, *argv, "--board", at) == main.FAILED
+    assert sorted(Path("directory").iterdir()) == [] and not Path("out").exists()
+
+
+def test_with_a_program_that_no_task_runs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FAILOVER_ACTIVATION_FD", raising=False)
+    assert told(capsys, "wait-activation") == main.FAILED
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -111,4 +127,5 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     swept = {*UNDER_AN_AGENT, "restore", "inspect", "capture", "check", "team", "board", "completion"}
+    swept |= {"ps", "task", "trace", "wait-activation"}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
