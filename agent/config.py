@@ -26,7 +26,7 @@ from failover.core.wire.names import check_component
 from failover.errors import FailoverError, NameFormatError
 
 PATIENCE_S_MAX: Final = 86_400
-"""A day. Whoever would wait longer may as well promote."""
+"""A day. An operator who would wait longer can promote instead."""
 
 KEEP_MAX: Final = 10_000
 """Files of one component; each is asked for its age when the agent starts."""
@@ -55,7 +55,7 @@ class HooksConfig:
     must_prepare: bool = False
 
     def command(self, occasion: str) -> tuple[str, ...]:
-        """What is run on an occasion."""
+        """The command that the agent runs on an occasion."""
         found: tuple[str, ...] = getattr(self, occasion)
         return found
 
@@ -68,7 +68,7 @@ class DeviceConfig:
     """A rule for a device that needs more than a word.
 
     Attributes:
-        reopen: what is opened on this robot in its place; "" for itself.
+        reopen: path that the agent opens on this robot in its place; "" for itself.
         optional: where it is missing the program finds it hung up.
     """
 
@@ -78,7 +78,7 @@ class DeviceConfig:
 
 @dataclass(frozen=True, slots=True)
 class ComponentConfig:
-    """What the operator wants for one component; ``[components."/lab/robot1/mapper"]``.
+    """The operator's settings for one component; ``[components."/lab/robot1/mapper"]``.
 
     Attributes:
         on_loss: takeover: the standby runs it; hold: the standby keeps its newest checkpoint until the primary is back.
@@ -98,12 +98,12 @@ class ComponentConfig:
         directory: and in this one, an absolute path; "" for that of `failover run`.
         environment: and with these variables besides, or instead.
         hooks: this robot's own commands around it.
-        devices: what becomes of devices that it has open, by path: see `checkpoint.device_rules`.
+        devices: rules for devices that it has open, by path: see `checkpoint.device_rules`.
         connections: reset: its connections with others, of TCP and of unix sockets, end where it goes on; carry: those of TCP go
             along where it is handed over; refuse: it is not captured while it has one.
         bring_data: files that it has open for reading only are brought to its standby, as its program is, when it runs here.
         carry: files and folders that travel with it when it is started here, besides those that `failover run` names.
-        carry_limit: what they may hold while it runs here.
+        carry_limit: the most that they may hold while it runs here.
         carry_at: where they are laid down here, by their path on the other robots; the same path for those not named.
         shared: files and folders that others write to as well: they keep the content that they have here.
         shared_memory: detach: shared memory that others have mapped, too, becomes its own copy where it resumes; refuse: it is
@@ -153,17 +153,17 @@ class Config:
     Attributes:
         robot: this robot's name in the team file.
         team_directory: see `failover.config.team`.
-        state_directory: what survives a power cut: vote record, snapshots, streams.
+        state_directory: files that survive a power cut: vote record, snapshots, streams.
         runtime_directory: sockets; gone after a reboot.
-        insecure: run without keys: anybody on the network can read memory and start programs.
-        group: unix group that may use the control socket besides its owner; "" for nobody.
+        insecure: run without keys: any machine on the network can read memory and start programs.
+        group: unix group that may use the control socket besides its owner; "" for no group.
         components_per_user: that a user other than root may have here, those that have ended included.
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
         patience_s: under the majority rule: how long the robots that hold the newest checkpoint are waited for.
         boot_patience_s: under the pair rule: how long a robot that starts waits for the robots that may run a component.
-        rule: who decides that a silent robot is replaced: pair, majority, or auto: a majority wherever more than two belong.
-        when_alone: under the pair rule: when no other robot is heard, what is started here runs on, or is held still.
+        rule: how the team decides to replace a silent robot: pair, majority, or auto: a majority wherever more than two belong.
+        when_alone: under the pair rule: while this robot hears no other one, components started here run on, or are held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
@@ -280,11 +280,11 @@ class Settings:
 
     @property
     def peers(self) -> Mapping[str, Robot]:
-        """Everybody else, by name."""
+        """All members but this one, by name."""
         return {name: robot for name, robot in self.team.robots.items() if name != self.config.robot}
 
     def component(self, name: str) -> ComponentConfig:
-        """What the operator wants for a component; the defaults where nothing was said."""
+        """The operator's settings for a component; the defaults where he gave none."""
         return self.config.components.get(name, ComponentConfig())
 
 
@@ -298,7 +298,7 @@ def load(path: Path) -> Settings:
         config = strict_toml.read(path, Config)
         members = team_directory.read(Path(config.team_directory))
         if config.robot not in members.robots:
-            known = ", ".join(sorted(members.robots)) or "nobody"
+            known = ", ".join(sorted(members.robots)) or "no member"
             where = Path(config.team_directory) / team_directory.TEAM_FILE
             raise ConfigError(f"{path}: robot {config.robot!r} is not in {where}, which knows {known}; see failover team enrol")
         secret = "" if config.insecure else team_directory.read_secret_key(Path(config.team_directory), config.robot)
@@ -311,7 +311,7 @@ def load(path: Path) -> Settings:
 
 
 def _check_keys(path: Path, config: Config, members: Team) -> None:
-    """With keys everybody has one: a single robot without would stay shut out for ever, unexplained."""
+    """With keys each member needs one: a single robot without a key would stay shut out for ever, without an explanation."""
     without = sorted(name for name, robot in members.robots.items() if not robot.public_key)
     if without and not config.insecure:
         raise ConfigError(
@@ -329,7 +329,7 @@ def _check_rule(path: Path, config: Config, members: Team) -> None:
 
 
 def _check_components(path: Path, config: Config, members: Team) -> None:
-    """A table for a name that no component can have, or for a robot that nobody knows, would be obeyed by nobody."""
+    """Refuse a table for a name that no component can have, or a robot that the team does not know: it would have no effect."""
     for name, component in config.components.items():
         where = f"{path}:{strict_toml.line_of(path.read_text(), ('components', name))}"
         try:
@@ -360,17 +360,17 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
 
 
 def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:
-    """Who only votes, or only keeps checkpoints, cannot be chosen for what it never does."""
+    """A member that only votes, or only keeps checkpoints, cannot be chosen for a task that it never does."""
     if chosen and chosen not in members.robots:
         raise ConfigError(f"{where}: {key} = {chosen!r}: the team knows {', '.join(sorted(members.robots))}")
     if chosen and members.robots[chosen].role not in roles:
-        able = ", ".join(sorted(name for name, member in members.robots.items() if member.role in roles)) or "nobody"
+        able = ", ".join(sorted(name for name, member in members.robots.items() if member.role in roles)) or "members to enrol"
         what = "runs nothing" if key == "prefer" else "keeps no checkpoints"
         raise ConfigError(f"{where}: {key} = {chosen!r}: it is a {members.robots[chosen].role} and {what}; choose among {able}")
 
 
 def _check_devices(where: str, component: ComponentConfig) -> None:
-    """A rule for no device would be obeyed by nobody."""
+    """Refuse a rule that fits no device: it would have no effect."""
     if len(component.devices) > RULES_MAX:
         raise ConfigError(f"{where}: {len(component.devices)} devices; at most {RULES_MAX}")
     try:
@@ -395,7 +395,7 @@ def _check_carry(where: str, component: ComponentConfig) -> None:
 
 
 def _check_command(where: str, component: ComponentConfig) -> None:
-    """What execve(2) would not take is found now, and not when a robot is lost."""
+    """Find a command that execve(2) would not take now, and not when a robot is lost."""
     if component.command and not component.command[0]:
         raise ConfigError(f"{where}: command begins with an empty word; the first one names the program")
     if component.directory and not component.directory.startswith("/"):

@@ -16,11 +16,11 @@ from failover.core import types
 from failover.core.types import CARRY, DETACH, REFUSE, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
 
 NO_LEVEL: Final = "no"
-"""Of ``failover run --portable``: whatever this processor has, whatever the operator says."""
+"""Of ``failover run --portable``: the program may use all features of this processor, also where the operator rules otherwise."""
 
 
 def node_config(settings: Settings) -> types.Config:
-    """What the node is told at birth.
+    """The configuration that the node gets when it is made.
 
     Raises:
         RulesError: the values contradict each other.
@@ -40,7 +40,7 @@ def node_config(settings: Settings) -> types.Config:
 
 
 def retention(config: Config) -> Retention:
-    """What the store keeps for people."""
+    """How much the store keeps for people."""
     size_max = size_bytes(config.keep_size) if config.keep_size else 0
     return Retention(config.keep_checkpoints, span_ms(config.keep_for) // 1_000, size_max)
 
@@ -69,12 +69,12 @@ def rules_for(config: Config, component: ComponentConfig) -> Rules:
 
 
 def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
-    """The level of processors that a program is started for; "" for whatever this one has.
+    """The level of processors that a program is started for; "" for that of this processor.
 
     A level of another kind of processor means the usual one of this kind: a mixed team has the same words everywhere.
 
     Args:
-        wanted: of ``failover run``: a level, "no", or "" for what this robot's operator says.
+        wanted: of ``failover run``: a level, "no", or "" for the setting of this robot's operator.
     """
     said: bool | str = wanted or (config.portable if component.portable == "" else component.portable)
     if isinstance(said, bool):
@@ -85,9 +85,9 @@ def level_of(wanted: str, config: Config, component: ComponentConfig) -> str:
 
 
 def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
-    """On which terms a component comes back on this robot: what travels with it, and this robot's own, which comes in its place.
+    """The terms on which a component comes back on this robot: those that travel with it, and this robot's own in their place.
 
-    Which files it carries its snapshots say.
+    Its snapshots say which files it carries.
     """
     carry = Carry(size_max=size_bytes(component.carry_limit), places=tuple(component.carry_at.items()))
     budget_ns, overrun_ns = round(component.freeze_budget_ms * 1_000_000), round(component.freeze_overrun_s * 1_000_000_000)
@@ -111,7 +111,7 @@ def terms_here(launch: Launch | None, component: ComponentConfig) -> Terms:
 
 
 def begun_on(launch: Launch, component: ComponentConfig) -> Terms:
-    """On which terms a component begins here."""
+    """The terms on which a component begins here."""
     terms = terms_here(launch, component)
     return replace(terms, carry=replace(terms.carry, paths=launch.carry))
 

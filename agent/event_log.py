@@ -33,7 +33,7 @@ _decoder = msgspec.json.Decoder(Line)
 
 
 class Kept(Struct, frozen=True):
-    """What was found on the disk: lines, oldest first, and how many could not be read."""
+    """The event log as found on the disk: lines, oldest first, and how many could not be read."""
 
     lines: tuple[Line, ...]
     damaged: int = 0
@@ -84,7 +84,7 @@ def _contents(directory: Path) -> Iterator[bytes]:
 class EventLogFile:
     """The two halves, open for appending. One thread at a time.
 
-    Raises (all methods): OSError, from the file system; what was written before stays readable.
+    Raises (all methods): OSError, from the file system; lines written before stay readable.
     """
 
     def __init__(self, state_directory: Path) -> None:

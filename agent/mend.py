@@ -72,19 +72,19 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
 
 
 def _mended(record: Record, epoch: int, *, has_left: bool) -> Record:
-    """What is left of the record: the program and its owner, but no vote, no primary, and no robot entrusted."""
+    """The record that remains: the program and its owner, but no vote, no primary, and no robot entrusted."""
     state = State.STANDBY if has_left else State.ABSENT
     return Record(record.name, epoch, state=state, spec=record.spec, begun=record.begun or has_left)
 
 
 def _later(store: Store | None, name: str, epoch: int) -> list[tuple[int, int]]:
-    """Generation and number of what was captured under later epochs."""
+    """Generation and number of the snapshots captured under later epochs."""
     positions = store.positions(name) if store is not None else ()
     return [(one.generation, one.sequence) for one in positions if one.generation // (PEERS_MAX + 1) > epoch]
 
 
 def _check_right(directory: Path) -> None:
-    """Root may, and who runs an agent that is not root's."""
+    """Root has the right, and a user who runs an agent that is not root's."""
     try:
         owner = directory.stat().st_uid
     except OSError as error:

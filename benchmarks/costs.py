@@ -33,8 +33,8 @@ QUICK_IDLE_S: Final = 3.0
 
 TICKS_A_SECOND: Final = os.sysconf("SC_CLK_TCK")
 PARTS: Final = {
-    "agent.main": "heart",
-    "agent.worker.process": "lanes",
+    "agent.main": "main loop",
+    "agent.worker.process": "worker",
     "agent.guard.server": "guard",
     "checkpoint keeper": "keeper",
 }
@@ -147,13 +147,13 @@ def _idle(span_s: float, directory: Path) -> list[Figure]:
         time.sleep(span_s)
         after = _processor_s(parts)
         memory = {part: sum(map(pss_mb, pids)) for part, pids in parts.items()}
-    of_agent = [part for part in parts if part in ("heart", "lanes")]
+    of_agent = [part for part in parts if part in ("main loop", "worker")]
     return [
-        Figure("memory of an idle agent", "heart and lanes", "MB", (sum(memory[part] for part in of_agent),)),
+        Figure("memory of an idle agent", "main loop and worker", "MB", (sum(memory[part] for part in of_agent),)),
         *(Figure("memory of an idle agent", part, "MB", (size,)) for part, size in memory.items()),
         Figure(
             "processor time of an idle agent",
-            "heart and lanes",
+            "main loop and worker",
             "% of a core",
             (sum(after[part] - before[part] for part in of_agent) / span_s * 100,),
         ),

@@ -48,7 +48,7 @@ EARLY: Final = "taken over before its power was cut"
 EARLY_SHARE: Final = 0.2
 """Of the cuts: with more, this machine stands still too often for such a lease, and a figure would mean nothing."""
 
-PHASES: Final = ("until it counts as dead", "decision, ballot and order", "from the order to its output")
+PHASES: Final = ("until it counts as dead", "decision, vote record and order", "from the order to its output")
 
 
 @dataclass(frozen=True, slots=True)

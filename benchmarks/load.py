@@ -33,6 +33,8 @@ FROZEN: Final[dict[str, tuple[Any, ...]]] = {
 """The program and its arguments, by case."""
 DELTAS: Final = 200
 QUICK_DELTAS: Final = 40
+DELTAS_S: Final = 60.0
+"""A case ends then, whatever it has: beside eight loops a delta of the program that writes 300 MB/s takes seconds."""
 
 KEPT: Final = {
     **{
@@ -82,8 +84,10 @@ def _freezes(case: str, program: str, arguments: list[int], count: int, deltas: 
     given_up = 0
     with running(program, *arguments, directory=directory) as measured, busy(count), Keeper.spawn() as keeper:
         keeper.ask(messages.Protect(measured.pid, "/benchmark"), messages.Protected)
-        base = True
+        base, until = True, time.monotonic() + DELTAS_S
         for sequence in range(1, deltas + 2):
+            if time.monotonic() > until:
+                break
             time.sleep(PERIOD_S)
             try:
                 taken = capture(keeper, base=base, sequence=sequence)

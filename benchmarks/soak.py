@@ -39,8 +39,8 @@ DESCRIPTOR_GROWTH: Final = "descriptors, growth an hour"
 WHEN: Final = "minutes since all were protected"
 
 PARTS: Final = {
-    "agent.main": "heart",
-    "agent.worker.process": "lanes",
+    "agent.main": "main loop",
+    "agent.worker.process": "worker",
     "agent.guard.server": "guards",
     "checkpoint keeper": "keeper",
 }

@@ -23,30 +23,30 @@ SETTLE_S: Final = 1.0
 
 SETTLE_STEP_S: Final = 0.001
 STANDING: Final = frozenset("TZX")
-"""States of /proc/PID/stat in which a process runs nothing, whoever lives or dies."""
+"""States of /proc/PID/stat in which a process runs nothing, whichever other process lives or dies."""
 HELD: Final = STANDING | {"t"}
 """The same, with a tracer that holds it now: once SIGSTOP is pending, it stands also when that tracer dies."""
 
 THREADS: Final = 17
-"""Where in what `_stat` gives the number of threads is; the state is 0. Source: proc_pid_stat(5)."""
+"""The index of the number of threads in the fields of `_stat`; the state's is 0. Source: proc_pid_stat(5)."""
 
 
 class Freezer(Protocol):
-    """Something that can hold a component still. All methods raise OSError only for what should not happen."""
+    """Something that can hold a component still. All methods raise OSError only for faults that should not happen."""
 
     kind: Literal["cgroup", "SIGSTOP"]
 
     def birthplace(self) -> AbstractContextManager[None]:
-        """What this process starts within the body is born inside."""
+        """Processes that this process starts within the body are born inside."""
 
     def add(self, pid: int) -> None:
-        """Take a process that is there already, and what it starts from now on."""
+        """Take a process that is there already, and those that it starts from now on."""
 
     def freeze(self) -> bool:
         """Hold everything; True once every thread stands, False if one does not yet (it will as soon as it leaves the kernel)."""
 
     def expose(self) -> None:
-        """Hold what is frozen so that a tracer can make calls in it, too; nothing of it runs by itself meanwhile."""
+        """Hold the frozen processes so that a tracer can make calls in them, too; none of them runs by itself meanwhile."""
 
     def thaw(self) -> None:
         """Let everything go on."""
@@ -55,7 +55,7 @@ class Freezer(Protocol):
         """SIGKILL to everything, frozen or not."""
 
     def close(self) -> None:
-        """Give back what was made; everything in it has ended."""
+        """Remove what this freezer has made; all processes in it have ended."""
 
 
 class CgroupFreezer:
@@ -173,7 +173,7 @@ class SignalFreezer:
 
     @contextmanager
     def birthplace(self) -> Iterator[None]:
-        """There is no place to be: whoever is born is added."""
+        """This freezer has no place to be born in: `add` takes each new process."""
         yield
 
     def add(self, pid: int, pidfd: int = -1) -> None:
@@ -205,7 +205,7 @@ class SignalFreezer:
         """It is held by SIGSTOP already."""
 
     def thaw(self) -> None:
-        """Continue those that we stopped; what stood before by itself stays as it was."""
+        """Continue those that we stopped; a process that stood before by itself stays as it was."""
         for pid in sorted(self._stopped, reverse=True):
             self._send(pid, signal.SIGCONT)
         self._stopped.clear()
@@ -239,7 +239,7 @@ class SignalFreezer:
 
 
 CGROUP_PREFIX: Final = "failover-"
-"""Of the names of our cgroups; what follows is random: PIDs of two namespaces can be equal."""
+"""Of the names of our cgroups; the rest is random: PIDs of two namespaces can be equal."""
 
 
 def own_cgroup() -> Path | None:
@@ -303,7 +303,7 @@ def _state_of_others(pid: int) -> str:
 
 
 def _stat(whose: str) -> list[str]:
-    """What follows the name in /proc/PID/stat, or that of a thread: state, parent …; nothing if it is gone."""
+    """The fields after the name in /proc/PID/stat, or in that of a thread: state, parent …; nothing if it is gone."""
     try:
         with open(f"/proc/{whose}/stat", encoding="utf-8", errors="replace") as file:
             return file.read().rpartition(")")[2].split()

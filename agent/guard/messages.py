@@ -20,7 +20,7 @@ class Message(msgspec.Struct, frozen=True, tag=True):
 
 
 class Task(msgspec.Struct, frozen=True):
-    """What a program is told as soon as it says that it keeps its state (`checkpoint.segment.task_messages`).
+    """The guard's answer to a program that says that it keeps its state (`checkpoint.segment.task_messages`).
 
     Attributes:
         engine: as it was asked for; for `Described`.
@@ -87,7 +87,7 @@ class MakeVessel(Message, frozen=True):
 
 
 class Watch(Message, frozen=True):
-    """Look after a process that is somebody else's child: its end is noticed, its exit status is not known. With its pidfd."""
+    """Look after a process that is another process's child: its end is noticed, its exit status is not known. With its pidfd."""
 
     component: str
     pid: int
@@ -97,7 +97,7 @@ class BeginTask(Message, frozen=True):
     """Have a program begin that was started warm; under the lease given before. With its state as a segment, if it has an origin.
 
     Attributes:
-        totals: bytes that the component had written to its two streams by then; what waits in its pipes follows them.
+        totals: bytes that the component had written to its two streams by then; output that waits in its pipes follows them.
     """
 
     epoch: int
@@ -150,7 +150,7 @@ class LimitOutput(Message, frozen=True):
 
 
 class Kill(Message, frozen=True):
-    """Send the program a signal; SIGKILL goes to whatever else it started, too."""
+    """Send the program a signal; SIGKILL goes to all processes that it started, too."""
 
     signal: int
 
@@ -199,7 +199,7 @@ class Watching(Message, frozen=True):
 
 
 class Done(Message, frozen=True):
-    """What was asked has been done."""
+    """The guard has done what the agent asked."""
 
 
 class Described(Message, frozen=True):
@@ -207,7 +207,7 @@ class Described(Message, frozen=True):
 
     Attributes:
         state: none: nothing was started yet; vessel: not committed yet; waiting: started warm, and not begun yet.
-        frozen_by: who holds it: "" nobody, "order" the agent, "lease" the guard.
+        frozen_by: who holds it: "" no process, "order" the agent, "lease" the guard.
         exit_status: as wait(2) gives it; None before the end, and for a process that was not our child.
         totals: bytes written to the two streams so far.
         freezes_by: "cgroup" (invisible to the program) or "SIGSTOP".

@@ -59,7 +59,7 @@ FAR_AWAY: Final = 1 << 40
 
 
 class Bounds(Struct, frozen=True):
-    """Where one stream begins, what of it is committed, and where it ends; all in bytes from the component's first."""
+    """Where one stream begins, how far it is committed, and where it ends; all in bytes from the component's first."""
 
     start: int
     committed: int
@@ -85,7 +85,7 @@ class OutputLogs:
         """Whether old bytes can be given back here; otherwise the logs grow until the disk is full."""
 
     def close(self) -> None:
-        """Let the files go; what was written stays. Closing twice is closing once; other calls fail with EBADF from then on."""
+        """Close the files; their bytes stay. Closing twice is closing once; other calls fail with EBADF from then on."""
         opened = (self._offsets, *self._logs.values())
         self._offsets, self._logs = CLOSED, dict.fromkeys(self._logs, CLOSED)
         for descriptor in opened:
@@ -112,7 +112,7 @@ class OutputLogs:
         return bool(self._word(HELD))
 
     def hold(self, held: bool) -> None:
-        """Note, on this robot, what the component's record says of its output."""
+        """Note, on this robot, whether the component's record has its output held."""
         if held != self.is_held:
             self._set_word(HELD, int(held))
 
@@ -136,7 +136,7 @@ class OutputLogs:
         The piece says where it begins: later than asked where the beginning is no longer kept.
 
         Args:
-            committed: only what no takeover can take back, of held output only what is safe; otherwise all that was written.
+            committed: only bytes that no takeover can take back, of held output only safe ones; otherwise all that was written.
         """
         while True:
             bounds = self.bounds(stream)
@@ -154,8 +154,8 @@ class OutputLogs:
     def apply(self, pieces: Iterable[OutputPiece], *, is_safe: bool = False) -> None:
         """Make the committed stream end as a snapshot says it does. Applying the same snapshot again changes nothing.
 
-        Pieces come from the snapshots of one chain, in its order. Whatever lay beyond a piece's end was written by a history
-        that did not survive and goes. Where the log ends before a piece begins, the stream's kept part starts with the piece.
+        Pieces come from the snapshots of one chain, in its order. Bytes beyond a piece's end were written by a history that did
+        not survive; they go. Where the log ends before a piece begins, the stream's kept part starts with the piece.
 
         Args:
             is_safe: they come from another robot, so that two hold them.
@@ -183,7 +183,7 @@ class OutputLogs:
                     self._set_offset(stream, which, total)
 
     def truncate(self, totals: tuple[int, int]) -> None:
-        """Make the streams end at ``totals``, all of it committed: what a program restored from there has written so far."""
+        """Make the streams end at ``totals``, all of it committed: a program restored from there has written so much."""
         for stream, total in zip(STREAMS, totals, strict=True):
             bounds = self.bounds(stream)
             self._end_at(stream, total, total if total > bounds.size else bounds.start)
@@ -194,7 +194,7 @@ class OutputLogs:
         new = start - start % TRIM_STEP
         if not self.trims or new <= old:
             return False
-        self._set_offset(stream, START, new)  # first: nobody may be served the zeros
+        self._set_offset(stream, START, new)  # first: no reader may get the zeros
         begin = old - old % TRIM_STEP
         syscalls.punch_hole(self._logs[stream], begin, new - begin)
         return True
@@ -221,7 +221,7 @@ class OutputLogs:
 
 
 def discard(directory: Path) -> None:
-    """Begin anew: the next `OutputLogs` of this directory opens empty files; whoever has the old ones open keeps them.
+    """Begin anew: the next `OutputLogs` of this directory opens empty files; a process that has the old ones open keeps them.
 
     Raises:
         OSError: the directory cannot be written.

@@ -31,7 +31,7 @@ READ_SIZE: Final = 256 << 10
 """Bytes taken at once; the only output ever held in this process's memory."""
 
 PIPE_SIZE: Final = 256 << 10
-"""Asked of the kernel for each pipe; bounds what a snapshot carries unread. A smaller pipe works too."""
+"""Asked of the kernel for each pipe; bounds the unread bytes that a snapshot carries. A smaller pipe works too."""
 
 COUNTERS_SIZE: Final = mmap.PAGESIZE
 LINE_LIMIT: Final = 200
@@ -44,7 +44,7 @@ HOLD_LIMIT: Final = 8 << 20
 """Bytes of a stream that wait unseen at most: half of what a snapshot carries (``BACKLOG_LIMIT``), so that a standby gets all."""
 
 HOLD_POLL_S: Final = 0.02
-"""How soon the program goes on once what waited has become safe."""
+"""How soon the program goes on once the output that waited has become safe."""
 
 CUT_FLOOR: Final = TRIM_STEP
 """Bytes of a log that are never given back for want of space: newer than any snapshot still being taken."""
@@ -64,7 +64,7 @@ class Counters:
         self._words = memoryview(self._mapping).cast("Q")  # an item is stored by one eight-byte move, never in parts
 
     def begin_at(self, totals: tuple[int, int], firsts: tuple[int, int]) -> None:
-        """Before a byte is taken: what was written before this program, and where the logs begin."""
+        """Set, before a byte is taken, how much was written before this program, and where the logs begin."""
         self._words[1], self._words[3] = totals
         self._words[4], self._words[5] = firsts
 
@@ -95,7 +95,7 @@ class Counters:
 class Pump:
     """Two pipes, two logs, one thread of its own: a disk that hangs must not keep the guard from its lease.
 
-    Until `begin` what the program writes stays in its pipes, and when they are full, it waits.
+    Until `begin` the program's output stays in its pipes, and when they are full, it waits.
     """
 
     def __init__(self) -> None:
@@ -124,7 +124,7 @@ class Pump:
         return self._logs is not None
 
     def open(self, logs: OutputLogs, totals: tuple[int, int]) -> None:
-        """Say where the output goes, and what was written there before."""
+        """Say where the output goes, and how much was written there before."""
         self._logs = logs
         self.counters.begin_at(totals, (logs.bounds(1).start, logs.bounds(2).start))
 
@@ -147,7 +147,7 @@ class Pump:
         return next((line.strip()[:LINE_LIMIT] for line in reversed(said) if line.strip()), "")
 
     def drain(self, patience_s: float) -> bool:
-        """The program has ended: wait until what it left in the pipes is in the logs; False if the disk took longer."""
+        """The program has ended: wait until its last output is in the logs; False if the disk took longer."""
         self._draining = True
         os.eventfd_write(self._wake, 1)
         return self._drained.wait(patience_s)

@@ -1,4 +1,4 @@
-"""The program that a guard looks after: its start, what freezes it, its lease, and its end.
+"""The program that a guard looks after: its start, its freezes, its lease, and its end.
 
 ====================  ==================================================================================================
 state                 arrows out of it
@@ -52,7 +52,7 @@ WATCHED: Final = "failover did not start it: its exit status will not be known, 
 
 
 class ProgramError(Exception):
-    """What was asked does not fit the state; says why and what to do."""
+    """The order does not fit the state; says why and what to do."""
 
 
 class GuardedProgram(Struct):
@@ -75,7 +75,7 @@ class GuardedProgram(Struct):
     engine: str = PTRACE
     """As it was asked for."""
     offered: MakeVessel | None = None
-    """What a restored program is told when it says that it keeps its state."""
+    """The message from which a restored program learns its state, once it says that it keeps one."""
 
     # --- birth ---
 
@@ -154,7 +154,7 @@ class GuardedProgram(Struct):
         """Logs, pipes and a freezer first; the process last, into all of them.
 
         Args:
-            totals: bytes that it had written by then; None: it waits, and what it writes now stays in its pipes.
+            totals: bytes that it had written by then; None: it waits, and its output stays in its pipes.
             user: uid and gid that the pipes shall belong to, so that the program can open /dev/stdout; None: ours.
         """
         pump = Pump()
@@ -184,7 +184,7 @@ class GuardedProgram(Struct):
         return program
 
     def descriptors(self) -> tuple[int, ...]:
-        """What the keeper needs of the streams: counters, two read ends, two logs. They stay ours."""
+        """The descriptors of the streams that the keeper needs: counters, two read ends, two logs. They stay ours."""
         if self.pump is None or not self.pump.is_open:
             return ()
         reads = [self.pump.read_ends[stream] for stream in STREAMS]
@@ -192,7 +192,7 @@ class GuardedProgram(Struct):
         return (self.pump.counters.descriptor, *reads, *logs)
 
     def note_logs(self) -> None:
-        """Say what the filesystem of the logs cannot do."""
+        """Note if the filesystem of the logs cannot give old bytes back."""
         if self.pump is not None and self.pump.is_open and not self.pump.logs.trims:
             self.notes.append(NO_TRIM)
 
@@ -285,7 +285,7 @@ class GuardedProgram(Struct):
         self.frozen_by = ""
 
     def set_lease(self, until_ns: int) -> None:
-        """Take a new lease; what the old one froze goes on. What was frozen by order stays so."""
+        """Take a new lease; a program that the old one froze goes on. A program frozen by order stays so."""
         self.lease_until_ns = until_ns
         if self.frozen_by == "lease" and self.exited is None and not self._lease_is_over(now_ns()):
             self.thaw()
@@ -309,7 +309,7 @@ class GuardedProgram(Struct):
     # --- the end ---
 
     def kill(self, number: int) -> None:
-        """Send a signal; SIGKILL goes to everything that it started, too. To what has ended, nothing happens."""
+        """Send a signal; SIGKILL goes to everything that it started, too. A process that has ended gets none."""
         if self.exited is not None:
             return
         try:
@@ -345,7 +345,7 @@ class GuardedProgram(Struct):
         self.kill(signal.SIGKILL)
 
     def reap(self) -> bool:
-        """Take the status of whatever has ended, orphans too; True if the program has just ended."""
+        """Take the status of each process that has ended, orphans too; True if the program has just ended."""
         just_ended = False
         while (reaped := _reap_one()) is not None:
             pid, status = reaped
@@ -372,7 +372,7 @@ class GuardedProgram(Struct):
         self.exited = Exited(status, self.totals(), tuple(self.notes))
 
     def close(self) -> None:
-        """Give back what was made outside this process."""
+        """Remove what this object has made outside this process."""
         self.freezer.close()
 
     # --- telling ---
@@ -426,7 +426,7 @@ def _task_end(order: Start, segment: tuple[int, ...]) -> TaskEnd:
 
 
 def _open(pump: Pump, log_directory: str, totals: tuple[int, int]) -> None:
-    """Have the output go on in the logs from ``totals`` on, whatever stood there beyond."""
+    """Have the output go on in the logs from ``totals`` on; the logs lose all bytes beyond."""
     logs = OutputLogs(Path(log_directory))
     logs.truncate(totals)
     pump.open(logs, totals)

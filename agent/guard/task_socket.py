@@ -1,4 +1,4 @@
-"""The guard's end of the task socket (TASK.md): which process keeps the state, what it begins with, which commits are safe.
+"""The guard's end of the task socket (TASK.md): which process keeps the state, how it begins, which commits are safe.
 
 Nothing here waits for the program: a message that does not fit into its socket is not sent; the next message says more.
 
@@ -65,7 +65,7 @@ class TaskEnd:
     """The socket that one program is born with the name of.
 
     Attributes:
-        environment: what the program finds the socket by.
+        environment: the variable by which the program finds the socket.
         pid: of the process that keeps the state; 0 before it has said so.
         keeps: it has made a commit.
     """
@@ -78,7 +78,7 @@ class TaskEnd:
             name: where a program that was restored looks; "" for a new one.
 
         Raises:
-            OSError: somebody else listens there.
+            OSError: another process listens there.
         """
         name = name or NAME_PREFIX + secrets.token_hex(8)
         self.environment = {VARIABLE: name}
@@ -110,7 +110,7 @@ class TaskEnd:
         return self._poll.fileno()
 
     def flows_into(self, counters: int, outputs: tuple[int, int]) -> None:
-        """What the program's output goes through.
+        """Name the counters and pipes that the program's output goes through.
 
         Args:
             counters: of its streams; stays the caller's.
@@ -131,12 +131,12 @@ class TaskEnd:
         self._say_begin()
 
     def tell_safe(self, commit: int) -> None:
-        """Say that a commit is safe, if somebody listens."""
+        """Say that a commit is safe, if a program listens."""
         if self._has_begun and commit > self._newest_told and self._say(Safe(commit)):
             self._newest_told = commit
 
     def heed(self) -> tuple[Told, ...]:
-        """Do what is to be done now; what the agent should hear of it."""
+        """Handle the packets that have come; return the events that the agent should hear of."""
         told: list[Told] = []
         for _ in range(PACKETS_A_TURN):
             ready = self._poll.poll(0, 1)
@@ -220,7 +220,7 @@ class TaskEnd:
         return [TaskKeeps(self.pid)]
 
     def _hang_up(self) -> list[Told]:
-        """Nobody is there any more; a state that nothing was committed to may be kept by somebody else."""
+        """The program has gone. If it made no commit, another process may keep the state."""
         if self._program is None:
             return []
         self._poll.unregister(self._program)
@@ -242,7 +242,7 @@ class TaskEnd:
         self._has_begun = self._say(Begin(self._component, epoch, self._pipes, origin), descriptors)
 
     def _say(self, packet: FromGuard, descriptors: tuple[int, ...] = ()) -> bool:
-        """Whether it fitted into the socket, and somebody is there."""
+        """Whether a program is connected and the packet fitted into the socket."""
         if self._program is None:
             return False
         ancillary = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))] if descriptors else []

@@ -20,7 +20,7 @@ from failover.core.wire.messages import Beat
 
 
 class Due(Struct, frozen=True):
-    """What may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the worker.
+    """The obligations that may leave now, in this order: ``persist`` to the disk, ``beats`` to the peers, ``acts`` to the worker.
 
     Attributes:
         persist: (number, vote record); `Outbox.kept` is told the number once it is durable.
@@ -36,7 +36,7 @@ class Outbox(Struct):
 
     Attributes:
         durable: the vote record that is on the disk.
-        beat_ns: period after which a beat is due whatever happens.
+        beat_ns: period after which a beat is always due.
 
     Invariant: acts leave in the order in which they were ordered, each after every vote record ordered before it.
     """
@@ -57,7 +57,7 @@ class Outbox(Struct):
         return self._kept < self._ordered
 
     def take(self, ready: Ready, now_ns: int) -> Due:
-        """Take in new obligations; what may leave now comes back."""
+        """Take in new obligations; return those that may leave now."""
         persist = None
         if ready.persist is not None:
             self._ordered += 1

@@ -1,4 +1,4 @@
-"""Vote record: what the agent must not forget, durable before anything that depends on it leaves the machine.
+"""Vote record: the facts that the agent must not forget, durable before anything that depends on them leaves the machine.
 
 One small file, ``ballot``: a line of JSON and a line with its digest. The agent writes it aside, syncs it, renames it, and syncs
 the directory, so a power cut leaves the old content or the new, never a mixture. Besides the core's own record it holds the boot
@@ -33,7 +33,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         boot: lives of this agent so far; grows by one at each start.
-        core: what `failover.core` asked to keep, as it encoded it.
+        core: the record that `failover.core` asked to keep, as it encoded it.
     """
 
     version: int
@@ -52,11 +52,11 @@ class VoteRecordFile:
 
     @property
     def record(self) -> Record:
-        """What is durable now."""
+        """The record that is durable now."""
         return self._record
 
     def open(self) -> Record:
-        """Read what an earlier life left and begin a new one: the boot counter is raised, durably.
+        """Read the record of an earlier life and begin a new one: the boot counter is raised, durably.
 
         Raises:
             BallotError: the file is unreadable, altered, or another robot's; or the directory cannot be written.
@@ -75,7 +75,7 @@ class VoteRecordFile:
             self._record = found
 
     def read(self) -> Record:
-        """What an earlier life left, without beginning a new one; an empty record where there is none. `keep` changes it then.
+        """The record of an earlier life, without beginning a new one; an empty one where there is none. `keep` changes it then.
 
         Raises:
             BallotError: the file is unreadable, altered, or another robot's.

@@ -49,7 +49,7 @@ class VoteRecordWriter:
             self._change.notify()
 
     def finished(self) -> list[tuple[int, VoteRecord]]:
-        """What has become durable since the last call."""
+        """The records that have become durable since the last call."""
         try:
             os.eventfd_read(self._signal)
         except BlockingIOError:

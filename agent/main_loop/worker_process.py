@@ -142,7 +142,7 @@ class WorkerProcess:
             log.error("the worker process does not read; the main loop ends it")
             self._waiting.clear()
             if self._wanted > self._begun:
-                self._is_doomed = True  # it will miss what was for it
+                self._is_doomed = True  # it will miss its messages
             else:
                 self._kill()
         self._waiting.append(message)
@@ -150,8 +150,8 @@ class WorkerProcess:
     def order(self, act: Act) -> None:
         """Pass an act on, and remember it until it is answered.
 
-        A process that has not sent its inventory cannot carry anything out yet: what is expected of it counts as lost when the
-        inventory comes, the rest is sent then.
+        A process that has not sent its inventory cannot carry anything out yet. When the inventory comes, acts that await
+        an answer count as lost, and all other acts are sent.
         """
         expected = isinstance(act, EXPECTED)
         if isinstance(act, acts.Admit):
@@ -168,7 +168,7 @@ class WorkerProcess:
             self._early.append(act)
 
     def ready(self) -> None:
-        """The inventory has come: whatever was ordered in the meantime leaves now."""
+        """The inventory has come: acts that were ordered in the meantime leave now."""
         self._ready = True
         lasting: tuple[Act, ...] = (*self._admitted.values(), *self._warm.values())
         for act in lasting:
@@ -177,7 +177,7 @@ class WorkerProcess:
             self.send(messages.order(self._early.popleft()))
 
     def flush(self) -> None:
-        """Send what waits, as much as goes without waiting."""
+        """Send waiting messages, as many as go without waiting."""
         assert self._channel is not None, "start comes first"
         while self._waiting:
             try:
@@ -187,7 +187,7 @@ class WorkerProcess:
             self._waiting.popleft()
 
     def receive(self) -> Iterator[ToMainLoop]:
-        """What has come, without waiting.
+        """The messages that have come, without waiting.
 
         Raises:
             ChannelError: it has gone, or sent nonsense.
@@ -201,12 +201,12 @@ class WorkerProcess:
             yield message
 
     def answered(self, event: Event) -> None:
-        """An event came: whatever it answers is expected no longer."""
+        """An event came: the acts that it answers are expected no longer."""
         for kind in ANSWERS.get(type(event), ()):
             self._expected.pop((kind, event.component), None)  # type: ignore[union-attr]
 
     def lost(self, inventory: Inventory) -> list[Event]:
-        """After a restart: what the core must hear, and what the new process must be told again."""
+        """After a restart: the events that the core must hear. Tell the new process again all that it must know."""
         self.ready()
         expected, self._expected = self._expected, {}
         told: list[Event] = []
@@ -215,7 +215,7 @@ class WorkerProcess:
                 self.order(act)
             else:
                 told.append(_failure(act))
-        told += [events.Warmed(act.component, act.epoch, False) for act in self._warm.values()]  # what waited ended with them
+        told += [events.Warmed(act.component, act.epoch, False) for act in self._warm.values()]  # they ended with it
         told += [events.Exited(found.component, found.epoch, found.status) for found in inventory.found if not found.running]
         return told
 

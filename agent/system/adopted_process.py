@@ -22,7 +22,7 @@ class Guest:
     """One process, which cannot be mistaken for a later one of its number.
 
     Attributes:
-        rights: user and groups that it had when a client named it; None: nobody asked.
+        rights: user and groups that it had when a client named it; None: no client named it.
     """
 
     def __init__(self, pid: int, rights: Inheritance | None = None) -> None:
@@ -39,7 +39,7 @@ class Guest:
 
     @property
     def has_ended(self) -> bool:
-        """Whether its number may be another process's by now. While it says no, whatever was asked by that number is its own."""
+        """Whether its number may be another process's by now. While False, every fact read by that number was its own."""
         watch = select.poll()
         watch.register(self._pidfd, select.POLLIN)
         return bool(watch.poll(0))

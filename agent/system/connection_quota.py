@@ -74,7 +74,7 @@ class Arrivals:
                 del self._held[address]
 
     def trouble(self) -> str:
-        """What was turned away, in a sentence; "" if nothing was."""
+        """How many connections were turned away, in a sentence; "" if none were."""
         if not self.turned_away:
             return ""
         return (

@@ -28,7 +28,7 @@ class LastAlive(Struct):
 
     @classmethod
     def found(cls, path: Path) -> LastAlive:
-        """Read what the earlier life left."""
+        """Read the sign of the earlier life."""
         try:
             before_ns = path.stat().st_mtime_ns
         except OSError:

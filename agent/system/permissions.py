@@ -26,17 +26,17 @@ from checkpoint.linux.spawn.inherited_limits import Inheritance
 
 SO_PEERGROUPS: Final = 59
 GROUPS_SIZE_MAX: Final = 1_024
-"""Bytes: what `socket.getsockopt` takes; a user in more than 256 groups gets those that the system's lists name."""
+"""Bytes that `socket.getsockopt` takes; a user in more than 256 groups gets those that the system's lists name."""
 
 SCHED_DEADLINE: Final = 6
 """Needs more than a priority to be set, and no child inherits it."""
 
 ROOT: Final = 0
 NOBODY: Final = -1
-"""For what a robot asks another one by itself: it may be told how things stand, and no more."""
+"""For questions that a robot asks another one by itself: it may be told how things stand, and no more."""
 
 SAID: Final = "; it said: "
-"""Begins, at the end of a sentence of the status or the event log, what a program wrote last."""
+"""Begins, at the end of a sentence of the status or the event log, the last line that a program wrote."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 
@@ -46,8 +46,8 @@ class Caller(Struct, frozen=True):
 
     Attributes:
         uid, gid, groups: as they were when it connected.
-        inheritance: what its children would inherit, as far as it can be seen; a client from another PID namespace cannot be,
-            and its programs get what the guard has, with no more than ordinary priorities.
+        inheritance: the rights and limits that its children would inherit, as far as the agent can see them. It cannot see a
+            client from another PID namespace: that one's programs get those of the guard, with no more than ordinary priorities.
     """
 
     uid: int
@@ -57,7 +57,7 @@ class Caller(Struct, frozen=True):
 
 
 def may(uid: int, owner: int | None) -> bool:
-    """The rule: root and the agent's own user may do everything, another user what concerns his own components.
+    """The rule: root and the agent's own user may do everything, another user all that concerns his own components.
 
     Args:
         owner: whose the component is; None: it is not known.
@@ -82,7 +82,7 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
 
 
 def without_output(told: Any) -> Any:
-    """The same without what programs said, in all of its sentences: for a user who may not read their output."""
+    """The same without the output of programs, in all of its sentences: for a user who may not read their output."""
     if isinstance(told, str):
         sentence, said, _ = told.partition(SAID)
         return f"{sentence}; only its owner and root may read what it said" if said else told
@@ -97,7 +97,7 @@ def uid_of(connection: socket.socket) -> int:
 
 
 def caller_of(connection: socket.socket) -> Caller:
-    """Ask the kernel who connected."""
+    """Ask the kernel which user and process connected."""
     pid, uid, gid = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     seen = _seen(pid, uid)
     groups = _groups(connection, uid, gid)
@@ -105,7 +105,7 @@ def caller_of(connection: socket.socket) -> Caller:
 
 
 def inheritance_for(caller: Caller, user: str) -> Inheritance:
-    """What a program inherits that this client wants to run.
+    """The rights that a program inherits which this client wants to run.
 
     Args:
         user: name or number of the user that it is to run as; "" for the client's own.
@@ -125,7 +125,7 @@ def inheritance_for(caller: Caller, user: str) -> Inheritance:
 
 
 def guest_of(pid: int, caller: Caller) -> Guest:
-    """A running process that a user wants protected, held by a pidfd: what is asked of it later is asked of the same one.
+    """A running process that a user wants protected, held by a pidfd: later questions go to the same process.
 
     A process that the system keeps from its own user (a set-user-id program, one that is not dumpable) is root's.
     Its rights are those that it has now; they bound each capture (`agent.worker.components.restore_limits`), for it may execute
@@ -166,7 +166,7 @@ def _check_own(pid: int, caller: Caller, uids: set[int], gids: set[int]) -> None
 
 
 def _as_user(caller: Caller, name: str) -> Inheritance:
-    """What a program inherits that is to run as another user."""
+    """The rights that a program inherits which is to run as another user."""
     if caller.uid != ROOT:
         raise RefusedError(f"only root may choose a user; uid {caller.uid} runs programs as itself", "PermissionError")
     try:
@@ -177,7 +177,7 @@ def _as_user(caller: Caller, name: str) -> Inheritance:
 
 
 def _seen(pid: int, uid: int) -> Inheritance | None:
-    """What the client's children would inherit; None where it cannot be seen, or has another user by now."""
+    """The rights that the client's children would inherit; None where they cannot be seen, or it has another user by now."""
     try:
         pidfd = os.pidfd_open(pid)
     except (OSError, ValueError):

@@ -122,7 +122,7 @@ def allow_absent(listener: socket.socket) -> None:
 
 
 def tell_interfaces(listener: socket.socket) -> None:
-    """From now on `interface_index` finds in what comes with a datagram by which interface it came. Source: ip(7), ipv6(7)."""
+    """From now on `interface_index` finds, in the data beside a datagram, by which interface it came. Source: ip(7), ipv6(7)."""
     if listener.family == socket.AF_INET6:
         listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_RECVPKTINFO, 1)
     else:
@@ -140,7 +140,7 @@ def interface_index(ancillary: Iterable[tuple[int, int, bytes]]) -> int:
 
 
 def drain(listener: socket.socket) -> None:
-    """Take all that has come; what changed is asked for anew, so that a message which was lost (ENOBUFS) loses nothing."""
+    """Take all that has come. The caller reads the state anew, so a message that was lost (ENOBUFS) loses nothing."""
     for _ in range(PIECES_A_TURN):
         try:
             listener.recv(PIECE_SIZE)

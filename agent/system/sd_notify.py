@@ -25,7 +25,7 @@ class Notifier:
             return  # the watchdog is the judge of a lost line
 
     def ready(self, status: str) -> None:
-        """The agent beats; what depends on it may start."""
+        """The agent beats; units that depend on it may start."""
         self.tell("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
 
     def alive(self) -> None:
@@ -43,7 +43,7 @@ def notifier() -> Notifier:
 
 
 def watchdog_period_ns() -> int:
-    """How often to feed systemd's watchdog: a third of its patience; 0 if nobody watches. Source: sd_watchdog_enabled(3)."""
+    """How often to feed systemd's watchdog: a third of its patience; 0 where it is off for us. Source: sd_watchdog_enabled(3)."""
     patience_us = int(os.environ.pop("WATCHDOG_USEC", "0") or 0)
     watched = os.environ.pop("WATCHDOG_PID", str(os.getpid()))
     return patience_us * NANOSECONDS_A_MICROSECOND // 3 if int(watched) == os.getpid() else 0

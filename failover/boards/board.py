@@ -89,7 +89,7 @@ class _Opened:
         return sorted(path.name.removeprefix(prefix) for path in self.directory.glob(f"{prefix}*"))
 
     def leave(self) -> None:
-        """Give everything back; the last user without an agent removes the board. A forked child only closes what it has."""
+        """Give everything back; the last user without an agent removes the board. A forked child only closes its files."""
         for file in self.files[1:]:
             file.close()
         if self.pid != os.getpid():
@@ -104,7 +104,7 @@ class _Opened:
 
 
 class _Holder:
-    """What is open now; survives its `Board` until that is collected, or the program ends."""
+    """The files that are open now; survives its `Board` until that is collected, or the program ends."""
 
     opened: _Opened | None = None
 
@@ -119,7 +119,7 @@ class Board:
 
     Attributes:
         guard: held while files are opened, mapped or examined; never while a program waits.
-        skew_ns: what this process's CLOCK_BOOTTIME is ahead of the machine's.
+        skew_ns: by how much this process's CLOCK_BOOTTIME is ahead of the machine's.
     """
 
     def __init__(self, place: Path | None, name: str) -> None:
@@ -155,7 +155,7 @@ class Board:
         """A handle of an item.
 
         Args:
-            type: what the program puts and gets: ``bytes``, "msgpack", "json", a dataclass, a `msgspec.Struct`, a numpy dtype;
+            type: of the values put and got: ``bytes``, "msgpack", "json", a dataclass, a `msgspec.Struct`, a numpy dtype;
                 None: dictionaries and numbers, as the item is declared.
 
         Raises:
@@ -426,7 +426,7 @@ def board(place: str | os.PathLike[str] | None = None, name: str = "") -> Board:
 
     Args:
         place: its directory; None: ``$FAILOVER_BOARD``, the agent's, or one that this user's programs share without an agent.
-        name: of this program, for people who ask who uses the board; "": its component's, or its file's.
+        name: of this program, for a person who looks which programs use the board; "": its component's, or its file's.
 
     Raises:
         BoardError: it cannot be opened or made; says why, and what to do.

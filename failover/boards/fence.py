@@ -1,4 +1,4 @@
-"""What orders loads and stores for other processors, on those that reorder; None on the others.
+"""A fence that orders loads and stores for other processors, on machines that reorder them; None on the others.
 
 CPython has no fence. To release a lock is a store that no earlier load or store passes, to take it again a load that no later one
 passes; and the two are ordered, because they are of one lock. So nothing passes both.
@@ -17,7 +17,7 @@ IN_ORDER: Final = ("x86_64", "i386", "i686")
 
 
 class _Lock(threading.local):
-    """One for each thread: nobody ever waits for it."""
+    """One for each thread: no thread ever waits for it."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()

@@ -49,7 +49,7 @@ PUT_WAIT_S: Final = 5.0
 
 
 class OpenBoard(Protocol):
-    """What an item asks its board (`failover.boards.board.Board`)."""
+    """The part of a board that an item needs (`failover.boards.board.Board`)."""
 
     guard: AbstractContextManager[Any]
     skew_ns: int
@@ -123,7 +123,7 @@ class Source:
 
 
 class ItemWriter:
-    """All puts of one item by this process: one lock, one count, whatever handles there are."""
+    """All puts of one item by this process: one lock and one count for all handles."""
 
     def __init__(self, board: OpenBoard, name: str) -> None:
         self._board = board
@@ -148,7 +148,7 @@ class ItemWriter:
         self._writer = self._source = None
 
     def put_slowly(self, value: Any, at: int | None = None) -> None:
-        """What the fast put does not do: examine, take the lock, wait for another thread.
+        """Take the steps that the fast put leaves out: examine, take the lock, wait for another thread.
 
         Raises:
             ValueMisfitError, WriterTakenError, BoardError: nothing was put.
@@ -297,7 +297,7 @@ class Item:
         return self._get_slowly(robot) if get is None else get()
 
     def _get_slowly(self, of: str | None = None) -> Reading:
-        """The newest value; whatever the fast get does not do."""
+        """The newest value; takes the steps that the fast get leaves out."""
         for _ in range(TURNS):
             source = self.source(of)
             try:
@@ -402,7 +402,7 @@ class Item:
         """Sleep until there is another put than ``after``; then as `get`.
 
         Args:
-            after: `Reading.number` of the newest that is known; None: whatever there is at the call.
+            after: `Reading.number` of the newest that is known; None: the newest at the call.
             timeout: seconds; None: for ever.
 
         Raises:

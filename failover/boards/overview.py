@@ -1,4 +1,4 @@
-"""All items of a board as a person looks at them: what is declared, what the newest value is, and what the counters say."""
+"""All items of a board as a person looks at them: the declaration, the newest value and the counters of each."""
 
 from __future__ import annotations
 

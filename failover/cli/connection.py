@@ -12,6 +12,6 @@ def connect(arguments: argparse.Namespace) -> Control:
     """Open the agent's control socket: the one on the command line, else the usual places.
 
     Raises:
-        NoAgentError: nobody listens there, or not for this user.
+        NoAgentError: no agent listens there, or not for this user.
     """
     return Control.open(Path(arguments.socket) if arguments.socket else None)

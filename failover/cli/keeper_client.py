@@ -75,18 +75,18 @@ class Keeper:
         self._link.send(request)
 
     def _last_words(self) -> str:
-        """The last line of what it wrote to standard error."""
+        """The last line that it wrote to standard error."""
         self._process.wait(LEAVE_S)
         self._complaints.seek(0)
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "nothing"
 
     def release(self) -> None:
-        """Have it let go of what it follows, and leave it to its end: the more memory it has held, the longer that takes.
+        """Have it let go of the program that it follows, and leave it to its end: the more memory it held, the longer that takes.
 
-        For a command, which ends soon itself: nobody reaps it.
+        For a command, which ends soon itself: no process reaps it.
         """
-        with contextlib.suppress(CheckpointError):  # what it followed has been killed: nothing is left to let go of
+        with contextlib.suppress(CheckpointError):  # the program that it followed has been killed: nothing is left to let go of
             self.ask(Release(), Released)
         self._complaints.close()
         self._link.close()
@@ -98,7 +98,7 @@ class Keeper:
             return
         self._complaints.close()
         self._link.close()
-        with contextlib.suppress(ProcessLookupError):  # nobody else reaps it
+        with contextlib.suppress(ProcessLookupError):  # no other process reaps it
             end = os.pidfd_open(self._process.pid)
             try:
                 if not select.select([end], [], [], LEAVE_S)[0]:

@@ -35,8 +35,8 @@ class Started(NamedTuple):
     """A keeper's process.
 
     Attributes:
-        ours: our end of its channel's socket; when that is closed it lets go of what it traces, and ends.
-        complaints: what it writes to standard error.
+        ours: our end of its channel's socket; when that is closed it lets go of its tracees, and ends.
+        complaints: its standard error.
     """
 
     process: Child
@@ -64,7 +64,7 @@ def taken() -> Started:
 
 
 def forsake() -> None:
-    """End one that nobody has taken, which has not been asked anything yet."""
+    """End one that no command has taken. It has not been asked anything yet."""
     while _ahead:
         left = _ahead.pop()
         left.ours.close()
@@ -77,7 +77,7 @@ def _started(born: Callable[[socket.socket, IO[bytes]], Child]) -> Started:
     import socket
 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
-    complaints = open(os.memfd_create("complaints"), "w+b")  # noqa: SIM115  # whoever takes it closes it
+    complaints = open(os.memfd_create("complaints"), "w+b")  # noqa: SIM115  # the caller that takes it closes it
     with theirs:
         return Started(born(theirs, complaints), ours, complaints)
 
@@ -109,7 +109,7 @@ def _forked(theirs: socket.socket, complaints: IO[bytes]) -> Child:
 
 
 def _as_keeper(theirs: int, complaints: int) -> int:
-    """Be in the child what `_spawned` starts."""
+    """Be in the child the keeper that `_spawned` starts."""
     import fcntl
 
     os.setpgid(0, 0)
@@ -141,7 +141,7 @@ class _Forked:
                 raise subprocess.TimeoutExpired("keeper", timeout)
             try:
                 self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
-            except ChildProcessError:  # whoever started this command ignores SIGCHLD, and so do we
+            except ChildProcessError:  # the parent of this command ignores SIGCHLD, and so do we
                 self._status = 0
         return self._status
 

@@ -75,7 +75,7 @@ def verb_function(name: str) -> Callable[[argparse.Namespace], int]:
 
 
 def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:
-    """Say what went wrong: a sentence, then one line per reason; as JSON when that was asked for."""
+    """Print the error: a sentence, then one line per reason; as JSON when that was asked for."""
     reasons: tuple[str, ...] = getattr(error, "reasons", ())
     kind = error.kind if isinstance(error, AgentRefusedError) and error.kind else type(error).__name__
     if getattr(arguments, "json", False):

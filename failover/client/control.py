@@ -54,7 +54,7 @@ STATUS: Final = """
 robot, team, role, pid, lanes_pid, version: of this agent; life: count of its starts
 insecure: links are neither authenticated nor encrypted
 realtime: the main loop runs at real-time priority with its memory locked
-rule, promise: by which rule the team decides, and one sentence: what holds if this robot dies now
+rule, promise: the rule by which the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
 rights: one sentence: by which rules and whose groups rights are decided here, and what is wrong; "" without rights.toml
 memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of main loop and worker, and of the keepers of
@@ -102,10 +102,10 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
         of the last ones, whether the newest is much older than that
     elsewhere: with ``team``: {robot: the same fields, as that robot sees the component}
 """
-"""What ``status`` answers, field by field. A value that is not known is None."""
+"""The fields of the answer to ``status``. A value that is not known is None."""
 
 WHY: Final = """
-robots: [{robot, answered, reason, lines, damaged, clock_offset_ms, clock_doubt_ms}]: who was asked
+robots: [{robot, answered, reason, lines, damaged, clock_offset_ms, clock_doubt_ms}]: the robots that were asked
     reason: why it did not answer; damaged: lines of its event log that cannot be read any more
     clock_offset_ms: by how much its calendar is ahead of the asked robot's, known within clock_doubt_ms
 story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_before, epoch, state, late_ms, lease_left_ms,
@@ -120,7 +120,7 @@ story: [{at, doubt_ms, robot, component, did, life, number, repeats, epoch_befor
     seen: [{robot, state, silent_ms, limit_ms, links, hears_us, says, life, beat}]: every peer as that robot heard it
         links: {link: silent_ms}; says: what that peer last said about the component
 """
-"""What ``why`` answers, field by field. A value that is not known is None."""
+"""The fields of the answer to ``why``. A value that is not known is None."""
 
 MESSAGE_LIMIT: Final = 16 << 20
 """Bytes of one message either way: a status of thousands of components fits, a runaway peer does not fill the memory."""
@@ -138,7 +138,7 @@ _TIMEVAL: Final = struct.Struct("@ll")
 
 
 class Request(msgspec.Struct, frozen=True):
-    """What the client wants."""
+    """One request of a client."""
 
     verb: str
     arguments: dict[str, Any] = {}
@@ -176,7 +176,7 @@ Reply = Update | Output | Result | Refused
 
 
 class Answer(dict[str, Any]):
-    """A result's value; what an agent of another version left out is an error in words."""
+    """A result's value; a key that an agent of another version left out is an error in words."""
 
     def __missing__(self, key: str) -> Any:
         raise LostAgentError(f"the agent's answer has no {key!r}; agent and command are of different versions: restart the agent")
@@ -208,7 +208,7 @@ class Control:
         """Connect to the agent.
 
         Raises:
-            NoAgentError: nobody listens there, or not for this user.
+            NoAgentError: no agent listens there, or not for this user.
         """
         path = path or socket_path()
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)

@@ -1,4 +1,4 @@
-"""Health of a component and of the team: from what every robot of the team says, so that all answer the same.
+"""Health of a component and of the team: from the words of every robot of the team, so that all answer the same.
 
 Pure: `failover.client.control.STATUS` in, words out. Every robot gets the same input: its own view and the others' views
 (``elsewhere``). So the answer may not depend on which of them is the robot's own.
@@ -11,7 +11,7 @@ from typing import Any, Final
 
 BAD_STATES: Final = frozenset({"degraded", "failed"})
 OVER_STATES: Final = frozenset({"ended", "released"})
-"""Nobody expects anything of these any more."""
+"""No robot is expected to run a component in one of these states any more."""
 
 Sight = Mapping[str, Any]
 """One component, as one robot sees it."""
@@ -26,7 +26,7 @@ def sights(component: Sight) -> Iterator[Sight]:
 def sight(component: Sight) -> Sight:
     """The component as the robot sees it that runs or ran it, where that one was asked; otherwise as the asked robot does.
 
-    With what its standby lacks, as that one says.
+    With the needs that its standby does not meet, as that one says.
     """
     elsewhere = component.get("elsewhere") or {}
     seen = max(sights(component), key=lambda one: (one.get("epoch") or 0, one.get("role") == "primary"))
@@ -36,19 +36,19 @@ def sight(component: Sight) -> Sight:
 
 
 def _of_primary(seen: Sight, elsewhere: Mapping[str, Sight]) -> Sight:
-    """What the robot says of it that others take for its primary, where that one agrees."""
+    """The word on it of the robot that others take for its primary, where that one agrees."""
     primary = seen.get("primary")
     theirs: Sight = elsewhere.get(primary, {}) if primary else {}
     return theirs if theirs.get("primary") == primary else seen
 
 
 def is_lacking(component: Sight) -> bool:
-    """Its standby would refuse it, and no hook brings what is lacking."""
+    """Its standby would refuse it, and no hook brings the lacking things."""
     return bool(component.get("lacks")) and not component.get("prepared_first")
 
 
 def is_unprotected(component: Sight) -> bool:
-    """It runs, and nobody could go on with what it does now."""
+    """It runs, and no robot could go on with its present state."""
     checkpointed = component.get("protection") not in ("none", "stopped")
     is_refused = is_lacking(component) or bool(component.get("contested"))
     return component.get("role") == "primary" and (not checkpointed or is_refused)
@@ -63,7 +63,7 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     """Whether all that should be protected is, as far as any robot that answered knows.
 
     No component is degraded, failed, unprotected, without a standby that can run it, or where no answer came from; no robot
-    counts a peer as dead, or has heard one say lately what it may not say.
+    counts a peer as dead, or has lately heard one say more than it may.
     """
     living = [one for one in map(sight, status["components"]) if one.get("state") not in OVER_STATES]
     unwell = any(

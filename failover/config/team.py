@@ -61,7 +61,7 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Team:
-    """The members, by name, and what lies on their board."""
+    """The members, by name, and the items of their board."""
 
     team: str
     robots: dict[str, Robot] = field(default_factory=dict)
@@ -144,7 +144,7 @@ def for_lookup(host: str) -> str | bytes:
 
 
 def write(directory: Path, team: Team) -> None:
-    """Write the team file whole: aside, then renamed. What an operator wrote below ``[board]`` stays as it is."""
+    """Write the team file whole: aside, then renamed. The operator's lines below ``[board]`` stay as they are."""
     directory.mkdir(parents=True, exist_ok=True)
     path, aside = directory / TEAM_FILE, directory / (TEAM_FILE + ".new")
     aside.write_text(_as_toml(team) + _board_text(path, team.board))

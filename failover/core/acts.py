@@ -32,11 +32,11 @@ class Start(Struct, frozen=True):
 class Restore(Struct, frozen=True):
     """Bring the program back from ``position``, which this robot's store holds. → Restored, ActFailed.
 
-    Whatever is left of the component on this robot (a crashed process, an old guard) is cleared away first.
+    The agent first clears away the remains of the component on this robot (a crashed process, an old guard).
 
     Attributes:
         lease_until_ns: given to the guard before the program runs; 0 = no lease.
-        why: what the program is told.
+        why: the reason that the program is told.
         generation: of the snapshots that will be taken of it.
     """
 
@@ -85,7 +85,7 @@ class Ship(Struct, frozen=True):
 
 
 class CancelShip(Struct, frozen=True):
-    """Give up the transfer of ``position``; a delta that nobody waits for any more. No answer."""
+    """Give up the transfer of ``position``; a delta that no member waits for any more. No answer."""
 
     component: str
     epoch: int
@@ -113,7 +113,7 @@ class Discard(Struct, frozen=True):
 
 
 class Show(Struct, frozen=True):
-    """What the component had written by ``position``, which is held here, is acknowledged: readers may see it. No answer."""
+    """The component's output up to ``position``, which is held here, is acknowledged: readers may see it. No answer."""
 
     component: str
     epoch: int
@@ -124,8 +124,8 @@ class Acknowledge(Struct, frozen=True):
     """Tell the keeper that ``position`` is a checkpoint: the next delta counts from here. No answer.
 
     Attributes:
-        is_safe: a standby holds it, or this robot is the whole team: a program that waits for it may go on. False where nobody
-            else is there just now.
+        is_safe: a standby holds it, or this robot is the whole team: a program that waits for it may go on. False where no other
+            member is there just now.
     """
 
     component: str
@@ -135,7 +135,7 @@ class Acknowledge(Struct, frozen=True):
 
 
 class Admit(Struct, frozen=True):
-    """From now on snapshots of this component are taken from ``sender`` at ``epoch`` or later ("": from nobody). No answer."""
+    """From now on snapshots of this component are taken from ``sender`` at ``epoch`` or later ("": from no robot). No answer."""
 
     component: str
     epoch: int
@@ -190,7 +190,7 @@ class End(Struct, frozen=True):
 
 
 class Stop(Struct, frozen=True):
-    """Kill this robot's copy at once and clear it away; there may be none. → Stopped. Its exit is nobody's result."""
+    """Kill this robot's copy at once and clear it away; there may be none. → Stopped. Its exit is not the component's result."""
 
     component: str
     epoch: int
@@ -208,8 +208,8 @@ class Warm(Struct, frozen=True):
 
     One that keeps its state is started in advance; of any other a stopped process holds the newest checkpoint's memory.
 
-    One that waits already is replaced. Whatever becomes of it, it is tried again until `Cool`; Start, Restore and Stop end it
-    where they do not use it.
+    One that waits already is replaced. Whenever one fails or ends, the agent tries again, until `Cool`; Start, Restore and Stop
+    end it where they do not use it.
     """
 
     component: str
@@ -218,14 +218,14 @@ class Warm(Struct, frozen=True):
 
 
 class Cool(Struct, frozen=True):
-    """What waits of this component on this robot ends. No answer."""
+    """End the program or copy of this component that waits on this robot. No answer."""
 
     component: str
     epoch: int
 
 
 class Inquire(Struct, frozen=True):
-    """Ask robot ``to`` what it lacks of what the component needs to go on there. → Inquired, unless the robot cannot be asked."""
+    """Ask robot ``to`` which needs of the component it does not meet. → Inquired, unless the robot cannot be asked."""
 
     component: str
     epoch: int
@@ -248,12 +248,12 @@ class Drop(Struct, frozen=True):
 
 
 class ReportExit(Struct, frozen=True):
-    """The end of the component is a record: tell whoever waits for it (``failover run``).
+    """The end of the component is a record: tell the clients that wait for it (``failover run``).
 
     Attributes:
         status: waitpid's.
         acknowledged: the standby knows it too; False when this robot is alone.
-        failed: it did not end by itself: ``reason`` says why nobody runs it any more.
+        failed: it did not end by itself: ``reason`` says why no robot runs it any more.
     """
 
     component: str
@@ -265,7 +265,7 @@ class ReportExit(Struct, frozen=True):
 
 
 class Answer(Struct, frozen=True):
-    """The reply to an operator's command; ``sentence`` says what was done, or why not and what to do about it.
+    """The reply to an operator's command; ``sentence`` says what was done, or why not, and the cure.
 
     Attributes:
         risks: of a promotion that was only asked about: a sentence for each reason to think before it is ordered.
@@ -312,7 +312,7 @@ class Ready(Struct, frozen=True):
     Attributes:
         persist: the whole vote record, to be made durable before anything else; None when it has not changed.
         send: beats, each for every peer over every link.
-        told: what was decided, for ``failover why``; nothing waits for it.
+        told: the decisions, for ``failover why``; no step waits for them.
     """
 
     persist: VoteRecord | None = None

@@ -45,7 +45,7 @@ def _why_not_by(component: Component, command: Command) -> str:
     is_new = isinstance(command, Run) and component.state in (State.RELEASED, State.ABSENT)
     if command.by is None or component.spec is None or is_new or component.spec.owner == command.by:
         return ""
-    return f"{component.name} belongs to uid {component.spec.owner}, not to uid {command.by} who asked; nothing was done"
+    return f"{component.name} belongs to uid {component.spec.owner}; uid {command.by} may give it no orders: nothing was done"
 
 
 def _run(component: Component, turn: Turn, command: Run) -> None:

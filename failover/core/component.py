@@ -1,4 +1,4 @@
-"""One component on one robot: its state, the table of its states, and what one step may change."""
+"""One component on one robot: its state, the table of its states, and the changes that one step may make."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ EPOCHS_LEFT_MIN = 3
 
 
 class Cause(enum.StrEnum):
-    """What moves a component from one state to another."""
+    """A cause that moves a component from one state to another."""
 
     CLAIM = "claims it"
     START = "may start it"
@@ -85,7 +85,7 @@ TABLE: dict[tuple[State, Cause], State] = {
     **{(state, Cause.FAIL): State.FAILED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
     **{(state, Cause.RELEASE): State.RELEASED for state in (*_RUNNING, *_IDLE, State.CLAIMING)},
 }
-"""Every arrow there is. What is not here does not happen: ``Component.move`` asserts it."""
+"""Every arrow there is. No other one happens: ``Component.move`` asserts it."""
 
 
 class Flight(Struct):
@@ -128,7 +128,7 @@ class Wanted(Struct, frozen=True):
 
 
 class Component(Struct):
-    """What one robot knows of one component. The first block survives a restart (``types.Record`` explains it).
+    """The facts that one robot knows of one component. The first block survives a restart (``types.Record`` explains it).
 
     Attributes:
         plan: while claiming: the position to restore, None to start afresh; ``resumption``: why the next process
@@ -151,15 +151,15 @@ class Component(Struct):
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
         elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
         ordered: the claim was, by an operator.
-        former: what was known of its namesake before an operator had it started.
+        former: the facts known of its namesake before an operator had it started.
         wanted: an operator promoted this robot, and a checkpoint is on its way here.
         remembered_epoch: the one that this life began with.
-        seen: highest epoch that anybody told of; a claim goes above it. contested_ns: when this copy, which stands still, last
+        seen: highest epoch that any member told of; a claim goes above it. contested_ns: when this copy, which stands still, last
             met another that does, or went above an epoch that only servers and witnesses know.
         behind_ns: since when this robot would claim it, and a server says that it keeps a newer checkpoint; 0: it does not wait.
         trail: the last acknowledged positions and their parents, for servers (`failover.core.replication.servers`).
             archives: on their way there.
-        promise: what the journal has been told of it, where it differs from the team's.
+        promise: the sentence that the journal has of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
@@ -285,7 +285,7 @@ class Component(Struct):
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether there is no later epoch that a beat could carry: nobody claims it before its record is mended."""
+        """Whether there is no later epoch that a beat could carry: no robot claims it before its record is mended."""
         return max(self.epoch, self.seen) + EPOCHS_LEFT_MIN >= EPOCH_MAX
 
     @property
@@ -305,7 +305,7 @@ class Component(Struct):
             self.held = [*self.held, position][-HISTORY_MAX:]
 
     def record(self) -> Record:
-        """What must not be forgotten."""
+        """The facts that must not be forgotten."""
         if self.holding:
             state = State.PRIMARY
         elif self.state is State.STOPPING:
@@ -350,7 +350,7 @@ class Component(Struct):
 
 
 class Turn(Struct):
-    """One step: its instant, what the rules may look at, what they order, and what they say about it.
+    """One step: its instant, the facts that the rules may look at, their orders, and their sentences.
 
     Attributes:
         before: the vote record as the last step left it.
@@ -377,7 +377,7 @@ class Turn(Struct):
         self.acts.append(act)
 
     def say(self, component: Component, sentence: str, output_pending: int = -1) -> None:
-        """For ``failover why``: a decision about a component, with what is known now."""
+        """For ``failover why``: a decision about a component, with the facts known now."""
         before = next((record.epoch for record in self.before.records if record.name == component.name), 0)
         checkpoint, age_ns = _newest_checkpoint(component, self.now_ns)
         facts = Facts(
@@ -416,7 +416,7 @@ class Turn(Struct):
 
 
 def _newest_checkpoint(component: Component, now_ns: int) -> tuple[int, int]:
-    """Number of the checkpoint from which somebody could go on, and its age; see `failover.core.event_log.decisions.Facts`."""
+    """Number of the checkpoint from which a robot could go on, and its age; see `failover.core.event_log.decisions.Facts`."""
     if component.holding and component.acked is not None:
         return component.acked.sequence, now_ns - component.acked_ns
     held = component.held[-1].sequence if component.held else 0

@@ -43,14 +43,14 @@ UNREAD = "its beats are sealed with a key that this robot was not given"
 
 
 class _Known(Struct):
-    """What is known of one component from one beat."""
+    """The entry of one component in one beat."""
 
     entry: Entry
     counter: int
 
 
 class Peer(Struct):
-    """What one peer has told us.
+    """All that one peer has told us.
 
     Attributes:
         heard_ns: instant of its last beat (before the first: of our own birth).
@@ -88,13 +88,13 @@ class Peer(Struct):
     entries: dict[str, _Known] = field(default_factory=dict)
 
     def entry(self, component: str) -> Entry | None:
-        """What it says about a component, if that is fresh enough to act on."""
+        """Its entry for a component, if that is fresh enough to act on."""
         known = self.entries.get(component)
         return known.entry if known and known.counter >= self.settled else None
 
     @property
     def complete(self) -> bool:
-        """Every entry that it has is known and fresh: what is missing here is missing there."""
+        """Every entry that it has is known and fresh: a component missing here is missing there."""
         fresh = sum(known.counter >= self.settled for known in self.entries.values())
         return self.boot > 0 and not self.at_odds and fresh >= self.total
 
@@ -119,7 +119,7 @@ class Peer(Struct):
         return tuple(entry for entry in beat.entries if self._news(entry, beat.counter))
 
     def timed(self, late_ns: int) -> None:
-        """A beat came so much later than a period after the one before; what is seldom seen again is forgotten."""
+        """A beat came so much later than a period after the one before; a lateness seldom seen again is forgotten."""
         self.unsteady_ns = max(late_ns, self.unsteady_ns - self.unsteady_ns // UNSTEADY_BEATS - 1, 0)
 
     def carried(self, copies: tuple[tuple[str, int], ...]) -> None:
@@ -190,7 +190,7 @@ class Membership:
         self._asked.append((counter, now_ns))
 
     def forgive(self, late_ns: int, now_ns: int) -> None:
-        """Our own loop slept too long by ``late_ns``: what peers said meanwhile may still wait to be read."""
+        """Our own loop slept too long by ``late_ns``: words of peers from that time may still wait to be read."""
         for peer in self.peers.values():
             peer.heard_ns = min(peer.heard_ns + late_ns, now_ns)
             peer.told_ns = min(peer.told_ns + late_ns, now_ns)
@@ -209,9 +209,9 @@ class Membership:
         return self.peers[robot].loyal_until_ns
 
     def _count_loyalty(self, peer: Peer) -> None:
-        """What cannot be authenticated proves that a robot lives only where that robot was never heard in this life of ours.
+        """Packets that cannot be authenticated prove that a robot lives only where it was never heard in this life of ours.
 
-        One that was heard and then falls silent is replaced, whatever comes from its address. Under majority votes decide.
+        One that was heard and then falls silent is replaced, even if such packets come from it. Under majority votes decide.
         """
         if peer.boot:
             peer.loyal_until_ns = peer.heard_ns + self._loyalty_ns + self._wider_ns(peer)
@@ -226,7 +226,7 @@ class Membership:
         return max(min(UNSTEADY_FACTOR * peer.unsteady_ns, lease_ns) - (self._loyalty_ns - lease_ns), 0)
 
     def next_death_ns(self, now_ns: int) -> int | None:
-        """When the next of those who live counts as dead if it stays silent; None if nobody does."""
+        """When the next living peer counts as dead if it stays silent; None if no peer lives."""
         return min((peer.loyal_until_ns for peer in self.peers.values() if peer.loyal_until_ns > now_ns), default=None)
 
     def dead(self, robot: str, now_ns: int) -> bool:
@@ -248,7 +248,7 @@ class Membership:
         return Echo(peer.robot, peer.boot, peer.counter)
 
     def steady(self, now_ns: int) -> bool:
-        """Whether everybody who lives was heard in the last two thirds of a loyalty: nobody is about to be taken for dead."""
+        """Whether each living peer was heard in the last two thirds of a loyalty: none is about to be taken for dead."""
         missing_ns = now_ns - 2 * self._loyalty_ns // 3
         return all(peer.heard_ns > missing_ns or peer.loyal_until_ns <= now_ns or not peer.boot for peer in self.peers.values())
 
@@ -264,9 +264,9 @@ class Membership:
         return robot not in self.peers or not self.peers[robot].boot
 
     def unreadable(self, robot: str, why: str, now_ns: int) -> str:
-        """Note what could not be authenticated; a sentence for the event log where it is the first, or says more than before.
+        """Note a packet that could not be authenticated; a sentence for the event log where it is the first, or says more.
 
-        Of a peer that lives it says nothing: anybody may send from its address.
+        Of a peer that lives it says nothing: any machine may send from its address.
         """
         peer = self.peers.get(robot)
         if peer is None:
@@ -281,12 +281,12 @@ class Membership:
         return f"{self._own[0]} receives from {robot} and cannot authenticate it: {peer.unread_why}" if is_news else ""
 
     def unread(self, robot: str, now_ns: int) -> str:
-        """Why what comes from a peer cannot be authenticated; "" where nothing of that kind came lately."""
+        """Why packets from a peer cannot be authenticated; "" where no such packet came lately."""
         peer = self.peers.get(robot)
         return peer.unread_why if peer is not None and self._is_recent(peer.unread_ns, now_ns) else ""
 
     def keeps_waiting(self, robot: str, now_ns: int) -> bool:
-        """Whether a peer would count as dead, but for what comes from it that cannot be authenticated."""
+        """Whether a peer would count as dead, but for packets from it that cannot be authenticated."""
         peer = self.peers[robot]
         return not peer.boot and peer.heard_ns + self._grace_ns <= now_ns < peer.loyal_until_ns
 
@@ -302,7 +302,7 @@ class Membership:
         return now_ns - self._born_ns
 
     def rested(self, now_ns: int) -> bool:
-        """Whether whatever an earlier life of ours has told anybody is over."""
+        """Whether all promises that an earlier life of ours gave are over."""
         return now_ns >= self._born_ns + self._loyalty_ns
 
     def _deaf(self, peer: Peer, now_ns: int) -> bool:
@@ -328,7 +328,7 @@ class Membership:
         return tuple(self._view(peer, now_ns) for peer in self.peers.values())
 
     def sightings(self, component: str, now_ns: int) -> tuple[Sighting, ...]:
-        """For ``failover why``: every peer, and what it says of a component ("" for none)."""
+        """For ``failover why``: every peer, and its word on a component ("" for none)."""
         return tuple(self._sighting(peer, component, now_ns) for peer in self.peers.values())
 
     def _sighting(self, peer: Peer, component: str, now_ns: int) -> Sighting:

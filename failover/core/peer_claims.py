@@ -1,4 +1,4 @@
-"""Checks what a member may say of a component: by its role, by the growth of epochs, by what the robot that it names says.
+"""Checks each word of a member on a component: by its role, by the growth of epochs, by the word of the robot that it names.
 
 Every member holds a key of the team, and one key may be stolen. So each entry is checked before the rules see it:
 
@@ -34,14 +34,14 @@ RECENT_NS = 60_000 * MS
 """For so long after the last such entry the status counts this robot's sight of the team as not healthy."""
 
 DENIED_LOYALTIES = 2
-"""What the named robot denies is counted once it denies it for so long: its own word may come later than that of others."""
+"""A word that the named robot denies counts once it is denied for so long: its own word may come later than that of others."""
 
 _VOTES = FREE | OPEN | HOLDS | BEGUN
 _SAYS = {State.ABSENT, State.STANDBY, *ENDED}
 
 
 class Beyond(enum.StrEnum):
-    """In what way a member said more than it may."""
+    """A way in which a member says more than it may."""
 
     RUNS = "runs"
     KEEPS = "keeps"
@@ -66,10 +66,10 @@ class Refusal(Struct):
 
 
 class Testimony(Struct):
-    """What was refused in this life of ours.
+    """The words of peers that were refused in this life of ours.
 
     Attributes:
-        denied_ns: since when a member has been saying of a component what the named robot denies.
+        denied_ns: since when a member has been saying a word on a component that the named robot denies.
     """
 
     refusals: dict[tuple[str, Beyond], Refusal] = field(default_factory=dict)
@@ -170,7 +170,7 @@ def _beyond_role(config: Config, sender: str, entry: Entry) -> tuple[Beyond, str
 
 
 def _denier(component: Component, turn: Turn, sender: str, entry: Entry) -> str:
-    """Who lives and says otherwise: the robot that the entry names, which must know; "" if it does not."""
+    """The robot that the entry names, if it lives and says otherwise: it must know; "" if it does not."""
     named, is_end, runs = entry.primary, state_of(entry) in ENDED, turn.config.runs(sender)
     is_news = entry.epoch >= component.epoch if is_end else not runs and entry.epoch > component.epoch
     if named in ("", sender) or not is_news:
@@ -196,7 +196,7 @@ def _acts(component: Component, turn: Turn) -> bool:
 
 
 def _unsaid(entry: Entry, sender: str, config: Config) -> Entry:
-    """What is left of an entry that was refused: nothing, but that a robot says it holds the component, so that none takes it."""
+    """The rest of an entry that was refused: nothing, but that a robot says it holds the component, so that none takes it."""
     state = state_of(entry)
     if config.runs(sender) and state in HOLDING:
         return Entry(entry.name, entry.state, 0, sender)

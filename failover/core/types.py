@@ -1,4 +1,4 @@
-"""Terms of the rules: the values for a component, for what a robot remembers, for what it shows. Frozen values only.
+"""Terms of the rules: the values for a component, for a robot's memory, for its status. Frozen values only.
 
 Instants are integer nanoseconds of this machine's own clock (suffix ``_ns``); two machines' clocks are never compared.
 Events of a node are in `failover.core.events`, its orders in `failover.core.acts`, the messages between robots in
@@ -34,14 +34,14 @@ class OnCrash(enum.StrEnum):
 
 
 class WhenAlone(enum.StrEnum):
-    """What a primary does when it hears nobody: go on (available), or stand still (safe)."""
+    """What a primary does when it hears no other robot: go on (available), or stand still (safe)."""
 
     RUN = "run"
     FREEZE = "freeze"
 
 
 class Rule(enum.StrEnum):
-    """Who decides that a silent primary is replaced: each robot that hears it no longer, or the majority of all that vote."""
+    """How a silent primary is replaced: by each robot that hears it no longer, or by the majority of all that vote."""
 
     PAIR = "pair"
     MAJORITY = "majority"
@@ -75,7 +75,7 @@ class State(enum.StrEnum):
 class Resumption(enum.StrEnum):
     """Why a program goes on from a checkpoint, in the words that it is told (``checkpoint/segment/TASK.md``).
 
-    It is told what became of the copy before it, not where the checkpoint was made: that may have been here all the same.
+    It is told how the copy before it ended, not where the checkpoint was made: that may have been here all the same.
     """
 
     RESTARTED = "restarted"
@@ -97,7 +97,7 @@ HOLDING = frozenset(
 """The states in which a robot says: the primacy of this epoch is mine."""
 
 ENDED = frozenset({State.FINISHED, State.FAILED, State.RELEASED})
-"""The states that are a record: nobody runs the component until an operator says so."""
+"""The states that are a record: no robot runs the component until an operator says so."""
 
 
 class Protection(enum.StrEnum):
@@ -110,7 +110,7 @@ class Protection(enum.StrEnum):
 
 
 IMMEDIATE = "immediate"
-"""Output is shown as it is written: after a takeover, what was written since the checkpoint is written again."""
+"""Output is shown as it is written: after a takeover, the output since the checkpoint is written again."""
 
 COMMITTED = "committed"
 """Output is shown once another robot holds a checkpoint that contains it."""
@@ -142,7 +142,7 @@ class Launch(Struct, frozen=True):
         pid: of a running program to protect (``failover protect``), 0 otherwise; means something on its home robot only.
         isolate: PID and time namespaces of its own.
         hooks: (occasion, command) pairs that came with the program and are run as its user, see `agent.worker.components.hooks`.
-        output: `IMMEDIATE` or `COMMITTED`: when what it writes is shown.
+        output: `IMMEDIATE` or `COMMITTED`: when its output is shown.
         inheritance: whose rights, limits and priorities it gets, packed (`checkpoint.linux.spawn.inherited_limits`); b"": the
             agent's own.
         carry: files and folders that travel with it, as absolute paths.
@@ -215,7 +215,7 @@ class ComponentSpec(Struct, frozen=True):
 
 
 class Waiting(Struct, frozen=True):
-    """What was started in advance: another command line, or another owner, is another program.
+    """The program that was started in advance: another command line, or another owner, is another program.
 
     Attributes:
         keeps_state: it is the program, started; else its memory. One that is captured from outside may come to keep its state.
@@ -227,12 +227,12 @@ class Waiting(Struct, frozen=True):
 
 
 class Config(Struct, frozen=True, dict=True):
-    """What one robot's node is told at birth.
+    """The configuration that one robot's node gets when it is made.
 
     Attributes:
         robot: own name.
         peers: the other members of the team: robots, servers and witnesses.
-        components: to be run from the start wherever nobody runs them yet (the same list may stand on every robot).
+        components: to be run from the start wherever no robot runs them yet (the same list may stand on every robot).
         beat_ms: between two beats.
         lease_ms: how long a primary may act without being heard; also the silence after which a primary may be replaced,
             stretched by the margin.
@@ -246,8 +246,8 @@ class Config(Struct, frozen=True, dict=True):
         rule: by which primaries are replaced.
         servers: members, perhaps this one, that keep checkpoints and vote, and run nothing.
         witnesses: members, perhaps this one, that only vote.
-        patience_ms: under majority, how long the robots that hold what was acknowledged are waited for before another one goes on
-            from an older checkpoint.
+        patience_ms: under majority, how long the robots that hold all that was acknowledged are waited for before another goes
+            on from an older checkpoint.
         archive_ms: between two whole checkpoints for a server that does not keep up with the deltas.
         boot_patience_ms: under pair, how long after its own start a robot waits for the robots that ran a component last, or that
             may have taken it over since, before it claims the component without having heard them.
@@ -347,7 +347,7 @@ BEAT_MS_MAX = 10_000
 PERIOD_MS_MAX = 3_600_000
 
 BEATS_IN_LEASE_MIN = 4
-"""Three beats may be lost in a row before anybody acts on it."""
+"""Three beats may be lost in a row before a robot acts on it."""
 
 PEERS_MAX = 63
 """Robots besides oneself; their echoes must fit a frame."""
@@ -360,11 +360,11 @@ HISTORY_MAX = 8
 
 
 class Record(Struct, frozen=True):
-    """What one robot must not forget about one component.
+    """The facts that one robot must not forget about one component.
 
     Attributes:
         epoch: the highest that was seen or claimed; only grows.
-        primary: robot whose primacy of ``epoch`` this robot accepts: itself, a peer, or "" (nobody's).
+        primary: robot whose primacy of ``epoch`` this robot accepts: itself, a peer, or "" (no robot's).
         state: PRIMARY while this robot holds the primacy, STANDBY, ABSENT, or one of the records FINISHED, FAILED, RELEASED.
         entrusted: robots that may take over if they stop hearing the primary: they hold all that it has acknowledged. A primary
             acts on leases while there are any (under majority always); a follower remembers what its primary told (majority).
@@ -374,7 +374,7 @@ class Record(Struct, frozen=True):
         reason: why it failed.
         claimed: this robot's claim of ``epoch`` needs consent that it did not have yet.
         begun: there is a checkpoint of it, or there was one when this robot heard last: it is not to begin anew.
-        bare: this robot was among those who held what was acknowledged, and has lost its checkpoints: others hold it.
+        bare: this robot was among those that held all that was acknowledged, and has lost its checkpoints: others hold it.
     """
 
     name: str

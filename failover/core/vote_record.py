@@ -17,7 +17,7 @@ def encode(vote_record: VoteRecord) -> bytes:
 
 
 def decode(body: bytes) -> VoteRecord:
-    """What ``encode`` gave; b"" is the vote record of a robot that never voted.
+    """The vote record that ``encode`` wrote; b"" is that of a robot that never voted.
 
     Raises:
         RulesError: anything else.

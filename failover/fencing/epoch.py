@@ -25,7 +25,7 @@ def epoch() -> int:
 
 
 def _own_epoch() -> int:
-    """What the C library finds in the environment, where the agent renews it: `os.environ` is a copy from the beginning."""
+    """The epoch in the environment of the C library, where the agent renews it: `os.environ` is a copy from the beginning."""
     told = _libc().getenv(epoch_variable.VARIABLE.encode())
     return int(told) if told is not None and told.isdigit() else 0
 

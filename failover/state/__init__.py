@@ -24,7 +24,7 @@ runs nothing (but ``__post_init__`` of a msgspec.Struct). No pickle, except wher
 | generic classes, NewType, Annotated, Optional, Union | as declared | the first type that fits |
 | numpy.ndarray, numpy scalars | dtype, C or F order | structured too; no objects, no long doubles; views whole |
 | Any, object, bare list, dict … | any kind above | not a program's own classes: declare these |
-| ``Annotated[X, Pickled()]``, ``Field(pickled=True)`` | what pickle makes | *who can write the stored state can run code here* |
+| ``Annotated[X, Pickled()]``, ``Field(pickled=True)`` | as pickle makes it | *a writer of stored state can run code here* |
 
 The schema refuses these by name and says what to keep instead (`failover.state.advice`), at declaration or at the commit: locks,
 files, sockets, functions, instances of subclasses of what was declared, attributes that are no fields, views that share memory,

@@ -63,7 +63,7 @@ _FUNCTIONS: Final = (types.FunctionType, types.BuiltinFunctionType, types.Method
 
 
 def advice_for(cls: type) -> str:
-    """What to do about a value of a class that cannot be kept; "" where nothing more is known than that."""
+    """The advice on a value of a class that cannot be kept; "" where nothing more is known than that."""
     for base in cls.__mro__:
         known = _ADVICE.get(f"{base.__module__}.{base.__qualname__}")
         if known is not None:
@@ -76,7 +76,7 @@ def advice_for(cls: type) -> str:
 
 
 def advice_for_annotation(annotation: Any, origin: Any) -> str:
-    """The same for what stands in the place of a type."""
+    """The same for an object in the place of a type."""
     if origin is collections.abc.Callable or annotation is collections.abc.Callable:
         return _FUNCTION
     if isinstance(annotation, types.BuiltinFunctionType) and annotation.__module__ in ("_thread", "threading"):

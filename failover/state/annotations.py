@@ -57,7 +57,7 @@ _ABSTRACT: dict[Any, tuple[Any, ...]] = {
     collections.abc.Set: (frozenset, set),
     collections.abc.MutableSet: (set,),
 }
-"""What an abstract annotation may hold."""
+"""The types that an abstract annotation may hold."""
 
 _WRAPPERS = tuple(
     found for name in ("Final", "Required", "NotRequired", "ReadOnly") if (found := getattr(typing, name, None)) is not None
@@ -181,7 +181,7 @@ class Compiler:
         raise _unknown(annotation, origin, where)
 
     def _inferred(self, default: Any, where: str) -> Kind:
-        """What a default says without an annotation."""
+        """The kind that a default implies without an annotation."""
         if default is MISSING:
             raise SchemaError(f"cannot keep {where}: it has neither an annotation nor a default; give it one of them", where)
         if default is None:
@@ -316,7 +316,7 @@ def _spelled(annotation: Any) -> str:
 
 
 def _factory_of(arguments: tuple[Any, ...]) -> Callable[[], Any] | None:
-    """What a declared defaultdict[K, V] makes: V, or the class that V is made of."""
+    """The factory of a declared defaultdict[K, V]: V, or the class that V is made of."""
     value = arguments[1] if arguments else None
     made: Any = typing.get_origin(value) or value
     return made if isinstance(made, type) else None
@@ -373,7 +373,7 @@ def array_form(declared: Field, where: str) -> tuple[np.dtype[Any] | None, tuple
 
 
 def default_of(declared: Field) -> Callable[[], Any] | None:
-    """What makes the first value of a field; None: it has none."""
+    """The function that makes the first value of a field; None: it has none."""
     if declared.factory is not None:
         return declared.factory
     if declared.default is not MISSING:

@@ -45,7 +45,7 @@ class Field(Struct, frozen=True, dict=True):
         factory: makes its first value.
         dtype, shape: of an array that keeps its form: zeros at first.
         formerly: names under which it was stored before.
-        pickled: stored by pickle; whoever can write the stored state can then run code in the program.
+        pickled: stored by pickle; a person who can write the stored state can then run code in the program.
     """
 
     annotation: Any = MISSING

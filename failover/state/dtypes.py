@@ -83,7 +83,7 @@ def lower_dtype(dtype: Dtype, depth: int = DTYPE_DEPTH_MAX) -> Wire:
 
 
 def lift_dtype(wire: Wire, depth: int = DTYPE_DEPTH_MAX) -> Dtype:
-    """The dtype of a wire value, whoever wrote it.
+    """The dtype of a wire value, from any writer.
 
     Raises:
         DtypeError: not of the documented form; nothing of it was given to numpy.

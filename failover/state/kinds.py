@@ -42,11 +42,11 @@ class Kind(ABC):
         name: the type as a person would declare it.
         types: what ``type(value)`` may be; a union chooses by it.
         exact: those of ``types`` whose values are their own wire values and need no look.
-        shapes: what its wire values look like: names of Python types, "record", marks. Kinds of one union that share a shape
+        shapes: the looks of its wire values: names of Python types, "record", marks. Kinds of one union that share a shape
             are told apart by a label, unless both are evident.
         keeps_text: any text is its own wire value, as far as a wire can hold it.
-        evident: the wire alone says what the value is, whatever was declared: two such kinds never make different values of
-            one wire.
+        evident: the wire alone says what the value is, regardless of the declaration: two such kinds never make different values
+            of one wire.
     """
 
     name: str = ""
@@ -66,7 +66,7 @@ class Kind(ABC):
 
     @abstractmethod
     def lift(self, wire: Wire, build: Build, place: Place) -> Any:
-        """The value of a wire value, whoever wrote it.
+        """The value of a wire value, from any writer.
 
         Raises:
             FitError: it is not of the declared type; names the place.
@@ -242,7 +242,7 @@ def _shares_memory(left: np.ndarray[Any, Any], right: np.ndarray[Any, Any]) -> b
 
 
 class Build:
-    """One lifting: which regions there are and what was made already."""
+    """One lifting: the regions, and the objects that were made already."""
 
     __slots__ = ("_left", "_shared", "allocate", "made", "notes")
 
@@ -255,7 +255,7 @@ class Build:
         self.notes: dict[str, str] = {}
 
     def note(self, subject: str, text: str) -> None:
-        """Remember what a person should know; once a subject, however often it occurs."""
+        """Remember a sentence for a person; once a subject, however often it occurs."""
         self.notes.setdefault(subject, text)
 
     def note_made(self, value: object, kind: Kind, place: Place) -> None:

@@ -22,7 +22,7 @@ PROTOCOL = 4
 
 
 class Unread(Struct, frozen=True):
-    """Pickled bytes that nobody unpickled: what a migration meets in the place of a pickled value, and leaves as it is."""
+    """Pickled bytes, not unpickled: a migration meets them in the place of a pickled value, and leaves them as they are."""
 
     packed: bytes
 
@@ -42,7 +42,7 @@ class UnreadKind(Kind):
 
 
 class PickledKind(Kind):
-    """Whatever pickle takes."""
+    """Any value that pickle takes."""
 
     name = "pickled"
     shapes = frozenset({PICKLED})

@@ -1,4 +1,4 @@
-"""Kinds of random number generators: Python's and numpy's, kept as the numbers that say what they draw next.
+"""Kinds of random number generators: Python's and numpy's, kept as the numbers that determine the next draws.
 
 Nothing on the wire names anything but one of numpy's own bit generators. Every number is checked against the table below: some
 of them are places in an array, and numpy's C code would follow them anywhere.
@@ -76,7 +76,7 @@ FORMS: Final[dict[str, dict[str, Form]]] = {
     "Philox": {"state.counter": ("<u8", 4), "state.key": ("<u8", 2), "buffer": ("<u8", 4), "buffer_pos": 4, **_HALF},
     "SFC64": {"state.state": ("<u8", 4), **_HALF},
 }
-"""Of each bit generator that is kept: what its ``state`` holds, by the way to it."""
+"""Of each bit generator that is kept: the items of its ``state``, by the way to each."""
 
 
 class GeneratorKind(Kind):

@@ -1,6 +1,6 @@
 """Classes of records by library: how each library declares their fields, and how to read and to make their objects.
 
-attrs and pydantic are known by what their classes carry, and never imported: a class of theirs exists only in a program that
+attrs and pydantic are known by the marks of their classes, and never imported: a class of theirs exists only in a program that
 has them.
 """
 
@@ -116,7 +116,7 @@ def _is_frozen_attrs(cls: Any) -> bool:
 
 
 class Structs(Style):
-    """Objects of msgspec: made by their constructor, then set to what was stored."""
+    """Objects of msgspec: made by their constructor, then set to the stored values."""
 
     def __init__(self, cls: type[msgspec.Struct]) -> None:
         self._cls = cls
@@ -272,7 +272,7 @@ def _may_be_absent(annotation: Any, optional: bool) -> bool:
 
 
 class Components(Mappings):
-    """The kept fields of a component: whatever else the program's object holds is its own affair."""
+    """The kept fields of a component. The other attributes of the program's object are its own affair."""
 
     mutable = False
 

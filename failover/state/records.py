@@ -58,7 +58,7 @@ class Style(ABC):
         """The object with its contents."""
 
     def extras(self, value: Any, count: int) -> tuple[str, ...]:
-        """Names of what an object holds besides its ``count`` fields."""
+        """Names of attributes that an object holds besides its ``count`` fields."""
         return ()
 
 
@@ -70,7 +70,7 @@ def attribute_reader(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]
 
 
 def undeclared(cls: type, value: Any) -> tuple[str, ...]:
-    """What lies in an object's dictionary, if it has one, besides what cached properties left there."""
+    """The names in an object's dictionary, if it has one, except those that cached properties left there."""
     found = getattr(value, "__dict__", ())
     return tuple(name for name in found if not isinstance(getattr(cls, name, None), cached_property))
 
@@ -170,7 +170,7 @@ class RecordKind(Kind):
         return wire
 
     def _refuse_extras(self, extras: tuple[str, ...], place: Place) -> None:
-        """Refuse an object that holds what is not declared.
+        """Refuse an object that holds undeclared attributes.
 
         Raises:
             KeepError: names the first of them.

@@ -51,7 +51,7 @@ class Decoded(Struct, frozen=True):
 
     Attributes:
         value: of the declared type.
-        notes: what was dropped, took its default or was migrated: one sentence each.
+        notes: fields that were dropped, took their default or were migrated: one sentence each.
         version: of the schema that stored it.
     """
 
@@ -61,7 +61,7 @@ class Decoded(Struct, frozen=True):
 
 
 class Stored(Struct, frozen=True):
-    """What the bytes say of themselves, before anything is built.
+    """A state as its bytes describe it, before anything is built.
 
     Attributes:
         wire: the state.
@@ -111,9 +111,9 @@ class Schema(Struct, frozen=True):
 
         Args:
             annotation: its type; MISSING: that of the default.
-            default: what ``fresh`` makes copies of.
+            default: the value that ``fresh`` copies.
             migrations: by the version that they start from; each makes the next version of a state.
-            pickled: stored by pickle; whoever can write the stored state can then run code in the program.
+            pickled: stored by pickle; a person who can write the stored state can then run code in the program.
 
         Raises:
             SchemaError: it cannot be kept; names the field.
@@ -204,7 +204,7 @@ class Schema(Struct, frozen=True):
         return Encoded(packed, tuple(walk.regions))
 
     def decode(self, encoded: Encoded, allocate: Allocate | None = None) -> Decoded:
-        """The value of bytes, whoever wrote them.
+        """The value of bytes, from any writer.
 
         Args:
             encoded: a region's memory may be longer than was stored.
@@ -227,7 +227,7 @@ class Schema(Struct, frozen=True):
         return Decoded(value, (*notes, *build.notes.values()), stored.version)
 
     def _migrated(self, stored: Stored, regions: dict[str, memoryview]) -> tuple[Wire, dict[str, memoryview], bool, list[str]]:
-        """The state in the form of this version, its regions, whether it is shared, and what was done.
+        """The state in the form of this version, its regions, whether it is shared, and the notes.
 
         Raises:
             FitError: it is newer, or a migration is missing or failed.
@@ -273,7 +273,7 @@ def _endless(name: str) -> SchemaError:
 
 
 def read(data: bytes | memoryview, name: str = "state") -> Stored:
-    """What the bytes of a state say of themselves.
+    """Read how the bytes of a state describe themselves.
 
     Raises:
         StateFormatError: cut off, damaged, of another format, or in another spelling than ours.

@@ -182,7 +182,7 @@ def _contradict(left: Kind, right: Kind, shapes: frozenset[str]) -> bool:
 
 
 def _nameless(value: object, where: str) -> KeepError:
-    """The refusal of a value of which a stored state would not say what it is."""
+    """The refusal of a value whose type a stored state would not tell."""
     cure = advice_for(type(value))
     if cure:
         return KeepError(f"cannot keep {where}: it holds {with_article(type(value).__name__)}: {cure}", where)
@@ -191,14 +191,14 @@ def _nameless(value: object, where: str) -> KeepError:
 
 
 def shape_of(wire: Wire) -> str:
-    """What a wire value looks like, in the words of ``Kind.shapes``."""
+    """The shape of a wire value, in the words of ``Kind.shapes``."""
     if type(wire) is dict:
         return mark_of(wire) or "record"
     return type(wire).__name__
 
 
 class AnyKind(Kind):
-    """A value of any of the built-in kinds: what its own type says. No classes of the program: these are declared."""
+    """A value of any of the built-in kinds, by its own type. No classes of the program: these are declared."""
 
     name = "Any"
     keeps_text = True

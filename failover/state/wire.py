@@ -3,7 +3,7 @@
 A stored state is msgpack of a *wire* value: None, a bool, an integer of 64 bits, a float, text, bytes, a list, a map with text
 keys that are the fields of a record, or a *marked* value: a map of one entry whose key starts with "$" and says what kind its
 payload is ("$datetime", "$array" …). The marks are a closed list of built-in kinds: no name on the wire is ever looked up as a
-class, so a stored state describes itself and still can build only what the program declares.
+class, so a stored state describes itself and still can build only classes that the program declares.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Wire: TypeAlias = Any
 """None | bool | int | float | str | bytes | list[Wire] | dict[str, Wire]."""
 
 FORMAT = "failover.state/1"
-"""First element of every stored state: what it is, and the version of the wire format."""
+"""First element of every stored state: its kind, and the version of the wire format."""
 
 INLINE_SIZE_MAX = 4096
 """Bytes. Arrays and bytes of this size and more lie in regions of their own, so that they travel as changed pages."""
@@ -36,7 +36,7 @@ KEY_TEXT_MAX = 40
 """Characters of a dictionary's key in the name of a place."""
 
 INT_MIN, INT_MAX = -(1 << 63), (1 << 64) - 1
-"""What msgpack holds as an integer; others are stored as bytes."""
+"""The integers that msgpack holds; others are stored as bytes."""
 
 INT_BITS_MAX = 1 << 20
 """An integer beyond this is a mistake or an attack: printing one takes quadratic time."""
@@ -121,7 +121,7 @@ def mark_of(wire: Wire) -> str | None:
 
 
 def said(wire: Wire) -> str:
-    """What a stored value is, in a few words of a message: ``str 'north'``, ``a list of 3``, ``a record (x, y)``."""
+    """A description of a stored value, in a few words of a message: ``str 'north'``, ``a list of 3``, ``a record (x, y)``."""
     if wire is None:
         return "None"
     if isinstance(wire, bool | int | float | str | bytes):

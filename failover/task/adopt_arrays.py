@@ -1,4 +1,4 @@
-"""Moves large arrays of a first value into live memory, where a commit costs what was changed and not what they hold.
+"""Moves large arrays of a first value into live memory, where a commit costs the changed pages and not all that they hold.
 
 Only arrays that the state alone holds move, so that no program can notice. An array of which the program has a name, a view or a
 weak reference stays where it is, and so does one that the state reaches by two ways. Those are compared at each commit.
@@ -46,12 +46,12 @@ def adopt(value: object, make: Make) -> None:
 
 
 def _holders(slots: Slots, key: Any) -> int:
-    """References to what lies there; how many that are for one holder differs between Pythons."""
+    """References to the object there; their number for one holder differs between Pythons."""
     return sys.getrefcount(slots[key])
 
 
 def _slots_of(value: object) -> Slots | None:
-    """Where a value keeps what it holds, if something else may be put there."""
+    """Where a value keeps its content, if another object may be put there."""
     if isinstance(value, dict | list) and type(value) in (dict, list):
         return value
     parameters: Any = getattr(type(value), "__dataclass_params__", None)

@@ -55,10 +55,10 @@ log = logging.getLogger("failover")
 
 
 class Handed(Struct, frozen=True):
-    """What the guard gave at the beginning.
+    """The packet and the state that the guard gave at the beginning.
 
     Attributes:
-        state: what was committed last; None where the component begins.
+        state: of the last commit; None where the component begins.
     """
 
     begin: Begin
@@ -72,13 +72,13 @@ class Guarded:
         end: connected to the guard; ours from now on.
 
     Raises:
-        TaskError: the guard will not have it, or says what makes no sense.
+        TaskError: the guard will not have it, or sends nonsense.
     """
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
         self._hearing = threading.RLock()
-        """Held by whoever waits for the next packet: a thread, and perhaps a signal handler that interrupts it."""
+        """Held by the code that waits for the next packet: a thread, and perhaps a signal handler that interrupts it."""
         self._output: OwnOutput | None = None
         self._is_pending = False
         self._told_segment = 0
@@ -114,12 +114,12 @@ class Guarded:
         """One packet, and its descriptors, ours to close.
 
         Raises:
-            TaskError: the guard has gone, or what came is no packet.
+            TaskError: the guard has gone, or sent bytes that are no packet.
         """
         room = socket.CMSG_SPACE(DESCRIPTORS_MAX * _INT_SIZE)
         try:
             content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, flags | socket.MSG_CMSG_CLOEXEC)
-        except ConnectionResetError:  # said once, before what it said when it hung up
+        except ConnectionResetError:  # said once, before the last packet of a guard that hung up
             content, ancillary, _, _ = self._end.recvmsg(PACKET_SIZE_MAX + 1, room, flags | socket.MSG_CMSG_CLOEXEC)
         carried = array.array("i")
         for level, kind, packed in ancillary:
@@ -137,7 +137,7 @@ class Guarded:
             raise
 
     def outputs(self) -> Outputs:
-        """What this program has written until now, for its commit."""
+        """The output that this program has written until now, for its commit."""
         outputs = self._output.totals() if self._output is not None else None
         self._is_pending = outputs is PENDING
         return outputs
@@ -148,7 +148,7 @@ class Guarded:
         return "its output pipe is full, the guard takes nothing from it; a later commit will do" if self._is_pending else ""
 
     def notice(self, segment: int) -> None:
-        """There is a new commit. Whoever takes it looks by himself, and is told of the first in each segment.
+        """There is a new commit. The keeper looks for commits by itself. The guard is told of the first one in each segment.
 
         Args:
             segment: how many segments there were, with the one that it went to.
@@ -157,7 +157,7 @@ class Guarded:
             return
         try:
             self._end.send(encode(Keeps()), socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)
-        except OSError:  # full: at the next commit; gone: nobody listens
+        except OSError:  # full: at the next commit; gone: no guard listens
             return
         self._told_segment = segment
 
@@ -201,7 +201,7 @@ class Guarded:
 
 
 def guarded() -> Guarded | None:
-    """Our end of the guard's socket; None where this program was started by nobody who keeps its state.
+    """Our end of the guard's socket; None where this program has no guard that keeps its state.
 
     Raises:
         TaskError: its guard will not have it.

@@ -38,7 +38,7 @@ from failover.task.state import KeptState
 S = TypeVar("S")
 
 NAME_VARIABLE: Final = "FAILOVER_COMPONENT"
-"""Names the component in place of the program; set by whoever starts it."""
+"""Names the component in place of the program; set by the agent or the person that starts it."""
 FOLDER_VARIABLE: Final = "FAILOVER_STATE"
 """The folder in which states without an agent are kept; the working directory unless set."""
 
@@ -55,7 +55,7 @@ class Resumed(Struct, frozen=True):
         epoch: number of the primacy under which this program runs now: the fencing token. 0 without an agent.
         generation: of this run; every resume opens a new one. Under an agent: of the checkpoint that it goes on from.
         why: "restarted" on the same robot, from its agent's store or the folder beside the program; "taken over" from another
-            that was lost; "handed over" by another, as somebody ordered: nothing was lost.
+            that was lost; "handed over" by another, as an operator ordered: nothing was lost.
         age_s: seconds since that commit.
         notes: what does not come back as it was: fields that were added or dropped, a damaged file that was passed over.
     """
@@ -74,7 +74,7 @@ class Task:
     Attributes:
         name: of the component.
         epoch: under which it runs; 0 without an agent.
-        value: what is committed.
+        value: the state that is committed.
         resumed: where it came from; None where it began here.
         activations: its steps, where it has any.
     """
@@ -93,7 +93,7 @@ class Task:
         """The thread that is in the middle of a change."""
 
     def commit(self) -> int:
-        """Make the value, as it is now, the point to return to; answer the commit's number. Takes microseconds, waits for nobody.
+        """Make the value, as it is now, the point to return to; answer the commit's number. Takes microseconds, without a wait.
 
         Raises:
             KeepError: something in it cannot be kept; names it. The last commit stands.
@@ -192,7 +192,7 @@ def _beside(name: str, state: KeptState, file: StateFile, value: Any, resumed: R
 
 
 def _open_guarded(name: str, state: KeptState, guard: Guarded, begin: Callable[[], Any]) -> Task:
-    """A task under an agent. What its checkpoint holds and does not fit any more is still stored there."""
+    """A task under an agent. Parts of its checkpoint that do not fit any more are still stored there."""
     state.outputs = guard.outputs
     kept, origin = guard.handed.state, guard.handed.begin.origin
     if kept is None or origin is None:
@@ -201,7 +201,7 @@ def _open_guarded(name: str, state: KeptState, guard: Guarded, begin: Callable[[
     epoch = guard.handed.begin.epoch
     resumed = Resumed(origin.robot, epoch, origin.generation, origin.why, origin.age_ns / 1e9, decoded.notes)
     task = Task(name, state, guard, decoded.value, resumed)
-    task.commit()  # a standby gets it now, not at the end of the first step: until then nobody else may hold it
+    task.commit()  # a standby gets it now, not at the end of the first step: until then no other robot may hold it
     return task
 
 
@@ -245,7 +245,7 @@ def _resumed(snapshot: Snapshot, file: StateFile, notes: tuple[str, ...]) -> Res
 
 
 class _Process:
-    """The one state that this process keeps: what the functions below are about."""
+    """The one state that this process keeps: the functions below are about it."""
 
     def __init__(self) -> None:
         self.task: Task | None = None
@@ -257,7 +257,7 @@ class _Process:
         atexit.register(self.release)
 
     def release(self) -> None:
-        """Write what is newest, and let it go."""
+        """Write the newest commit, and let the task go."""
         if self.task is not None:
             task, self.task = self.task, None
             atexit.unregister(self.release)
@@ -291,14 +291,14 @@ def resume(
 
     Args:
         default: an object that can change: a dataclass, an attrs, msgspec or pydantic model, a dict, a list, an array.
-        version: of what the state looks like; raise it when a migration is needed.
+        version: of the state's form; raise it when a migration is needed.
         migrations: by the version that they start from, see ``failover.state``.
-        pickled: store what is no plain data by pickle. Whoever can write the folder can then run code in this program.
+        pickled: store what is no plain data by pickle. A person who can write the folder can then run code in this program.
 
     Raises:
         StateTakenError: another process keeps this state.
         SchemaError: the default cannot be kept; names the field.
-        FitError: what is stored does not fit any more; names the field. It is still stored.
+        FitError: the stored state does not fit any more; names the field. It is still stored.
     """
     PROCESS.refuse_second(name)
     if isinstance(default, _UNCHANGING):
@@ -315,7 +315,7 @@ def resume(
 
 
 def commit() -> int:
-    """Make the state, as it is now, the point to return to. Takes microseconds, waits for nobody.
+    """Make the state, as it is now, the point to return to. Takes microseconds, without a wait.
 
     Returns:
         The number of the commit.
@@ -330,8 +330,8 @@ def commit() -> int:
 def transaction(state: S) -> Iterator[S]:
     """Change the state in the body; one commit at its end, none if it raises.
 
-    What the body has changed in memory by then stays changed, for parts of the state may be known to the program by other names,
-    and a rollback that reached some of them only would leave a state that never was. Whoever catches the exception puts it
+    Changes that the body has made in memory by then stay, for parts of the state may be known to the program by other names,
+    and a rollback that reached some of them only would leave a state that never was. The code that catches the exception puts it
     right, or ends the program, which resumes from its last commit.
     """
     task = PROCESS.the_task("begin a transaction")

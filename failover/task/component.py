@@ -35,7 +35,7 @@ DECLARED: Final = "__failover_component__"
 
 
 class Kept:
-    """What `kept` leaves in a class: the declaration, and the first value for whoever makes an instance by hand."""
+    """The attribute that `kept` leaves in a class: the declaration, and the first value for an instance that is made by hand."""
 
     def __init__(self, declared: Field) -> None:
         self.declared = declared
@@ -85,10 +85,10 @@ def kept(
 
     Args:
         default: its first value, copied for each use; or ``factory`` makes it.
-        shape, dtype: of an array that keeps its form, zeros at first. A large one lies in memory of which the kernel tells what
-            was written, so that a commit costs what was changed and not what it holds.
+        shape, dtype: of an array that keeps its form, zeros at first. The kernel tells which pages of a large one
+            were written, so that a commit costs the changed pages and not the whole array.
         formerly: names under which it was stored before it was renamed.
-        pickled: store it by pickle. Whoever can write the stored state can then run code in this program.
+        pickled: store it by pickle. A person who can write the stored state can then run code in this program.
     """
     given = [default is not MISSING, factory is not None, shape is not None]
     if sum(given) != 1 or (shape is None) != (dtype is None):
@@ -99,7 +99,7 @@ def kept(
 
 
 class Declaration(Struct, frozen=True):
-    """What `component` was told about a class.
+    """The declarations that `component` got for a class.
 
     Attributes:
         period_ns: 0 for steps that follow one another at once.
@@ -133,9 +133,9 @@ def component(
     """Declare a class whose kept attributes survive.
 
     Args:
-        name: of the component; the class's name in small letters unless given. Whoever starts the program may set another.
+        name: of the component; the class's name in small letters unless given. The person who starts the program may set another.
         every: seconds from the beginning of a step to that of the next one; none: at once.
-        version: of what is kept; raise it when a migration is needed.
+        version: of the kept state; raise it when a migration is needed.
         migrations: by the version that they start from, see ``failover.state``.
     """
     if cls is not None and not isinstance(cls, type):
@@ -191,7 +191,7 @@ def schema_of(cls: type, declaration: Declaration, name: str) -> Schema:
 
 
 class Component(Protocol):
-    """What `run` runs."""
+    """The object that `run` runs."""
 
     def step(self) -> object:
         """One activation; it ends at a point where the state may be committed. May be a coroutine."""
@@ -205,7 +205,7 @@ def run(cls: type[R]) -> R:
     """Make the component, give it its state, and run its steps; each that returns is committed.
 
     Kept attributes are there when ``__init__`` runs. After a resume they are set again afterwards, so that the beginnings which
-    it sets do not take the place of what was kept; then ``on_resume`` is called, if there is one, and then the steps begin.
+    it sets do not take the place of the kept values; then ``on_resume`` is called, if there is one, and then the steps begin.
     A step that returns `FINISHED` is the last one; one that raises is not committed. SIGTERM ends the program after the step
     under way.
 

@@ -36,16 +36,16 @@ SMALL_PAGES: Final = 64
 REST_PART: Final = 9
 """After a write the thread rests this many times as long as it took: it takes a tenth of a processor, and of Python, at most…"""
 REST_S_MAX: Final = 0.1
-"""…but not longer than this, which is what a crash loses of a program that commits without pause."""
+"""…but not longer than this, the most that a crash loses of a program that commits without pause."""
 TIDY_S: Final = 5.0
-"""Between two looks whether the deltas of a large state have become too many; the chain grows by what is written meanwhile."""
+"""Between two looks whether the deltas of a large state have become too many; the chain grows by the writes meanwhile."""
 RETRY_S: Final = 0.5
 """After a write that failed."""
 LOOK_S: Final = 1.0
-"""How often whoever waits looks whether the thread still lives."""
+"""How often a waiting thread looks whether the writing thread still lives."""
 
 _LEARNING: Final = threading.Lock()
-"""Held while the thread does for the first time what loads modules and has decoders built: a child that is forked in the middle
+"""Held while the thread loads modules and builds decoders for the first time: a child that is forked in the middle
 of that would have them half built, for ever, and end by SIGSEGV at its own first write."""
 os.register_at_fork(before=_LEARNING.acquire, after_in_parent=_LEARNING.release, after_in_child=_LEARNING.release)
 
@@ -90,7 +90,7 @@ class StateFile:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What was found damaged or left over: one sentence each."""
+        """Files found damaged or left over: one sentence each."""
         return tuple(self._store.notices)
 
     def load(self) -> Snapshot | None:
@@ -114,7 +114,7 @@ class StateFile:
             The number of the commit that is safe now.
 
         Raises:
-            CheckpointError: it was not written; what was kept is intact.
+            CheckpointError: it was not written; the state kept before is intact.
         """
         is_small = session.reader.layout.page_count <= SMALL_PAGES
         order = CaptureOrder(base=is_small or self._sequence == 0, generation=self.generation, sequence=self._sequence + 1)
@@ -122,7 +122,7 @@ class StateFile:
             snapshot = session.capture(order)
             descriptor = memfd_holding(format.encode_bytes(snapshot), "state")
             if not self._has_learnt:
-                format.read_outline(descriptor)  # as the store will, but without the disk: nobody who forks waits for that
+                format.read_outline(descriptor)  # as the store will, but without the disk: no thread that forks waits for that
                 self._has_learnt = True
         try:
             self._store.put(descriptor, prove=False)
@@ -134,7 +134,7 @@ class StateFile:
         return session.commit_at(snapshot.position)
 
     def tidy(self) -> None:
-        """Forget what is older than the newest. Of a large state seldom: its deltas become a new base then, which is all of it.
+        """Forget commits older than the newest. Of a large state seldom: its deltas become a new base then, which is all of it.
 
         Raises:
             CheckpointError: the disk does not take that base; nothing was forgotten.
@@ -198,7 +198,7 @@ class Recorder:
                 self._written.wait(LOOK_S if left is None else min(left, LOOK_S))
 
     def close(self) -> None:
-        """Write what is newest, end the thread, let the file go."""
+        """Write the newest commit, end the thread, let the file go."""
         if os.getpid() != self._pid:
             return
         self._is_closing = True

@@ -51,7 +51,7 @@ class _Stopping:
 class Turns:
     """The turns of a loop at their times: each is committed when its body has come to its end. See `every`.
 
-    Iterated by ``for`` or by ``async for``; what a turn yields is its number in this run, from 0. SIGTERM ends the loop after the
+    Iterated by ``for`` or by ``async for``; a turn yields its number in this run, from 0. SIGTERM ends the loop after the
     turn under way, committed like the others. A body that raises, or leaves the loop by itself, is not committed.
     """
 
@@ -73,7 +73,7 @@ class Turns:
                 stopping.is_between_steps = False
 
     def __aiter__(self) -> AsyncIterator[int]:
-        from failover.task.asyncio_loop import turns  # which takes its time to load: only who has an asyncio loop pays for it
+        from failover.task.asyncio_loop import turns  # which takes its time to load: only a program with an asyncio loop pays
 
         return turns(self._task, self._period_ns)
 

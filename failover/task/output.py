@@ -17,7 +17,7 @@ from checkpoint.segment.layout import PENDING, Pending
 from checkpoint.segment.output_counters import StreamCounts, Totals
 
 PATIENCE_S: Final = 0.0003
-"""How long a commit waits for a guard that is just emptying a pipe or counting what it took; for one that stands still, once."""
+"""How long a commit waits for a guard that is just emptying a pipe or counting its bytes; for one that stands still, once."""
 LOOK_S: Final = 0.00005
 BUFFERED_MAX: Final = io.DEFAULT_BUFFER_SIZE + 8192
 """Bytes that Python holds back of one stream at most: the buffer of bytes, and one piece of text before it (``_CHUNK_SIZE``)."""
@@ -69,7 +69,7 @@ class OwnOutput:
         """Whether a flush fits into the pipe, however its slots are filled.
 
         Two neighbours hold more than one page together, else the kernel had put them into one slot; the first may be read in
-        part. What other threads and children write meanwhile is not foreseen. A pipe that is empty is taken as it is.
+        part. Writes by other threads and children meanwhile are not foreseen. A pipe that is empty is taken as it is.
         Source: pipe(7), ``pipe_write`` in the kernel's fs/pipe.c.
         """
         unread = self._counts.unread(index)

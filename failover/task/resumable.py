@@ -27,7 +27,7 @@ Awaited = Callable[[S], AsyncIterator[None] | Coroutine[Any, Any, None]]
 
 
 class _Decorator(Protocol):
-    """What ``resumable(name=…)`` answers."""
+    """The decorator that ``resumable(name=…)`` returns."""
 
     @overload
     def __call__(self, function: Awaited[S], /) -> Callable[[S], Coroutine[Any, Any, S]]: ...
@@ -45,7 +45,7 @@ def resumable(function: Any = None, /, *, name: str = "") -> Any:
     """Make a function that is called with its first state and goes on from the last commit instead, where there is one.
 
     Each ``yield`` is a commit, and so is the end. A function that does not yield calls `failover.commit` where it stands well.
-    The function begins anew each time: what must survive is in the state. Coroutines and asynchronous generators likewise.
+    The function begins anew each time: all that must survive is in the state. Coroutines and asynchronous generators likewise.
 
     Args:
         name: of the component; the function's name unless given.

@@ -21,7 +21,7 @@ _libc.munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
 
 
 def scratch(size: int) -> memoryview:
-    """Memory for what changes much and can be computed again: caches, buffers of frames.
+    """Memory for data that changes much and can be computed again: caches, buffers of frames.
 
     No checkpoint that is taken of this program from outside carries it, so it costs neither network nor freeze. Where the program
     goes on it is mapped as it was and holds zeros. It is shared with children, as a mapping with MAP_SHARED is::

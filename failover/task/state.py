@@ -42,7 +42,7 @@ class KeptState:
     """Commits values of one schema. May be called from any thread; one commit at a time.
 
     Attributes:
-        live: memory for arrays, of which the kernel tells what was written.
+        live: memory for arrays, of which the kernel tells which pages were written.
     """
 
     def __init__(self, schema: Schema) -> None:
@@ -59,7 +59,7 @@ class KeptState:
         self._memory_of: dict[str, tuple[int, int]] = {}
         """Where the content of each region lay at the last commit, and its size."""
         self.outputs: Callable[[], Outputs] = _nobody_counts
-        """What was written until now, where somebody counts it."""
+        """Counts the output until now, where the program has an agent."""
         self.segments = 0
         """How many there were until now."""
         self._is_forked = False
@@ -115,7 +115,7 @@ class KeptState:
         return writer.commit(sources, self.outputs())
 
     def _source(self, name: str, content: Bytes | bytes) -> Source:
-        """What a region holds now, and which of its pages were written, if the kernel can tell.
+        """The content of a region now, and which of its pages were written, if the kernel can tell.
 
         It can where the region held just this memory at the last commit, or never held any: then zeros were written over.
         """
@@ -178,7 +178,7 @@ class KeptState:
         self.live.distrust()
 
     def _room_for(self, name: str, size: int) -> int:
-        """What a region gets: what it needs, and twice as much when it turns out that it grows."""
+        """The room of a region: as much as it needs, and twice as much when it turns out that it grows."""
         before = self._rooms.get(name, 0)
         if size <= before:
             return before
@@ -187,7 +187,7 @@ class KeptState:
         return 2 * size if before else size
 
     def open_reader(self) -> SegmentReader:
-        """Somebody who reads what was committed. The first commit must have been made."""
+        """A reader of the commits. The first commit must have been made."""
         with self._lock:
             assert self._writer is not None, "there is a commit"
             return SegmentReader(self._writer.descriptor)

@@ -18,11 +18,11 @@ def test_growth_is_the_slope_after_the_first_quarter() -> None:
 def test_what_comes_and_goes_is_no_row_and_what_comes_later_is_aligned() -> None:
     samples = soak.Samples()
     for minute in range(20):
-        seen = {"heart": (20.0, 9.0)} | ({"late": (float(minute), 3.0)} if minute >= 2 else {})
+        seen = {"main loop": (20.0, 9.0)} | ({"late": (float(minute), 3.0)} if minute >= 2 else {})
         samples.add(minute, seen | ({"short": (5.0, 5.0)} if minute == 7 else {}))
     figures = {(figure.benchmark, figure.case): figure for figure in soak.figures_of(samples)}
-    assert figures[soak.MEMORY, "heart"].values == (20.0,) * 20
+    assert figures[soak.MEMORY, "main loop"].values == (20.0,) * 20
     assert figures[soak.MEMORY, "late"].values == tuple(map(float, range(2, 20)))
     assert math.isclose(figures[soak.MEMORY_GROWTH, "late"].median, 60.0)
-    assert abs(figures[soak.DESCRIPTOR_GROWTH, "heart"].median) < 1e-9
+    assert abs(figures[soak.DESCRIPTOR_GROWTH, "main loop"].median) < 1e-9
     assert (soak.MEMORY, "short") not in figures

@@ -89,7 +89,7 @@ class Prepared(Struct, frozen=True):
 
 
 class Standing(Struct, frozen=True):
-    """How a component stands, for ``status``. ``notes`` are whole sentences: what is missing or degraded, and why."""
+    """How a component stands, for ``status``. ``notes`` are whole sentences: each thing missing or degraded, and why."""
 
     state: str
     pid: int
@@ -114,11 +114,11 @@ class Component:
         task_pid: of the process that keeps its state, 0 before it has said so (``connected``); keeps: it has made a commit.
         goes_on: it was started again, or had waited, with a state that it was to go on from.
         committed: called at its first commit to each segment.
-        last_words: what its guard noted at its end.
-        keeper: what captures it.
-        commit: what `resume` commits to it with.
+        last_words: its guard's notes on its end.
+        keeper: captures it.
+        commit: the message with which `resume` commits to it.
         prepared: a program that is to be started with a state, by `resume`.
-        streams: what its guard gave of them: counters, two read ends, two logs; none of a program that is not the guard's child.
+        streams: the guard's descriptors: counters, two read ends, two logs; none of a program that is not the guard's child.
         let_go_ns: when `resume` let it go on, by our clock; 0 where it is not known.
         ended: the wait status once the program has ended (None: it was not our child); GuardLostError if the guard died first.
     """
@@ -263,7 +263,7 @@ class Component:
 
     @contextlib.contextmanager
     def _patience(self) -> Iterator[None]:
-        """What cannot be captured from outside may yet say that it keeps its state: numpy's threads are there before that.
+        """A program that cannot be captured from outside may yet say that it keeps its state: numpy's threads exist before that.
 
         Raises:
             NothingCommittedError: instead of UnsupportedError, for a while.
@@ -370,7 +370,7 @@ class Component:
     # --- holding still ---
 
     async def lease(self, until_ns: int) -> None:
-        """The program may run until CLOCK_BOOTTIME passes ``until_ns``; renew in time. 0 for ever. Thaws what a lease froze."""
+        """Let it run until CLOCK_BOOTTIME passes ``until_ns``; renew in time. 0 for ever. Thaws a program that a lease froze."""
         self._lease_until_ns = until_ns
         if self.prepared is None:  # else it is given with the start
             await self.ask_guard(messages.Lease(until_ns))
@@ -382,7 +382,7 @@ class Component:
     async def thaw(self) -> None:
         """Let it go on. Raises GuardError while its lease is over."""
         if self._held:
-            self._drop_keeper()  # lets go of what its last capture held; the next capture has a new one
+            self._drop_keeper()  # lets go of the program held by its last capture; the next capture has a new one
         await self.ask_guard(messages.Thaw())
 
     async def describe(self) -> Standing:
@@ -435,7 +435,7 @@ class Component:
         self.close()
 
     def close(self) -> None:
-        """Let go of guard, keeper and logs without changing anything for the program: what a stopping agent does."""
+        """Let go of guard, keeper and logs without changing anything for the program, as a stopping agent does."""
         self._drop_keeper()
         self._guard.close()
         if self.prepared is not None:
@@ -448,7 +448,7 @@ class Component:
     # --- guard and keeper ---
 
     def take(self, born: Started | VesselReady | Described, streams: tuple[int, ...]) -> None:
-        """Note what the guard said of it."""
+        """Note the guard's facts about it."""
         self.pid, self.inner_pid, self.isolated, self.notes = born.pid, born.inner_pid, born.isolated, born.notes
         self._take_streams(streams)
         self.limit_output(self.engine == PTRACE)
@@ -472,7 +472,7 @@ class Component:
         return reply, streams
 
     async def undo(self) -> None:
-        """Before the commit: whatever was made of it is killed, and has ended when this returns."""
+        """Before the commit: kill all processes of the unfinished component. They have ended when this returns."""
         self._drop_keeper()
         with contextlib.suppress(GuardError):
             if self.pid:

@@ -22,7 +22,7 @@ class Dialogue:
     """A conversation with a guard or a keeper. Lives in one loop.
 
     Attributes:
-        heard: takes an event and returns True; False for what answers a request.
+        heard: takes an event and returns True; False for the answer to a request.
         ended: called once when the other end has gone.
     """
 
@@ -35,8 +35,8 @@ class Dialogue:
     ) -> None:
         """
         Args:
-            incoming: the union of what may come.
-            lost: raised to whoever waits, or asks, when the other end has gone.
+            incoming: the union of the messages that may come.
+            lost: raised to each task that waits, or asks, when the other end has gone.
             whom: the other end, for messages.
         """
         end.setblocking(False)
@@ -69,7 +69,7 @@ class Dialogue:
         return await answer
 
     def tell(self, message: msgspec.Struct, descriptors: tuple[int, ...] = ()) -> None:
-        """Send what has no answer; raises as `ask`."""
+        """Send a message that has no answer; raises as `ask`."""
         if not self.open:
             raise self._lost(f"{self._whom} has gone")
         try:
@@ -81,7 +81,7 @@ class Dialogue:
             raise self._lost(f"{self._whom} has gone: {error}") from error
 
     def close(self) -> None:
-        """Hang up; whoever waits is told that the other end is lost, and `ended` is not called."""
+        """Hang up; each waiting task is told that the other end is lost, and `ended` is not called."""
         self.ended = lambda: None
         self._end()
 

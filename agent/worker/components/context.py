@@ -22,14 +22,14 @@ from failover.core.types import COMMITTED, Launch
 
 
 class Surroundings(Struct):
-    """What every supervisor works with.
+    """The objects that every supervisor works with.
 
     Attributes:
         tell: passes an event to the core.
         silence_ns: how long the robot that the component is taken over from has been silent, as far as known; for the outage.
         settled: returns once no snapshot of a component is being stored any more; given a position that it goes on from, with its
             output in the logs.
-        here: what this robot's operator wants for a component.
+        here: the settings that this robot's operator gives a component.
         hooks: runs his commands.
         last_alive: tells for how long this robot was off; None: that is not known.
     """
@@ -46,7 +46,7 @@ class Surroundings(Struct):
 
 
 def program_of(launch: Launch) -> Program:
-    """What to start."""
+    """The program to start."""
     return Program(
         tuple(os.fsencode(argument) for argument in launch.argv),
         tuple(os.fsencode(f"{name}={value}") for name, value in launch.environment),

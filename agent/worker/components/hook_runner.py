@@ -25,12 +25,12 @@ CAPTURE_PAUSE_S: Final = 10
 """Between two runs of before_capture: a whole snapshot that cannot be taken is tried again every second."""
 
 CAPTURE_LIMIT_S: Final = 5.0
-"""What before_capture may take, whatever limit_s says: a handover as a whole has ten seconds, and acknowledgements, deltas and
-stops of the component wait behind it."""
+"""How long before_capture may take, also where limit_s allows more: a handover has ten seconds in all, and acknowledgements,
+deltas and stops of the component wait behind it."""
 
 
 class Occasions(Struct):
-    """Of one component. What a hook had to complain of stands in its figures, how it went in ``failover why``."""
+    """The occasions of one component. Its figures hold the complaints of a hook; ``failover why`` tells how each run went."""
 
     name: str
     around: Surroundings
@@ -41,7 +41,7 @@ class Occasions(Struct):
     """When before_capture began last."""
 
     async def before_start(self, act: acts.Start) -> None:
-        """Run what is to be run before it begins here.
+        """Run the hook that is due before it begins here.
 
         Raises:
             AgentError: it failed, and the program must not run here without it.
@@ -49,9 +49,9 @@ class Occasions(Struct):
         await self._prepare("before_start", act.spec, self._occasion(act, hooks.STARTED))
 
     async def before_capture(self, act: acts.Capture, pid: int) -> None:
-        """Run what is to be run before a whole snapshot, or the last one of a handover; it runs on meanwhile.
+        """Run the hook that is due before a whole snapshot, or the last one of a handover; the program runs on meanwhile.
 
-        A snapshot is taken whatever comes of it: one of a program that is not prepared is better than none.
+        The agent takes the snapshot even when the hook fails: a snapshot of an unprepared program is better than none.
         """
         pause_ns = CAPTURE_PAUSE_S * 10**9
         if not self._hook("before_capture", self._spec).command:
@@ -61,7 +61,7 @@ class Occasions(Struct):
             await self._run("before_capture", self._spec, replace(self._occasion(act, hooks.CAPTURED), pid=pid))
 
     async def before_resume(self, act: acts.Restore, newest: int, age_ns: int) -> Occasion | None:
-        """Run what is to be run before it goes on here; why it does, where anybody is to be told.
+        """Run the hook that is due before it goes on here. Return why it does; None without a hook for it here.
 
         Args:
             newest: descriptor of the newest snapshot, which is so old.
@@ -96,7 +96,7 @@ class Occasions(Struct):
         self.around.tell(events.Noticed(self.name, said))
 
     async def after_resume(self, spec: ComponentSpec | None, occasion: Occasion, pid: int) -> None:
-        """Run what is to be run once it has gone on here."""
+        """Run the hook that is due once it has gone on here."""
         if _signal_in(self._hook("after_resume", spec).command):
             return
         await self._run("after_resume", spec, replace(occasion, pid=pid))
@@ -144,7 +144,7 @@ class Occasions(Struct):
 
 
 def _signal_in(command: tuple[str, ...]) -> int:
-    """Of a command that may have come from another robot: what is no signal is found out when it is run."""
+    """Of a command that may have come from another robot: a wrong signal name is found out when it is run."""
     try:
         return signal_in(command)
     except ValueError:

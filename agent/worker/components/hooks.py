@@ -42,7 +42,7 @@ from checkpoint.sentences import in_words
 STARTED: Final = "started"
 CAPTURED: Final = "captured"
 OUTPUT_MAX: Final = 4_096
-"""Bytes of what a hook said that stand in the log: the last ones."""
+"""Bytes of a hook's output that stand in the log: the last ones."""
 
 CHUNK: Final = 1 << 16
 """Bytes of it that are read at a time."""
@@ -51,13 +51,13 @@ LINE_MAX: Final = 300
 """Characters of the last line that ``failover why`` shows."""
 
 REST_S: Final = 0.5
-"""How long the rest of what a hook said is waited for once it has ended: another process may have its output open for ever."""
+"""How long to wait for the rest of a hook's output once it has ended: another process may have its output open for ever."""
 
 END_S: Final = 2.0
 """How long the end of a hook that took too long is waited for."""
 
 SWEEPS: Final = 5
-"""Looks for processes of a hook that is ended: what was born during one is found by the next."""
+"""Looks for processes of a hook that is ended: the next look finds processes that were born during one."""
 
 SYSTEMD_S: Final = 2.0
 """How much later than that systemd tells of a hook that it has ended."""
@@ -73,7 +73,7 @@ class Hook(Struct, frozen=True):
     Attributes:
         command: the first word names the program; () for none.
         limit_s: it is ended after that.
-        user: None: the agent's own user, for what its operator wrote; else the program's, for what came with it.
+        user: None: the agent's own user, for a hook that its operator wrote; else the program's, for one that came with it.
     """
 
     command: tuple[str, ...]
@@ -115,7 +115,7 @@ class Outcome(Struct, frozen=True):
 
     Attributes:
         failure: why it failed, a sentence; "" if it did not.
-        last_line: what it said last; "" if nothing.
+        last_line: the last line that it wrote; "" if none.
     """
 
     failure: str = ""
@@ -197,8 +197,8 @@ class _Running(Struct):
     """A hook that was begun.
 
     Attributes:
-        reader, output: of what it says; closed by whoever began it. The pipe is ours, not asyncio's, which would take a hook for
-            running as long as any process has the other end: one that puts itself in the background keeps it.
+        reader, output: of the hook's output; closed by the hook's caller. The pipe is ours, not asyncio's, which would take
+            a hook for running as long as any process has the other end: one that puts itself in the background keeps it.
     """
 
     process: asyncio.subprocess.Process
@@ -207,10 +207,10 @@ class _Running(Struct):
     said: bytes = b""
 
     async def last_said(self, limit_s: float) -> bytes:
-        """Wait for the end of the hook; of what it said, which may be without end, the last bytes.
+        """Wait for the end of the hook; return the last bytes of its output, which may be without end.
 
         Raises:
-            TimeoutError: it runs for longer than ``limit_s``; how long the rest of what it said takes does not count.
+            TimeoutError: it runs for longer than ``limit_s``; the time for the rest of its output does not count.
         """
         reading = asyncio.create_task(self._read())
         try:
@@ -231,14 +231,14 @@ class _Running(Struct):
 
 
 def _user_of(user: Inheritance | None) -> dict[str, Any]:
-    """What subprocess is told to become, where we can become somebody."""
+    """The user and groups that subprocess gives the hook, where this process has the right to change them."""
     if user is None or os.geteuid() != 0 or user.uid == 0:
         return {}
     return {"user": user.uid, "group": user.gid, "extra_groups": list(user.groups)}
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
-    """End a hook and whatever it started in its session, in whichever process group."""
+    """End a hook and all processes that it started in its session, in every process group."""
     for _ in range(SWEEPS):
         if not sum(_kill_of(process.pid, int(name)) for name in os.listdir("/proc") if name.isdigit()):
             break
@@ -264,7 +264,7 @@ def _kill_of(session: int, pid: int) -> bool:
 
 
 def _log_output(kind: Kind, occasion: Occasion, said: bytes) -> str:
-    """Put what a hook said into the log; its last line."""
+    """Put a hook's output into the log; return its last line."""
     lines = said.decode(errors="replace").splitlines()
     for line in lines:
         log.info("%s: %s said: %s", occasion.component, kind, line)

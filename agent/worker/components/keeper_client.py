@@ -90,14 +90,14 @@ class Following:
             self._link.dialogue.tell(message)
 
     async def let_loose(self) -> None:
-        """Have the keeper let go of what it follows, if it is there; it may follow something else then."""
+        """Have the keeper let go of the component that it follows, if it is there; it may follow another one then."""
         self._remembers_nothing()
         if self.is_there:
             self.followed = None
             await self.ask(messages.Release())
 
     def drop(self) -> None:
-        """The keeper ends, and lets go of what it follows."""
+        """The keeper ends, and lets go of the component that it follows."""
         self._remembers_nothing()
         link, self._link, self.followed = self._link, None, None
         if link is not None:
@@ -108,7 +108,7 @@ class Following:
         return self._places.budget.share(self._name, self._wanted, self._remembered)
 
     def note(self, captured: messages.Captured) -> None:
-        """What it remembers since a capture."""
+        """Note how much it remembers after a capture."""
         self._wanted, self._remembered = captured.wanted_bytes, captured.remembered_bytes
 
     def _remembers_nothing(self) -> None:

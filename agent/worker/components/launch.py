@@ -43,7 +43,7 @@ from checkpoint.snapshot.required_files import names_of_contents, needs
 
 
 class Program(Struct, frozen=True):
-    """What to start, as execve(2) wants it.
+    """The program to start, as execve(2) wants it.
 
     Attributes:
         brought: its files that were brought here, for where its own are missing: (path, content, mode).
@@ -66,7 +66,7 @@ class RestoreOptions(Struct, frozen=True):
     Attributes:
         outage_ns: added to the program's monotonic and boot time: how long ago the newest snapshot was taken.
         owner: uid; None: the one it ran as. A program that is not root's opens its files with its owner's rights alone.
-        started: what it was started with; None: not known.
+        started: its inheritance when it was started; None: not known.
         task: for a program that may still say that it keeps its state.
         epoch: the fencing token.
         terms: this robot's.
@@ -141,7 +141,7 @@ async def watch(name: str, guest: Guest, places: Places) -> Component:
     """Take a running process in: its guard is not its parent and does not own its streams.
 
     Args:
-        guest: becomes the component's, whatever happens.
+        guest: becomes the component's, also where this fails.
 
     Raises:
         GuardError: it has ended.
@@ -253,7 +253,7 @@ async def lay(
 
     Args:
         age_ns: of the newest snapshot.
-        started: what it was started with; None: not known.
+        started: its inheritance when it was started; None: not known.
         terms: this robot's.
 
     Raises:
@@ -280,7 +280,7 @@ async def lay(
 
 
 def stale(name: str) -> ChainError:
-    """A ready copy does not lead to what the store holds now: a base has come."""
+    """A ready copy does not lead to the chain that the store holds now: a base has come."""
     return ChainError(copy_outdated("a new chain has begun", name))
 
 
@@ -307,7 +307,7 @@ async def finish(component: Component, outline: Snapshot, places: Places, option
 
 
 def terms_of(outline: Snapshot, here: Terms, owner: Owner | None) -> Terms:
-    """On which terms a component that comes back is followed on this robot: it carries what its snapshot says.
+    """The terms on which a component that comes back is followed on this robot: its snapshot says which files it carries.
 
     Args:
         owner: whose rights bound it, see `agent.worker.components.restore_limits.bound_of`.
@@ -355,7 +355,7 @@ async def begin_again(
             await waiting.undo()
         raise
     component = waiting or Component(name, await places.process_pool.guard(), places)
-    component.engine_wanted = COOPERATIVE  # what another engine took before it says Hello would be older than its state
+    component.engine_wanted = COOPERATIVE  # a snapshot by another engine before it says Hello would be older than its state
     component.keeper.terms = terms_of(outline, options.terms, bound_of(owner, program.inheritance))
     try:
         await component.keeper.give()

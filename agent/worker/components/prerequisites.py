@@ -31,13 +31,13 @@ PATIENCE_S: Final = 15.0
 """How long another robot may take to look what it lacks: it reads files."""
 
 CLEARING_S: Final = 5.0
-"""How long is waited for a copy that is being ended here: what it holds, a name or a port, the next one does not lack."""
+"""How long to wait for a copy that is being ended here: once it has gone, its names and ports are free for the next one."""
 
 log = logging.getLogger("failover.lacks")
 
 
 async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
-    """What another robot lacks of what a component needs to go on there; nothing where it cannot be asked."""
+    """Needs of a component that another robot does not meet, so it could not go on there; none where it cannot be asked."""
     try:
         found = await errands.send(robot, "lacks", {"name": name}, patience_s=PATIENCE_S)
     except RefusedError as untold:
@@ -48,7 +48,7 @@ async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
 
 
 async def look(around: Surroundings, supervisors: Iterable[Supervisor]) -> Mapping[str, tuple[str, ...]]:
-    """What is lacking here for each of these, as sentences, by name; what cannot be looked at, or is not stored, is left out."""
+    """The unmet needs of each of these here, as sentences, by name; without those that cannot be looked at, or are not stored."""
     return await _told_by_one_keeper(around, supervisors, _compared)
 
 

@@ -36,7 +36,7 @@ POLL_S: Final = 0.005
 _PEER: Final = struct.Struct("3i")
 
 SPARES_MAX: Final = 8
-"""Pairs that wait at most; each holds about 60 MB. Whatever is taken over beyond that waits for interpreters to start."""
+"""Pairs that wait at most; each holds about 60 MB. A takeover of more components waits for interpreters to start."""
 
 REFILL_S: Final = 1.0
 """How long after one was used its successor is started: a takeover has the processor for itself."""
@@ -62,7 +62,7 @@ class KeeperLink(Struct):
             raise KeeperLostError("the keeper ended before it was asked anything") from error
 
     def end(self) -> None:
-        """Hang up: it lets go of what it follows, and ends."""
+        """Hang up: it lets go of the component that it follows, and ends."""
         self.dialogue.close()
 
 
@@ -84,7 +84,7 @@ class ProcessPool:
         self._closed = False
 
     def begin(self) -> None:
-        """There is a component: have a pair born, both at the same time, for who is given a guard asks for a keeper next."""
+        """There is a component: have a pair born, both at the same time: a worker that takes a guard asks for a keeper next."""
         if not self._least:
             self._least = 1
             self._prepare_if_possible()
@@ -168,7 +168,7 @@ class ProcessPool:
         asyncio.get_running_loop().call_later(REFILL_S, self._prepare_if_possible)
 
     def _prepare_if_possible(self) -> None:
-        """A machine without memory or processes left is not made to fail by what only waits."""
+        """Spare processes only wait: they must not fail a machine without memory or processes left."""
         if self._closed:
             return
         try:
@@ -246,7 +246,7 @@ class ProcessPool:
         return child
 
     def _reap(self) -> None:
-        """Collect what has ended."""
+        """Collect the processes that have ended."""
         self._children = [child for child in self._children if child.poll() is None]
 
 

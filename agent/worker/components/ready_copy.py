@@ -44,14 +44,14 @@ log = logging.getLogger("failover.component")
 
 
 class Ready(Struct, frozen=True):
-    """A copy and what it stands at."""
+    """A copy, and the snapshot whose state it has."""
 
     component: Component
     outline: Snapshot
 
 
 class ReadyCopy:
-    """What is kept ready of one component on this robot, if anything should be. Lives in one loop."""
+    """The ready copy of one component on this robot, if there should be one. Lives in one loop."""
 
     def __init__(self, name: str, around: Surroundings, figures: Figures) -> None:
         self._name = name
@@ -79,7 +79,7 @@ class ReadyCopy:
         self._news.set()
 
     def drop(self) -> None:
-        """None is wanted any more; what there is ends; its end is not awaited."""
+        """No copy is wanted any more; the one that exists ends; its end is not awaited."""
         work, self._work = self._work, None
         ready, self._ready = self._ready, None
         self._figures.copy = CopyFigures()
@@ -94,7 +94,7 @@ class ReadyCopy:
         if self._work is None:
             return None
         try:
-            async with self._turn:  # what is under way ends first: laying takes no longer than a restore
+            async with self._turn:  # work under way ends first: laying takes no longer than a restore
                 if self._ready is not None and self._ready.outline.position != position:
                     await self._bring_on(position)
                 ready, self._ready = self._ready, None
@@ -109,7 +109,7 @@ class ReadyCopy:
         return ready
 
     async def close(self) -> None:
-        """End what is kept, and see it ended."""
+        """End the copy that is kept, and see it ended."""
         self.drop()
         await asyncio.gather(*self._ending, return_exceptions=True)
 
@@ -189,7 +189,7 @@ class ReadyCopy:
         return wanted if wanted is not None and wanted in self._around.store.positions(self._name) else None
 
     async def _bring_on(self, position: Position | None = None) -> None:
-        """Apply what the store holds beyond it, up to a position; lay it again where that does not continue it."""
+        """Apply the snapshots that the store holds beyond it, up to a position; lay it again where that does not continue it."""
         ready = self._ready
         assert ready is not None, "laid before"
         entries = self._around.store.chain_of(self._name, position)

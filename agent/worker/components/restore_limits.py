@@ -20,7 +20,7 @@ def check_rights(name: str, outline: Snapshot, owner: int, started: Inheritance 
     """Let a snapshot come back with the rights of its owner, and no more: all threads of all of its processes.
 
     Args:
-        started: what it was started with; None: not known, it may have one group and call it by all four of its names.
+        started: its inheritance when it was started; None: not known, it may have one group and call it by all four of its names.
 
     Raises:
         MismatchError: it has become another user or group, as a set-user-id or set-group-id program does; or it has filters of

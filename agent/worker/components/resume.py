@@ -25,7 +25,7 @@ from failover.core import acts
 from failover.core.types import ComponentSpec, Resumption
 
 LINE_LIMIT: Final = 300
-"""Characters of what a program said last that are told."""
+"""Characters of a program's last line that are told."""
 
 
 async def brought_back(
@@ -86,7 +86,7 @@ def _options(around: Surroundings, act: acts.Restore, outage_ns: int) -> launch.
 
 
 def again(around: Surroundings, spec: ComponentSpec, newest: Snapshot | None) -> launch.Program:
-    """What is to be started again, with what was brought of it; a command of this robot's own needs nothing of that."""
+    """The program to start again, with the files that were brought of it; a command of this robot's own needs none of them."""
     here = around.here(spec.name)
     program = program_of(started_here(spec.launch, here))
     if newest is None or here.command or not around.places.contents:
@@ -111,7 +111,7 @@ def refusal(component: Component, status: int) -> str:
 
 
 def _last_line(component: Component) -> str:
-    """What it wrote last to its standard error since it was started; "" if nothing."""
+    """The last line that it wrote to its standard error since it was started; "" if none."""
     bounds = component.logs.bounds(2)
     piece = component.logs.read(2, max(bounds.committed, bounds.size - LINE_LIMIT), committed=False)
     lines = piece.content.decode(errors="replace").splitlines()

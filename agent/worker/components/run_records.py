@@ -31,7 +31,7 @@ class Running(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def all_terms(self) -> Terms:
-        """Whoever noted them."""
+        """The terms of the component, from a note of any release."""
         return Terms(self.carry, self.devices) if self.terms == NO_TERMS else self.terms
 
 
@@ -54,12 +54,12 @@ class Records:
         aside.replace(path)
 
     def epoch(self, component: str) -> int:
-        """Under which it runs; 0 if nobody noted it."""
+        """The epoch under which it runs; 0 if no note of it exists."""
         noted = self._noted(component)
         return noted.epoch if noted else 0
 
     def terms(self, component: str) -> Terms:
-        """What its operator has ruled."""
+        """The terms that its operator has ruled."""
         noted = self._noted(component)
         return noted.all_terms if noted else NO_TERMS
 

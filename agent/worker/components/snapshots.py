@@ -26,7 +26,7 @@ log = logging.getLogger("failover.component")
 
 
 class Snapshots(Struct, frozen=True):
-    """Of one component. What the last one was like stands in its figures."""
+    """The snapshots of one component. Its figures describe the last one."""
 
     name: str
     around: Surroundings
@@ -65,7 +65,7 @@ class Snapshots(Struct, frozen=True):
         )
 
     async def keep_aside(self, component: Component, act: acts.KeepAside) -> Path:
-        """One last snapshot of a copy that lost, where nobody resumes from it by himself; returns where it is.
+        """One last snapshot of a copy that lost, where no robot resumes from it by itself; returns where it is.
 
         Raises:
             CheckpointError, AgentError, OSError: there is none.
@@ -86,7 +86,7 @@ class Snapshots(Struct, frozen=True):
         return path
 
     async def tidy(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
-        """Put away what is not needed any more.
+        """Remove snapshots that are not needed any more.
 
         Raises:
             CheckpointError, OSError: from the store.

@@ -18,7 +18,7 @@ STEP_S: Final = 1.0
 """Between two looks at a process that owes an answer."""
 
 STEPS_MAX: Final = 5
-"""Looks in a row at which it has done nothing; then it is ended. A guard answers within two seconds, whatever it waits for."""
+"""Looks in a row at which it has done nothing; then it is ended. A guard answers within two seconds, even while it waits."""
 
 LATE_S: Final = 0.5
 """A look that comes so late says that we stood still, too: it does not count."""

@@ -19,7 +19,7 @@ REASONS_TOLD: Final = 3
 
 
 GAPS_KEPT: Final = 64
-"""Of the commits that were captured last; the longest of them is what a program is used to."""
+"""Of the commits that were captured last; the longest interval is a program's usual one."""
 SILENT_TIMES: Final = 10
 """A program whose newest commit is so many times older than it is used to has stopped committing, it seems…"""
 SILENT_NS_MIN: Final = 2 * 10**9
@@ -57,7 +57,7 @@ class Commits(Struct):
         return self.number > 0 and now_ns - self.newest_ns > limit_ns
 
     def remark(self, now_ns: int) -> str:
-        """What to say of a program that is overdue, for a user who looks at ``failover status`` for the first time."""
+        """A sentence on a program that is overdue, for a user who looks at ``failover status`` for the first time."""
         used = "its only one" if self.usual_ns is None else f"before that there was one every {seconds(self.usual_ns)}"
         return (
             f"last commit {seconds(now_ns - self.newest_ns)} ago, {used}: it commits no more, or it hangs; "
@@ -107,7 +107,7 @@ class Budget(Struct):
             self.last_us, self.last_bytes = captured.freeze_us, captured.frozen_bytes
 
     def remark(self, budget_ms: float) -> str:
-        """What there is to say of those that missed it; "" for nothing."""
+        """A sentence on the captures that missed it; "" if none did."""
         if not self.missed:
             return ""
         return (
@@ -121,7 +121,7 @@ class Memory(Struct, frozen=True):
 
     Attributes:
         agent: of the main loop and the worker; ``keepers``: of those that follow a component here.
-        remembered: of both, what holds pages that deltas are told from, and proved by; ``remembered_max``: its bound, xor_cache.
+        remembered: of both, for pages that deltas are told from, and proved by; ``remembered_max``: its bound, xor_cache.
     """
 
     agent: int
@@ -131,7 +131,7 @@ class Memory(Struct, frozen=True):
 
 
 class Figures(Struct):
-    """What ``failover status`` shows of one component on this robot; None where it is not known."""
+    """The figures that ``failover status`` shows of one component on this robot; None where one is not known."""
 
     snapshots: int = 0
     restores: int = 0
@@ -152,7 +152,7 @@ class Figures(Struct):
     spec: ComponentSpec | None = None
     """Of a standby: as its primary told it with the newest snapshot."""
     lacks: tuple[str, ...] | None = None
-    """Of a standby: what this robot lacks of what the program needs (`prerequisites`); None: it has not looked yet."""
+    """Of a standby: needs of the program that this robot does not meet (`prerequisites`); None: it has not looked yet."""
     contested: tuple[str, ...] = ()
     """Of a primary: which of its files others hold open for writing, so that a restore would be refused (`prerequisites`)."""
     digests: tuple[KnownDigest, ...] = ()
@@ -160,7 +160,7 @@ class Figures(Struct):
     devices: tuple[DeviceRule, ...] = ()
     """Of those that it has open, as the newest snapshot from its primary tells."""
     hooks: dict[str, str] = field(default_factory=dict)
-    """By occasion: what the last run of a hook had to complain of."""
+    """By occasion: the complaint of the last run of a hook."""
     bringing: dict[str, str] = field(default_factory=dict)
     """By robot: how far its files are on their way there."""
     engine: str = PTRACE
@@ -169,7 +169,7 @@ class Figures(Struct):
 
     @property
     def xor_hit_rate(self) -> float | None:
-        """Which part of what deltas carried could be told as a difference; None before the first one."""
+        """Which part of the bytes in deltas could be told as a difference; None before the first one."""
         return self.known_bytes / self.written_bytes if self.written_bytes else None
 
     def captured(self, captured: Captured, budget_ms: float = 0) -> None:

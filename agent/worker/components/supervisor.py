@@ -46,11 +46,11 @@ log = logging.getLogger("failover.component")
 
 @dataclass(slots=True)
 class Supervisor:
-    """The component and what is to be done with it.
+    """The component and the acts that are due on it.
 
     Attributes:
         component: None while nothing of it runs here.
-        standby, copy: what waits here to take it over: a program that keeps its state, or any other's memory.
+        standby, copy: wait here to take it over: a program that keeps its state, or any other's memory.
         epoch: of the newest act; an older one is dropped.
         ended: set by the core's word that the component's end is a record.
         guest: the running process that a client has just named, to be taken in; the client's, while it waits.
@@ -76,9 +76,9 @@ class Supervisor:
     _coming: Component | None = None
     """One that is being restored: it has a lease already."""
     _lease_until_ns: int = 0
-    """What the core said last, whether or not the guard knows."""
+    """The core's last word, also where the guard does not know it yet."""
     _is_held: bool = False
-    """Whether the core wants it to stand still, whatever is still in the queue."""
+    """Whether the core wants it to stand still, regardless of acts still in the queue."""
     _is_thaw_owed: bool = False
     """A thaw was refused, for its lease was over by then; the next lease brings it."""
     _to_prune: acts.Prune | None = None
@@ -110,7 +110,7 @@ class Supervisor:
             self._queue.put_nowait(act)
 
     def _note_lease(self, act: Act) -> None:
-        """Leases and freezes overtake what waits in the queue: a thaw or a restore must not bring an older lease back."""
+        """Leases and freezes overtake the acts that wait in the queue: a thaw or a restore must not bring an older lease back."""
         match act:
             case acts.SetLease():
                 self._lease_until_ns = act.until_ns
@@ -188,7 +188,7 @@ class Supervisor:
         while True:
             act = await self._queue.get()
             if isinstance(act, asyncio.Future):
-                if not act.done():  # who waited for it may have hung up
+                if not act.done():  # the task that waited for it may have hung up
                     act.set_result(None)
                 continue
             if act.epoch < self.epoch and not isinstance(act, acts.Stop):  # type: ignore[union-attr]
@@ -393,7 +393,7 @@ class Supervisor:
         return self.around.last_alive.off_ns(age_ns) if self.around.last_alive is not None else 0
 
     async def _resumed(self, act: acts.Restore, chain: list[int], outage_ns: int, laps: clock.Laps) -> tuple[Component, int]:
-        """The component, running, and the age of its state: what waits here for it, or, where that fails, from its beginning."""
+        """The component, running, and the age of its state: from its copy or program that waits here, else from its beginning."""
         copied = await self.copy.take(act.position)
         if copied is not None:
             laps.lap("taking the ready copy")
@@ -488,7 +488,7 @@ class Supervisor:
         )
 
     async def _report(self, act: acts.ReportExit) -> None:
-        """The end is a record now: tell who waits, and let the guard go."""
+        """The end is a record now: tell the waiting clients, and let the guard go."""
         self.figures.exit_status, self.figures.reasons = act.status, ()
         self.started.set()
         ended = self.end()

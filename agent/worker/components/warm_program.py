@@ -33,7 +33,7 @@ log = logging.getLogger("failover.component")
 
 
 class Standby:
-    """What waits of one component on this robot, if anything should. Lives in one loop."""
+    """The program of one component that waits on this robot, if one should. Lives in one loop."""
 
     def __init__(self, name: str, places: Places) -> None:
         self._name = name
@@ -42,10 +42,10 @@ class Standby:
         self._ending: set[asyncio.Task[None]] = set()
         self._ready: Component | None = None
         self._given: Component | None = None
-        """What was taken last: it is not ours to end."""
+        """The component that was taken last: it is not ours to end."""
 
     def warm(self, program: Program, owner: int, tell: Callable[[bool, str], None]) -> None:
-        """From now on have this program wait; whatever waited ends.
+        """From now on have this program wait; one that waited before ends.
 
         Args:
             tell: called with whether it is ready, and why not, each time that this changes.
@@ -55,7 +55,7 @@ class Standby:
         self._work.add_done_callback(end_worker_on_mistake)
 
     def cool(self) -> None:
-        """Nothing is to wait any more; what does is ended; its end is not awaited."""
+        """No program is to wait any more; one that does is ended; its end is not awaited."""
         work, self._work, self._ready = self._work, None, None
         if work is not None:
             work.cancel()
@@ -72,7 +72,7 @@ class Standby:
         return ready
 
     async def close(self) -> None:
-        """End what waits, and see it ended."""
+        """End the program that waits, and see it ended."""
         self.cool()
         await asyncio.gather(*self._ending, return_exceptions=True)
 

@@ -1,1 +1,1 @@
-"""The control socket: verbs, queries, what status shows, how much each user may hold."""
+"""The control socket: verbs, queries, the status, how much each user may hold."""

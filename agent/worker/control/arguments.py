@@ -14,13 +14,13 @@ SIGNAL_MAX: Final = 64
 """The last real-time signal. Source: signal(7)."""
 
 PID_MAX: Final = (1 << 31) - 1
-"""What a pid_t holds."""
+"""The largest value of a pid_t."""
 
 USER_SIZE_MAX: Final = 256
 """Characters of a user's name: what useradd(8) takes."""
 
 Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
-"""What the kernel can be told: a string of C ends with a NUL."""
+"""Text that the kernel can be told: a string of C ends with a NUL."""
 
 Variable = Annotated[str, msgspec.Meta(pattern=r"\A[^\0=]+\Z")]
 """A name in the environment."""
@@ -35,10 +35,10 @@ HookName = Literal["before_capture", "before_resume", "after_resume"]
 """Occasions for a command that comes with a program, see `agent.worker.components.hooks`."""
 
 Connections = Literal["", "reset", "carry", "refuse"]
-"""What becomes of connections with others; "" for what this robot's operator says."""
+"""What becomes of connections with others; "" for the setting of this robot's operator."""
 
 SharedMemory = Literal["", "refuse", "detach"]
-"""What becomes of shared memory that others have mapped, too; "" for what this robot's operator says."""
+"""What becomes of shared memory that others have mapped, too; "" for the setting of this robot's operator."""
 
 T = TypeVar("T")
 
@@ -158,7 +158,7 @@ class WhyArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class PageArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``story``: what a robot asks another one for when it merges event logs; ``before``: life and number of a line."""
+    """Of ``story``: the page that a robot asks another for when it merges event logs; ``before``: life and number of a line."""
 
     name: str = ""
     age_ms_max: Age = 0
@@ -166,7 +166,7 @@ class PageArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``piece``: what another robot asks for when it passes a stream on."""
+    """Of ``piece``: the bytes that another robot asks for when it passes a stream on."""
 
     name: str
     stream: int

@@ -1,4 +1,4 @@
-"""Status of fencing in one sentence: what keeps a program here from acting when it may not, and what this robot lacks for it.
+"""Status of fencing in one sentence: how a program here is kept from acting when it may not, and what this robot lacks for it.
 
 Each part alone, and agent and keeper together, may die or stand still: the guard freezes its program before the lease ends, and a
 guard that stands still is ended with its program. One case remains: all of them stand still at once, as in a machine that hangs
@@ -23,11 +23,11 @@ MORE: Final = "docs/fencing.md"
 
 
 class Watchdog(Struct, frozen=True):
-    """A hardware watchdog that somebody feeds, as far as the kernel tells.
+    """A hardware watchdog that a program feeds, as far as the kernel tells.
 
     Attributes:
         timeout_s: without a sign of life for so long it resets the machine; 0: not told.
-        is_told: False: it is there, and a kernel without CONFIG_WATCHDOG_SYSFS does not tell whether anybody feeds it. Opening
+        is_told: False: it is there, and a kernel without CONFIG_WATCHDOG_SYSFS does not tell whether a program feeds it. Opening
             the device would tell, and start it.
     """
 
@@ -37,7 +37,7 @@ class Watchdog(Struct, frozen=True):
 
 
 def watchdog(directory: Path = WATCHDOGS) -> Watchdog | None:
-    """The first one that is active, else the first of which that is not known; None where there is none, or nobody feeds it."""
+    """The first active one, else the first of which that is not known; None where there is none, or no program feeds one."""
     places = sorted(directory.glob("watchdog*"))
     active = [place for place in places if _fact(place, "state") == ACTIVE]
     untold = [place for place in places if not _fact(place, "state")]

@@ -22,7 +22,7 @@ USER_CONNECTIONS_MAX: Final = 32
 """Of any other user: each `failover run` that waits, `logs -f` and `status --watch` holds one."""
 
 OTHERS_CONNECTIONS_MAX: Final = 128
-"""Of all those users together: the agent keeps its descriptors for what it protects."""
+"""Of all those users together: the agent keeps its descriptors for the components that it protects."""
 
 USER_BYTES_MAX: Final = 8 << 20
 """Of requests of one user that have arrived and are not answered, without the first 32 KB of each: a small one is heard."""
@@ -31,11 +31,11 @@ NAMES_FOR_EACH: Final = 2
 """Names of components that a user may have used, those that were released included, for each component that he may have."""
 
 OTHERS_BYTES_MAX: Final = 32 << 20
-"""The same of all users together who are neither root nor the agent's own."""
+"""The same of all users together except root and the agent's own."""
 
 
 class Admission:
-    """Who holds what of the control socket. Lives in one asyncio loop."""
+    """How much of the control socket each user holds. Lives in one asyncio loop."""
 
     def __init__(self) -> None:
         self._connections: Counter[int] = Counter()

@@ -38,7 +38,7 @@ _decoder = msgspec.msgpack.Decoder(Request)
 
 
 class Conversation:
-    """What a verb says to its client while it works, and who that is."""
+    """The answers of a verb to its client while it works, and the client's identity."""
 
     def __init__(self, writer: asyncio.StreamWriter, caller: Caller) -> None:
         self._writer = writer
@@ -121,7 +121,7 @@ class ControlServer:
             writer.close()
 
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Request after request, until the client closes, or says what is none, or says nothing."""
+        """Serve request after request, until the client closes, sends bytes that are none, or sends nothing."""
         connection = writer.get_extra_info("socket")
         uid = uid_of(connection)
         try:
@@ -139,7 +139,7 @@ class ControlServer:
             self._admission.leave(uid)
 
     async def _served(self, reader: asyncio.StreamReader, conversation: Conversation) -> bool:
-        """Take one request, and answer it; whether there was one. What it takes is counted until then.
+        """Take one request, and answer it; whether there was one. Its bytes are counted until then.
 
         Raises:
             RefusedError: it was none, it did not come in time, or it is one too many.

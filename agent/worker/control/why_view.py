@@ -36,7 +36,7 @@ NS_PER_MS: Final = 10**6
 
 
 class Worker(Protocol):
-    """What of `agent.worker.process.Worker` is needed here."""
+    """The part of `agent.worker.process.Worker` that is needed here."""
 
     settings: Settings
     errands: Errands
@@ -109,7 +109,7 @@ class Telling:
         }
 
     async def _own(self, component: str, age_ms_max: int) -> tuple[list[Line], int]:
-        """This robot's lines, oldest first; what the main loop has not written yet is asked for before the disk is read."""
+        """This robot's lines, oldest first. It asks the main loop for lines not written yet before it reads the disk."""
         told = await self._worker.ask("why")
         try:
             kept = await asyncio.to_thread(event_log.read, Path(self._worker.settings.config.state_directory))
@@ -207,7 +207,7 @@ def _on_our_clock(line: Line, heard: Heard) -> Timed:
 
 
 def _witness(heard: Heard) -> dict[str, Any]:
-    """What is said about one robot's part in the answer; see `failover.client.control.WHY`."""
+    """One robot's part in the answer; see `failover.client.control.WHY`."""
     return {
         "robot": heard.robot,
         "answered": not heard.reason,

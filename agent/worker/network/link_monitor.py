@@ -24,7 +24,7 @@ log = logging.getLogger("failover.links")
 
 
 class Wires:
-    """Refreshes `Links` and passes on what changed. Lives in the worker's loop."""
+    """Refreshes `Links` and passes the changes on. Lives in the worker's loop."""
 
     def __init__(self, links: Links, changed: Callable[[list[str]], Awaitable[None]]) -> None:
         self._links = links

@@ -1,7 +1,7 @@
 """Network links of this robot: wired or wireless, cable in or out, and which traffic may use them.
 
 Heartbeats use every link. Snapshots are large and are a program's memory: they use wired links alone, unless the operator allows
-more (``snapshots_over``). What the kernel knows decides what a link is. Where the kernel cannot know, because a radio is behind
+more (``snapshots_over``). The kernel's facts decide what kind a link is. Where the kernel cannot know, because a radio is behind
 an Ethernet port, the operator says so (``wireless``).
 """
 
@@ -43,7 +43,7 @@ DEPTH_MAX: Final = 8
 
 
 class Medium(enum.StrEnum):
-    """What carries a link's bytes."""
+    """How a link carries its bytes."""
 
     WIRED = "wired"
     WIRELESS = "wireless"
@@ -73,7 +73,7 @@ class Device(Struct, frozen=True):
 
 
 class Scene(Struct, frozen=True):
-    """What the kernel said at one instant: interfaces by index, and the index of each address's."""
+    """The kernel's answer at one instant: interfaces by index, and the index of each address's."""
 
     links: Mapping[int, KernelLink]
     addresses: Mapping[str, int]
@@ -93,7 +93,7 @@ class Scene(Struct, frozen=True):
 
 
 class Facts:
-    """What makes an interface wireless: the operator's word, then the kernel's."""
+    """The signs that an interface is wireless: the operator's word, then the kernel's."""
 
     def __init__(self, declared: frozenset[str], sysfs: Path = SYSFS, proc: Path = PROC_WIRELESS) -> None:
         self._declared = declared
@@ -101,7 +101,7 @@ class Facts:
         self._proc = proc
 
     def link(self, one: KernelLink, scene: Scene) -> Link:
-        """What is known of an interface."""
+        """The facts that are known of an interface."""
         if one.hardware == ARPHRD_LOOPBACK:
             return Link(one.name, Medium.LOOPBACK, one.carrier, "the loopback", one.index)
         because = self._radio(one, scene, DEPTH_MAX)
@@ -137,7 +137,7 @@ class Facts:
         return frozenset(line.partition(":")[0].strip() for line in lines if ":" in line)
 
     def _sysfs_radio(self, one: KernelLink) -> str:
-        """What /sys says; it may be mounted for another network namespace, where the same name means another interface."""
+        """A radio's sign in /sys, which may be of another network namespace, where the same name means another interface."""
         place = self._sysfs / one.name
         try:
             if int((place / "ifindex").read_text()) != one.index:
@@ -174,7 +174,7 @@ class Links:
         self.trouble = ""
 
     def refresh(self) -> list[str]:
-        """Ask the kernel anew; returns what changed, a sentence each."""
+        """Ask the kernel anew; returns the changes, a sentence each."""
         try:
             self._scene = scene = Scene.now()
         except OSError as error:
@@ -208,7 +208,7 @@ class Links:
         return Device(link.name, link.index)
 
     def notes(self) -> list[str]:
-        """For the status: what is wrong with this robot's links, a sentence each."""
+        """For the status: each fault of this robot's links, a sentence each."""
         missing = [host for host in self._hosts[1:] if self._known.get(host) is None]
         told = [f"no interface of this robot has its beat address {host} now" for host in missing]
         if hindrance := self.hindrance():
@@ -250,7 +250,7 @@ class Links:
         return self._facts.link(one, scene) if one is not None else None
 
     def _change(self, host: str, before: Link | None) -> str:
-        """What to say of an address whose link is another than before; "" if nothing."""
+        """A sentence on an address whose link is another than before; "" if there is no change."""
         link = self._known[host]
         if link == before:
             return ""
@@ -290,7 +290,7 @@ def resolved(host: str) -> str:
 
 
 def _traffic(name: str) -> dict[str, int | None]:
-    """What the kernel counted on an interface. Source: proc_pid_net(5), /proc/net/dev, of our own network namespace."""
+    """The kernel's counters of an interface. Source: proc_pid_net(5), /proc/net/dev, of our own network namespace."""
     try:
         lines = Path("/proc/net/dev").read_text().splitlines()
     except OSError:

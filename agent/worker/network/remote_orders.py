@@ -31,11 +31,11 @@ CONTENT_MAX: Final = CHUNK_SIZE_MAX
 """Bytes of an answer: the replication link takes no larger message than a chunk of a snapshot."""
 
 Order = Callable[[dict[str, Any], int], Awaitable[dict[str, Any]]]
-"""Carries one verb out on this robot: its arguments, the uid of who gave it → its result."""
+"""Carries one verb out on this robot: its arguments, the uid of the user who gave it → its result."""
 
 
 class Errands:
-    """Both ends: what was sent from here, and what came from others. Lives in the worker's loop."""
+    """Both ends: orders sent from here, and orders that came from others. Lives in the worker's loop."""
 
     def __init__(self, say: Callable[[str, Bulk], object], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
         """
@@ -56,7 +56,7 @@ class Errands:
         """Have a peer carry an order out, or answer a question.
 
         Args:
-            by: uid of who gave the order.
+            by: uid of the user who gave the order.
 
         Raises:
             RefusedError: it cannot be reached; it refused, with its reasons; or its answer did not come.
@@ -107,7 +107,7 @@ class Errands:
         task.add_done_callback(end_worker_on_mistake)
 
     async def close(self) -> None:
-        """Give up what is under way."""
+        """Give up the orders under way."""
         tasks = [task for under_way in self._under_way.values() for task in under_way]
         for task in tasks:
             task.cancel()

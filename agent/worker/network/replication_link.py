@@ -1,7 +1,7 @@
 """The replication link: ZeroMQ between agents, authenticated and encrypted by CURVE. The only ``zmq`` import.
 
 One ROUTER socket receives from all peers; one DEALER socket sends to each peer. A connection carries one direction's messages, in
-order. Messages queued for a connection are lost with the connection: the core says again what still matters.
+order. Messages queued for a connection are lost with the connection: the core repeats messages that still matter.
 
 The link identifies a sender by key, not by claim: the ZAP answer below admits only public keys of the team file and names their
 owner. Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
@@ -37,7 +37,7 @@ QUEUE_LIMIT: Final = 1_024
 """Messages waiting for one peer, chunks not counted: a peer that takes none for so long has lost them anyway."""
 
 HIGH_WATER: Final = 6
-"""Messages inside ZeroMQ for one peer: what is in there can no longer be overtaken by a vote."""
+"""Messages inside ZeroMQ for one peer: a vote can no longer overtake them."""
 
 MESSAGE_LIMIT: Final = CHUNK_SIZE_MAX + (64 << 10)
 """Bytes of one frame from a stranger; more closes the connection."""
@@ -130,7 +130,7 @@ Unread = Callable[[str, str], None]
 
 
 class Callbacks(Struct, frozen=True):
-    """Whom a link tells what happens on it."""
+    """Functions to which a link tells its events."""
 
     receive: Receive
     changed: Changed
@@ -156,7 +156,7 @@ def public_key_of(secret: str) -> str:
 
 
 class PeerConnection:
-    """The way to one peer: a DEALER socket, what waits for it, and how its connection stands."""
+    """The way to one peer: a DEALER socket, the messages that wait for it, and how its connection stands."""
 
     def __init__(
         self,
@@ -241,7 +241,7 @@ class PeerConnection:
         self._fail_chunk("the agent ends")
 
     async def _send(self) -> None:
-        """Whatever waits, small messages first, one at a time, so that little is committed to the socket's own queue."""
+        """Send waiting messages, small ones first, one at a time, so that little is committed to the socket's own queue."""
         while True:
             await self._wake.wait()
             if self._words:
@@ -384,7 +384,7 @@ class ReplicationLink:
     async def hold_to_devices(self) -> None:
         """Interfaces have come or gone: connect, or listen, anew where it must be by another one than before.
 
-        Where an interface has only gone, what was held to it waits for its return.
+        Where an interface has only gone, the sockets bound to it wait for its return.
 
         Raises:
             LaneError: the address cannot be had any more.
@@ -427,7 +427,7 @@ class ReplicationLink:
         await self.links[peer].ship(chunk)
 
     def troubles(self) -> list[str]:
-        """What was refused in this life, for the status: a sentence each."""
+        """The messages that this robot refused in this life, for the status: a sentence each."""
         told = [
             f"{peer} sent {count} messages on the replication link that this robot does not understand; "
             "install the same release on both"
@@ -452,7 +452,7 @@ class ReplicationLink:
         self._context.destroy(linger=0)
 
     async def _hear(self, router: zmq.asyncio.Socket) -> None:
-        """Every message of every peer, in order; what is malformed or of a stranger is counted and dropped."""
+        """Every message of every peer, in order; a message that is malformed or of a stranger is counted and dropped."""
         try:
             while True:
                 frames = await router.recv_multipart(copy=False)
@@ -468,7 +468,7 @@ class ReplicationLink:
             router.close(0)
 
     async def _watch(self, monitor: zmq.asyncio.Socket) -> None:
-        """Follow which connections come and go; what is too much is ended before it has said a word."""
+        """Follow which connections come and go; a connection too many is ended before it has said a word."""
         try:
             while True:
                 event = parse_monitor_message(await monitor.recv_multipart())
@@ -489,7 +489,7 @@ class ReplicationLink:
         return claimed
 
     async def _admit(self, gate: zmq.asyncio.Socket) -> None:
-        """Answer ZeroMQ's question who may connect: the owners of the team's keys, by name."""
+        """Answer ZeroMQ's question which peer may connect: the owners of the team's keys, by name."""
         owners = {z85.decode(key.encode()): name for name, key in self._keys.peers.items() if key}
         try:
             while True:

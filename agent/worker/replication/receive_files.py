@@ -34,7 +34,7 @@ NAMED: Final = 3
 DIGESTS_KEPT: Final = 4096
 
 ASKING_S: Final = 60.0
-"""What was named within this time counts as one asking: all parts of one come in seconds."""
+"""Files that a peer names within this time count as one asking: all parts of one come in seconds."""
 
 MB: Final = 10**6
 
@@ -42,7 +42,7 @@ log = logging.getLogger("failover.belongings")
 
 
 class Limits(Struct, frozen=True):
-    """What this robot's operator allows.
+    """The limits that this robot's operator sets.
 
     Attributes:
         bring: files are brought here at all.
@@ -56,7 +56,7 @@ class Limits(Struct, frozen=True):
 
 
 class Stock:
-    """What is here. One for an agent; lives in its loop, looks at files in threads. It is the desk for contents that come in."""
+    """The files here, and the `Desk` for contents that come in. One for an agent; lives in its loop, reads files in threads."""
 
     def __init__(self, store: Store, limits: Limits, robot: str, admits: Callable[[str, str], str]) -> None:
         """
@@ -72,7 +72,7 @@ class Stock:
         self._named: dict[tuple[str, str], dict[bytes, tuple[Belonging, float]]] = {}
 
     async def compare(self, peer: str, asked: Belongings) -> Lacking:
-        """Answer what of a program's files is lacking here; from then on it may be offered by that peer."""
+        """Answer which of a program's files are lacking here; from then on that peer may offer them."""
         if reason := self._admits_component(asked.component, peer):
             return Lacking(asked.number, (), reason)
         if strange := next((file for file in asked.files if not is_plausible(file)), None):
@@ -91,7 +91,7 @@ class Stock:
         return [file for file in files if not (self._limits.runs and is_in_place(file))]
 
     def _all_named(self, peer: str, component: str, files: Iterable[Belonging]) -> list[Belonging]:
-        """These, and what was named in the same asking: it may come in several messages."""
+        """These, and the files named in the same asking: it may come in several messages."""
         now_s = time.monotonic()
         known = self._named.setdefault((peer, component), {})
         known |= {file.digest: (file, now_s) for file in files}
@@ -102,7 +102,7 @@ class Stock:
         return bool(file.digest) and self._store.contents.hold(file.digest, file.size)
 
     def _hindrance(self, elsewhere: list[Belonging], lacking: list[Belonging]) -> str:
-        """Why what is lacking cannot be brought; "" if it can."""
+        """Why the lacking files cannot be brought; "" if they can."""
         if not lacking:
             return ""
         if not self._limits.bring:
@@ -124,7 +124,7 @@ class Stock:
     # As a desk (`agent.worker.replication.transfer.Desk`)
 
     def admits(self, peer: str, offer: Content) -> None:
-        """Take what was said to be lacking, and nothing else."""
+        """Take files that were said to be lacking, and no others."""
         if self._awaited.get(peer, {}).get(offer.digest) != offer.size:
             raise Refusal("this robot has not asked for that file")
 

@@ -58,9 +58,9 @@ class Deposit:
     ) -> None:
         """
         Args:
-            kept: called with what was offered, and that snapshot without its pages, once the core has accepted it.
-            runs: this member runs components: what it keeps it may have to lay down.
-            here: what this robot's operator wants for a component.
+            kept: called with the offer, and that snapshot without its pages, once the core has accepted it.
+            runs: this member runs components: it may have to lay down the files that it keeps.
+            here: the settings that this robot's operator gives a component.
         """
         self._runs = runs
         self._here = here
@@ -86,7 +86,7 @@ class Deposit:
         return self._senders.get(component, "")
 
     def admits(self, peer: str, offer: Offer) -> None:
-        """Refuse what was not asked for, before a byte of it travels.
+        """Refuse a snapshot that was not asked for, before a byte of it travels.
 
         Raises:
             Refusal: with the reason for the sender's status.
@@ -104,14 +104,14 @@ class Deposit:
         return "" if taken else f"this robot does not take snapshots of {component} from {peer}"
 
     async def make_room(self, size: int) -> None:
-        """Have room for a snapshot of so many bytes, if what is kept for people can give it."""
+        """Have room for a snapshot of so many bytes, if the snapshots kept for people can give it."""
         try:
             await asyncio.to_thread(self._store.make_room, size)
         except StoreError as error:
             log.warning("%s", error)
 
     def not_taken(self, peer: str, offer: Offer, why: str) -> None:
-        """The disk did not take what was admitted: the core hears of it, and status tells."""
+        """The disk did not take an admitted snapshot: the core hears of it, and status tells."""
         self._tell(StoreFailed(offer.component, offer.epoch, peer, why, needs_base=False))
 
     async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
@@ -186,7 +186,7 @@ class Deposit:
                 logs.apply(one.output, is_safe=True)
         finally:
             logs.close()
-        if is_gap:  # an earlier worker took in what came before
+        if is_gap:  # an earlier worker took in the snapshots before
             self._complete(component, directory, position, is_safe=True)
         while unshown and unshown[0].position <= position:
             unshown.popleft()
@@ -202,10 +202,10 @@ class Deposit:
     async def settled(self, component: str, position: Position | None = None) -> None:
         """Return once no snapshot of it is being stored: from then on a guard writes its output here.
 
-        The core has ordered that no robot's are taken any more; what waits for its turn is refused.
+        The core has ordered that snapshots are taken from no robot any more; a snapshot that waits for its turn is refused.
 
         Args:
-            position: what the component goes on from here: its output is in the logs when this returns, shown before or not.
+            position: of the checkpoint to go on from here: its output is in the logs when this returns, shown before or not.
         """
         async with self._turns.setdefault(component, asyncio.Lock()):
             if position is not None:
@@ -222,7 +222,7 @@ class Deposit:
                 self._mend_logs_of(name)
 
     def _mend_logs_of(self, name: str) -> None:
-        """What the newest snapshot continues was acknowledged; whether that one was, the core will say (`show`)."""
+        """The chain before the newest snapshot was acknowledged; the core will say whether the newest one was (`show`)."""
         descriptors = self._store.open_chain(name)
         try:
             if len(descriptors) > 1 and complete_logs(log_directory(name, self._places), descriptors[:-1]):

@@ -47,7 +47,7 @@ Reader = Callable[[str, Need], Awaitable[int]]
 
 
 class _Sure(Struct):
-    """What a peer was found to have of a component."""
+    """The files of a component that a peer was found to have."""
 
     needs: tuple[Need, ...]
     until_s: float
@@ -79,7 +79,7 @@ class Bringing:
         """
         Args:
             say: on the replication link; False: it is not connected.
-            note: told (component, peer, sentence) what is on its way, for the status; "" when nothing is any more.
+            note: told (component, peer, sentence) how the files travel, for the status; "" when none does any more.
         """
         self._shipper = shipper
         self._say = say
@@ -93,7 +93,7 @@ class Bringing:
         """Return once the peer has all of these.
 
         Raises:
-            LaneError: it cannot have them, or not yet; what is under way goes on all the same.
+            LaneError: it cannot have them, or not yet; transfers under way go on all the same.
         """
         known = self._peers.setdefault(peer, _Peer())
         sure = known.sure.get(component)
@@ -109,7 +109,7 @@ class Bringing:
         known.sure[component] = _Sure(files, time.monotonic() + SURE_S)
 
     async def close(self) -> None:
-        """Give up what is under way."""
+        """Give up the transfers under way."""
         tasks = [task for peer in self._peers.values() for task in peer.under_way.values()]
         for task in tasks:
             task.cancel()
@@ -122,7 +122,7 @@ class Bringing:
             asked[1].set_result(message)
 
     def lost(self, peer: str) -> None:
-        """The connection is gone: what comes back may be another robot by that name."""
+        """The connection is gone: another robot may come back by that name."""
         self._peers.setdefault(peer, _Peer()).sure.clear()
         for name, answer in self._asked.values():
             if name == peer and not answer.done():
@@ -211,7 +211,7 @@ class Sources:
     def __init__(self, store: Store, ask: Callable[[str, Need], Awaitable[int]]) -> None:
         """
         Args:
-            ask: of the component's keeper, for what no path leads to any more, or only the program may read; its descriptor.
+            ask: the component's keeper, for the descriptor of a file without a path any more, or that only the program may read.
         """
         self._store = store
         self._ask = ask
@@ -228,7 +228,7 @@ class Sources:
         return descriptor if descriptor is not None else await self._from_keeper(component, need)
 
     async def keep_what_goes(self, component: str, files: tuple[Need, ...]) -> None:
-        """Keep by content what its path does not lead to any more: the program was upgraded, or removed, while it runs.
+        """Keep by content the files that are not at their paths any more: the program was upgraded, or removed, while it runs.
 
         Raises:
             CheckpointError, AgentError, OSError: it cannot be had (any more), or kept.

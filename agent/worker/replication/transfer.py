@@ -58,7 +58,7 @@ INCOMING_LIMIT: Final = 64
 
 
 class Link(Protocol):
-    """What of `agent.worker.network.replication_link.ReplicationLink` is needed here."""
+    """The part of `agent.worker.network.replication_link.ReplicationLink` that is needed here."""
 
     def say(self, peer: str, message: Bulk) -> bool: ...
     async def ship(self, peer: str, chunk: Chunk) -> None: ...
@@ -195,11 +195,11 @@ class Refusal(Exception):
 
 
 Kind = TypeVar("Kind", Offer, Content, contravariant=True)
-"""What is offered: each kind has a receiver of its own."""
+"""The kinds of offers: each has a receiver of its own."""
 
 
 class Desk(Protocol[Kind]):
-    """Who decides about what comes in."""
+    """Decides about offers that come in."""
 
     def admits(self, peer: str, offer: Kind) -> None:
         """Raises `Refusal` when it is not wanted from this peer."""
@@ -273,7 +273,7 @@ class Receiver:
         self._drop((peer, message.transfer))
 
     def lost(self, peer: str) -> None:
-        """The peer is gone: whatever it had begun leaves no trace."""
+        """The peer is gone: its unfinished transfers leave no trace."""
         for key in [key for key in self._incoming if key[0] == peer]:
             self._drop(key)
 
@@ -291,7 +291,7 @@ class Receiver:
             transfer.task.cancel()
 
     async def _receive(self, peer: str, transfer: _Incoming) -> None:
-        """Fill an unnamed file, so that whatever happens nothing half is left, and hand it over."""
+        """Fill an unnamed file, so that no failure leaves half a file, and hand it over."""
         offer = transfer.offer
         try:
             await self._desk.make_room(offer.size)
@@ -300,7 +300,7 @@ class Receiver:
             try:
                 await self._fill(peer, transfer, descriptor)
                 if isinstance(offer, Offer):
-                    self._incoming.pop((peer, offer.transfer), None)  # a newer one does not end what is whole
+                    self._incoming.pop((peer, offer.transfer), None)  # a newer offer does not end a whole one
                 await self._desk.take(peer, offer, descriptor)
                 self._link.say(peer, Taken(offer.transfer))
             finally:
@@ -345,7 +345,7 @@ class Receiver:
 
 
 def _of(offer: Offered) -> str | bytes:
-    """What a newer offer takes the place of."""
+    """The key of an offer: a newer offer with the same key takes its place."""
     return offer.component if isinstance(offer, Offer) else offer.digest
 
 

@@ -58,7 +58,7 @@ def _be_init(command: list[str]) -> NoReturn:
 
 
 def _host(command: list[str]) -> int:
-    """Wait for the word, start the agent, and reap whatever ends, until nothing is left."""
+    """Wait for the word, start the agent, and reap each process that ends, until none is left."""
     if not os.read(0, 1):
         return REFUSED
     agent = os.fork()

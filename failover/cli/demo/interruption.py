@@ -34,7 +34,7 @@ class Interruption:
 
     @contextmanager
     def allowed(self) -> Iterator[None]:
-        """Raise in the body, also for what has come before it. What ends the body is ended in peace."""
+        """Raise in the body, also for a signal that has come before it. No signal disturbs the code that ends the body."""
         self._set_allowed(True)
         try:
             yield

@@ -33,7 +33,7 @@ SECONDS_BEFORE: Final = 3.0
 
 TAKEOVER_S: Final = 60.0
 END_S: Final = 120.0
-"""Bounds, far above what is usual, after which the demo says that it failed."""
+"""Bounds, far above the usual times, after which the demo says that it failed."""
 
 LENGTHS: Final = (1, 4, 16)
 """How many times the usual time the programs take: the first; the next where one came to its end before it could be protected."""
@@ -49,7 +49,7 @@ RESULT_COLUMNS: Final = ("program", "outage", "lag at the cut", "freeze median",
 
 
 class Act(Struct):
-    """One program in the play, and what was seen of it.
+    """One program in the play, and the observations of it.
 
     Attributes:
         freezes_us: freeze time of each snapshot, by sequence.
@@ -117,7 +117,7 @@ def short_place() -> str:
 
 
 class Play:
-    """The acts on one stage. `perform` is the whole; afterwards ``acts`` holds what was seen."""
+    """The acts on one stage. `perform` is the whole; afterwards ``acts`` holds the observations."""
 
     def __init__(self, stage: Stage, screen: PlainScreen, length: int = 1) -> None:
         self._length = length
@@ -192,7 +192,7 @@ class Play:
         )
 
     def _sample(self) -> bool:
-        """Note what the primary's agent knows of each program; whether all are well."""
+        """Note the facts that the primary's agent has of each program; return whether all are well."""
         found = {component["name"]: component for component in self._primary.status()["components"]}
         for act in self.acts:
             component = found.get(act.program.name)
@@ -286,7 +286,7 @@ class Play:
             self._screen.say(f"{act.program.title} has ended ({ending}); its {act.size} bytes of output are {verdict}")
 
     def end_references(self) -> None:
-        """Whatever happens, no undisturbed run goes on without us, and nobody watches any more."""
+        """Stop the watchers, and end the undisturbed runs, however the demo ends: none goes on without us."""
         for act in self.acts:
             act.before.stop()
             act.after.stop()

@@ -69,7 +69,7 @@ class Program(Struct, frozen=True):
     Attributes:
         name: of the component.
         title: how the demo speaks of it.
-        argv: what to execute.
+        argv: the command line to execute.
         directory: where to execute it; its files lie there.
         expected_size: bytes that it writes in all, near enough for a progress bar.
     """
@@ -81,7 +81,7 @@ class Program(Struct, frozen=True):
     expected_size: int
 
     def undisturbed(self, environment: dict[str, str]) -> subprocess.Popen[bytes]:
-        """Start it as anybody would, politely, its output going to a file: see `reference`."""
+        """Start it as a user would, politely, its output going to a file: see `reference`."""
         with self.reference.open("wb") as output:
             return subprocess.Popen(
                 ["nice", "-n", "10", *self.argv],

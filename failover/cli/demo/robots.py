@@ -58,7 +58,7 @@ GUARDS_CGROUP: Final = "failover-"
 """How the names of the guards' cgroups begin (`agent.guard.freezer`)."""
 
 GO: Final = b"g"
-"""What a host waits for before it starts its agent."""
+"""The byte that a host waits for before it starts its agent."""
 
 
 class Pace(Struct, frozen=True):
@@ -72,20 +72,20 @@ USUAL_PACE: Final = Pace(BEAT_MS, LEASE_MS)
 
 
 class Means(Struct, frozen=True):
-    """What this machine allows: each True makes the robots more like two machines."""
+    """The means that this machine allows: each True makes the robots more like two machines."""
 
     own_pids: bool
     own_network: bool
 
     def sentence(self) -> str:
-        """What the robots have of their own, and why not more."""
+        """The things that each robot has of its own, and why not more."""
         pids = "own PIDs" if self.own_pids else "shared PIDs (this system forbids user namespaces)"
         network = "own network, joined by a cable" if self.own_network else f"loopback ports ({why_no_network()})"
         return f"{pids}, {network}"
 
 
 def means() -> Means:
-    """Find out what can be had here."""
+    """Find out which means can be had here."""
     probe = subprocess.run(host_command(True, ["/bin/true"]), input=GO, capture_output=True, check=False)
     own_network = os.geteuid() == 0 and ip_command() is not None and can_unshare_network()
     return Means(own_pids=probe.returncode == 0, own_network=own_network)
@@ -131,7 +131,7 @@ class RobotMachine(Struct):
 
     @property
     def log(self) -> Path:
-        """What its agent said."""
+        """The output of its agent."""
         return self.directory / "agent.log"
 
     def switch_on(self) -> None:
@@ -164,7 +164,7 @@ class RobotMachine(Struct):
                 time.sleep(POLL_S)
 
     def status(self) -> dict[str, Any]:
-        """What its agent knows now."""
+        """The present status, from its agent."""
         with Control.open(self.socket) as link:
             return link.ask("status")
 
@@ -192,7 +192,7 @@ class RobotMachine(Struct):
         return len(frozen)
 
     def end(self) -> None:
-        """Kill whatever is left, wait until nothing is, and remove the cgroups that only its guards would have removed."""
+        """Kill all processes left, wait until none is, and remove the cgroups that only its guards would have removed."""
         cgroups = {place for pid in self.processes() if (place := cgroup_of(pid)) is not None}
         while left := self.processes():
             for pid in left:
@@ -203,7 +203,7 @@ class RobotMachine(Struct):
             self.process.kill()
         self.process.wait()
         for place in cgroups:
-            with contextlib.suppress(OSError):  # somebody else's as well, or the guard was quicker
+            with contextlib.suppress(OSError):  # another robot uses it as well, or the guard was quicker
                 place.rmdir()
 
     def last_words(self) -> str:
@@ -317,7 +317,7 @@ class Stage:
         return RobotMachine(name, directory, process)
 
     def configuration(self, name: str, directory: Path) -> str:
-        """What stands in a robot's agent.toml, whose things lie in this directory."""
+        """The text of a robot's agent.toml, whose things lie in this directory."""
         return (
             f'robot = "{name}"\n'
             f'team_directory = "{directory / "team"}"\n'
@@ -373,7 +373,7 @@ def run(command: list[str]) -> None:
     """Run one set-up command.
 
     Raises:
-        FailoverError: it failed; says what it said.
+        FailoverError: it failed; quotes its message.
     """
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     if ran.returncode:
@@ -381,7 +381,7 @@ def run(command: list[str]) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of the loopback that are free now, as TCP and as UDP, and that the system does not lend to whoever asks for any.
+    """Ports of the loopback that are free now, as TCP and as UDP, and that the system lends to no program that asks for any.
 
     So a robot that was away for a while finds its own free when it comes back.
     """
@@ -393,7 +393,7 @@ def free_ports(count: int) -> list[int]:
             held.append(stream)
             datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             held.append(datagram)
-            with contextlib.suppress(OSError):  # somebody has this one
+            with contextlib.suppress(OSError):  # another process has this one
                 stream.bind(("127.0.0.1", _any_port()))
                 datagram.bind(stream.getsockname())
                 ports.append(stream.getsockname()[1])

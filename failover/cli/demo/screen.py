@@ -37,7 +37,7 @@ class PlainScreen:
             print(line, flush=True)
 
     def draw(self, lines: Sequence[Sequence[str]], share: float, caption: str) -> None:
-        """Nothing: what matters is said."""
+        """Nothing: `say` prints all that matters."""
 
 
 class LiveScreen(PlainScreen):

@@ -32,7 +32,7 @@ class Waiting:
         """Whether it has lasted for as long as it may; tells of it meanwhile.
 
         Args:
-            how_far: what is known of the progress, in a few words; "" for nothing.
+            how_far: the progress, in a few words; "" if nothing is known.
         """
         now = time.monotonic()
         if now - self._told >= TOLD_EVERY_S:

@@ -184,7 +184,7 @@ class LiveBoard:
 
 
 def save_picture(path: str, command: str, lines: Sequence[str], columns: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
-    """Write what a terminal showed, some lines and a table, as an SVG picture."""
+    """Write the content of a terminal, some lines and a table, as an SVG picture."""
     import io
 
     from rich.console import Console
@@ -259,6 +259,6 @@ def _widths(cells: Sequence[Sequence[str]], room: int) -> list[int] | None:
 
 
 def _stacked(columns: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """One row for a narrow terminal: its name, and below it what is known, with the columns' names."""
+    """One row for a narrow terminal: its name, and below it the known values, with the columns' names."""
     told = [f"{column} {cell}".strip() for column, cell in zip(columns[1:], cells[1:], strict=True) if cell.strip(" -–")]
     return [cells[0], *([f"     {', '.join(told)}"] if told else [])]

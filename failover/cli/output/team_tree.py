@@ -70,7 +70,7 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
         found += _branch(own, "")
     orphans = [component for component in components if component.get("primary") not in {name for name, _ in robots}]
     if orphans:
-        found.append(Row(("nobody", *[""] * (len(COLUMNS) - 1)), "bad"))
+        found.append(Row(("no robot", *[""] * (len(COLUMNS) - 1)), "bad"))
         found += _branch(orphans, "")
     return tuple(found)
 
@@ -119,7 +119,7 @@ def _component_row(component: Mapping[str, Any], branch: str) -> Row:
 
 
 def _standby(component: Mapping[str, Any]) -> str:
-    """Who goes on with it; whether its program waits there already, where one can."""
+    """The robot that would resume it; whether its program waits there already, where one can."""
     standby, warm = component.get("standby"), component.get("warm")
     if not standby or warm is None:
         return f"{standby or 'none'}{', ready' if component.get('ready') else ''}"
@@ -155,7 +155,7 @@ def mood_of(component: Mapping[str, Any]) -> Mood:
 
 
 def promises(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What holds now: for the team, and for the components for which something else holds."""
+    """The promises that hold now: the team's, and those of components that differ from it."""
     found = [f"promise: {status['promise']}"] if status.get("promise") else []
     for component in map(sight, status["components"]):
         if component.get("promise_differs") and component.get("promise"):
@@ -164,7 +164,7 @@ def promises(status: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def kept(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What a server keeps, for whom, how much, how old."""
+    """The checkpoints that a server keeps: for which component, how much, how old."""
     if status.get("role") != "server":
         return ()
     return tuple(_kept_line(component) for component in status["components"] if component.get("kept"))
@@ -190,7 +190,7 @@ DAYS_FROM_S: Final = 2 * 86_400
 
 
 def memory(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What the agent takes of this robot's memory, and what bounds that."""
+    """How much of this robot's memory the agent takes, and its bounds."""
     found = status.get("memory")
     if not found:
         return ()
@@ -215,7 +215,7 @@ def _copy(copy: Mapping[str, Any]) -> str:
 
 
 def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """What stands below the tree: what is wrong, each cause once, with the components that it concerns."""
+    """The lines below the tree: each cause of trouble once, with the components that it concerns."""
     alike: dict[str, list[tuple[str, str]]] = {}
     for component in status["components"]:
         if sight(component).get("state") != "released":
@@ -237,7 +237,7 @@ _FIGURE: Final = re.compile(r"(?<=\bpid )\d+|\d+(?:\.\d+)?(?= (?:ms|s|min|bytes|
 
 
 def _of_all(told: Sequence[tuple[str, str]]) -> str:
-    """What is said of several components, by name, as one sentence."""
+    """The sentences on several components as one, with their names."""
     if len(told) == 1:
         return ": ".join(told[0])
     return f"{listed([name for name, _ in told])}: {_in_one([line.replace(name, 'it') for name, line in told])}"
@@ -285,7 +285,7 @@ def _remarks_on(component: Mapping[str, Any]) -> list[str]:
 
 
 def _add(told: str, line: str, lines: list[str]) -> None:
-    """Add a line. Where another one gives its cause, which stands behind a colon, that one says what else follows from it."""
+    """Add a line. Where another one gives its cause, which stands behind a colon, that one also tells this consequence."""
     what, _, rest = line.partition(": ")
     cause = rest.partition("; ")[0]
     for index, other in enumerate(lines):

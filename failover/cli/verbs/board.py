@@ -1,4 +1,4 @@
-"""board, board get, put, top, users: what lies on the board of this robot, and a put by hand."""
+"""board, board get, put, top, users: the items on the board of this robot, and a put by hand."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _rates(before: list[Seen], after: list[Seen], passed_s: float) -> dict[tuple
 
 
 def _answer(opened: Board, seen: list[Seen], rates: dict[tuple[str, str], float]) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """The answer that ``--json`` prints."""
     robots = {
         name: {"state": robot.state, "age_ms": ms(robot.age_ns), "rank": robot.rank} for name, robot in opened.robots().items()
     }

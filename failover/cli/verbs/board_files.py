@@ -109,7 +109,7 @@ def import_file(arguments: argparse.Namespace) -> int:
 
 
 def _imported(content: bytes, path: Path, arguments: argparse.Namespace) -> tuple[Board, tuple[str, ...], dict[str, str]]:
-    """The board of a file, what is to be said of it, and a comment for each item."""
+    """The board of a file, remarks on it, and a comment for each item."""
     if content.lstrip()[:1] == b"<":
         return Board(rtdb_xml.parse(content, str(path), arguments.size)), (), {}
     found = rtdb_conf.parse(content, str(path))

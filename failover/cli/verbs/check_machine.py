@@ -30,7 +30,7 @@ STAND_IN = ("sleep", "60")
 
 
 LOCKED_OR_FIRST: Final = ("beats run at ", "the main loop's memory ")
-"""How an agent's notes begin that say what it was refused of real-time priority and locked memory (`agent.system.clock`)."""
+"""How an agent's notes begin that tell of refused real-time priority and locked memory (`agent.system.clock`)."""
 
 
 class Offer(Struct, frozen=True):
@@ -64,7 +64,7 @@ def check_machine(arguments: argparse.Namespace) -> int:
 
 
 def _status(arguments: argparse.Namespace) -> Mapping[str, Any] | None:
-    """What the agent says of itself; None where none answers."""
+    """The status that the agent gives of itself; None where none answers."""
     try:
         with connect(arguments) as agent:
             return agent.ask("status")
@@ -73,7 +73,7 @@ def _status(arguments: argparse.Namespace) -> Mapping[str, Any] | None:
 
 
 def _of_agent(status: Mapping[str, Any]) -> list[Offer]:
-    """What the agent that runs has been given, or was refused: a shell is often allowed more, or less, than a service."""
+    """The grants and refusals that the running agent got: a shell is often allowed more, or less, than a service."""
     refused = [note for note in status["notes"] if note.startswith(LOCKED_OR_FIRST)]
     if refused:
         return [Offer("lesser", "real-time priority", f"the agent says: {note}") for note in refused]
@@ -83,7 +83,7 @@ def _of_agent(status: Mapping[str, Any]) -> list[Offer]:
 
 
 def _standing_by(status: Mapping[str, Any]) -> list[Offer]:
-    """What this robot lacks of what the components need that it stands by for."""
+    """The needs that this robot does not meet, of components that it stands by for."""
     held = [one for one in status["components"] if one["role"] == "standby" and one["lacks"] is not None]
     lacking = [(one, lack) for one in held for lack in one["lacks"]]
     if lacking:
@@ -105,7 +105,7 @@ def _architecture() -> Offer:
 
 
 def _looking_into() -> list[Offer]:
-    """Protect and capture a stand-in, and make a vessel to restore into: what a system forbids shows only when it is tried."""
+    """Protect and capture a stand-in, and make a vessel to restore into: only a trial shows what a system forbids."""
     with subprocess.Popen(STAND_IN, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as stand_in:
         try:
             notes = _captured_once(stand_in.pid)
@@ -121,7 +121,7 @@ def _looking_into() -> list[Offer]:
 
 
 def _captured_once(pid: int) -> tuple[str, ...]:
-    """What the keeper has to say about a process that it captures once and lets go."""
+    """The keeper's notes on a process that it captures once and lets go."""
     with Keeper.spawn() as keeper:
         protected, _ = keeper.ask(Protect(pid, "/check", verb="capture"), Protected)
         captured, (content,) = keeper.ask(Capture(base=True, generation=1, sequence=1), Captured)

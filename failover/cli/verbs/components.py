@@ -207,7 +207,7 @@ def stop(arguments: argparse.Namespace) -> int:
 
 
 def logs(arguments: argparse.Namespace) -> int:
-    """Show what a component wrote, from whichever robot it wrote it; with --follow through restarts of the agent."""
+    """Show the output of a component, on whichever robot it wrote it; with --follow through restarts of the agent."""
     offsets = [0, 0]
     agent = connect(arguments)
     try:
@@ -230,7 +230,7 @@ def logs(arguments: argparse.Namespace) -> int:
 
 
 def _show_logs(agent: Control, arguments: argparse.Namespace, offsets: list[int]) -> dict[str, Any]:
-    """Show the streams from the offsets on, which move along; returns what the agent ends with."""
+    """Show the streams from the offsets on, which move along; returns the agent's last answer."""
     for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow, offsets=offsets):
         if isinstance(reply, Output):
             _show_piece(arguments, reply)
@@ -271,7 +271,7 @@ def _moved(answer: dict[str, Any]) -> str:
 
 
 def promote(arguments: argparse.Namespace) -> int:
-    """Have a robot run what nobody is heard to run, once whoever orders it knows what that risks."""
+    """Have a robot run a component that no robot is heard to run, once the operator knows the risks."""
     wanted = {"name": arguments.name, "robot": arguments.robot or ""}
     with connect(arguments) as agent:
         would = agent.ask("promote", **wanted)
@@ -287,7 +287,7 @@ def promote(arguments: argparse.Namespace) -> int:
 
 
 def _agreed(question: str) -> bool:
-    """Whether a person at the terminal says yes; without one nobody does."""
+    """Whether the person at the terminal says yes; False without a terminal."""
     if not sys.stdin.isatty():
         return False
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)

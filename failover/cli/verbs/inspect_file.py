@@ -22,7 +22,7 @@ PROTECTION = ((1, "r"), (2, "w"), (4, "x"))
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Show what a snapshot holds."""
+    """Show the content of a snapshot."""
     try:
         format.verify(arguments.file)
         snapshot = format.read_outline(arguments.file)
@@ -41,9 +41,9 @@ class Rights(msgspec.Struct, frozen=True):
     """With whose rights a snapshot comes back if root restores it.
 
     Attributes:
-        author: uid of whose word it is; None: that cannot be told, and root is refused without --trust.
-        why: what shows that.
-        reduced: what it asks for and does not get, each with its figure.
+        author: uid of its author; None: that cannot be told, and root is refused without --trust.
+        why: the fact that shows that.
+        reduced: the rights that it asks for and does not get, each with its figure.
     """
 
     author: int | None
@@ -62,7 +62,7 @@ class Rights(msgspec.Struct, frozen=True):
 
 
 def rights_of(snapshot: Snapshot, file: int, path: str) -> Rights:
-    """What `failover restore` would give it where root calls it."""
+    """The rights that `failover restore` would give it where root calls it."""
     try:
         author = file_author.author_of(file, path)
     except AuthorError as error:
@@ -98,7 +98,7 @@ def _show(snapshot: Snapshot, size: int, with_vmas: bool, back: Rights) -> None:
 
 
 def facts(snapshot: Snapshot, size: int) -> list[tuple[str, str]]:
-    """What a person asks first: which program, when, where, how large."""
+    """The facts that a person asks for first: which program, when, where, how large."""
     process, machine = snapshot.process, snapshot.machine
     taken = datetime.fromtimestamp(snapshot.clocks.realtime_ns / NANOSECONDS, UTC)
     carried = sum(run.size for run in snapshot.runs)

@@ -154,7 +154,7 @@ def _captured(keeper: Keeper, pid: int, order: Capture, file: int, target: Path)
 
 
 def _at_last(pid: int, ask: Callable[[], A]) -> A:
-    """The answer to what is asked again where the moment was bad: no agent is there to ask again.
+    """The answer of the keeper, asked again where the moment was bad: no agent is there to ask again.
 
     A refusal is asked again, too, until it was given `REFUSED_TRIES` times in the same words: a child that has not executed its
     program yet (vfork), or bytes on their way, are refused only for a moment.
@@ -182,7 +182,7 @@ def _at_last(pid: int, ask: Callable[[], A]) -> A:
 
 
 def _in_vain(pid: int, error: CaptureError, took_s: float) -> str:
-    """Why no try succeeded, and what helps."""
+    """Why no try succeeded, and the cure."""
     why = str(error).removesuffix("; capture it again")
     load, cores = os.getloadavg()[0], len(os.sched_getaffinity(0))
     tried = f"failover tried {CAPTURE_TRIES} times in {took_s:.0f} s; the machine has a load of {load:.0f} on {cores} cores"
@@ -206,9 +206,9 @@ def _ended(pid: int) -> Iterator[None]:
 
 
 def _wait_for_ends(dying: Mapping[int, int]) -> None:
-    """Wait, for a while, until these have ended, and their parents can be told: who restores at once finds files and PIDs free.
+    """Wait, for a while, until these have ended, and their parents can be told: a restore at once finds files and PIDs free.
 
-    The end of who is traced is told to its tracer first, and to its parent when that has taken note, or has ended itself.
+    The end of a traced process is told to its tracer first, and to its parent when that has taken note, or has ended itself.
 
     Args:
         dying: process ids by their pidfds.
@@ -272,7 +272,7 @@ def _written_whole(target: Path) -> Iterator[int]:
 
 
 def terms_of(arguments: argparse.Namespace) -> Terms:
-    """What was ruled for this capture or restore.
+    """The terms that the user ruled for this capture or restore.
 
     Raises:
         FailoverError: a rule is none.
@@ -289,7 +289,7 @@ def terms_of(arguments: argparse.Namespace) -> Terms:
 
 
 def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
-    """What becomes of devices.
+    """The rules for devices.
 
     Raises:
         FailoverError: a rule is none.
@@ -306,7 +306,7 @@ def device_rules(arguments: argparse.Namespace) -> tuple[DeviceRule, ...]:
 def restore(arguments: argparse.Namespace) -> int:
     """Start the program of a snapshot where it stood; print its PID and return, or stay until it ends."""
     try:
-        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what is no file is told, not waited for
+        file = os.open(arguments.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe is refused, not waited for
     except OSError as error:
         raise FailoverError(f"cannot read {arguments.file}: {error.strerror}") from error
     try:
@@ -316,7 +316,7 @@ def restore(arguments: argparse.Namespace) -> int:
 
 
 def whose_rights(arguments: argparse.Namespace, file: int) -> Author | None:
-    """Whose word a snapshot is, and so whose rights it gets at most; None: it gets what it asks for, as far as we have it.
+    """The author of a snapshot, whose rights it gets at most; None: it gets the rights that it asks for, as far as we have them.
 
     Raises:
         AuthorError: that cannot be told.
@@ -359,7 +359,7 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
 
 
 def _reduced(path: str, state: State, author: Author) -> tuple[str, ...]:
-    """What a snapshot asks for and does not get, as a note; none where it asks for no more than its owner has."""
+    """The rights that a snapshot asks for and does not get, as a note; none where it asks for no more than its owner has."""
     assert author.owner is not None
     if not (asked := credentials.excess(state, author.owner)):
         return ()
@@ -369,7 +369,7 @@ def _reduced(path: str, state: State, author: Author) -> tuple[str, ...]:
 
 @contextmanager
 def _told_of(reduced: tuple[str, ...]) -> Iterator[None]:
-    """Add to what comes to nothing that it was tried with less than was asked for."""
+    """Add to an error that the restore was tried with fewer rights than were asked for."""
     try:
         yield
     except CheckpointError as error:
@@ -378,7 +378,7 @@ def _told_of(reduced: tuple[str, ...]) -> Iterator[None]:
 
 
 def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.ExitStack) -> Birth:
-    """The same for an owner who is not root: with nothing of root's, also not root's terminal to read from."""
+    """The same for an owner other than root: with nothing of root's, also not root's terminal to read from."""
     if owner is None:
         return birth
     theirs = credentials.at_most(state.process.credentials, owner)
@@ -387,7 +387,7 @@ def _owned(birth: Birth, state: State, owner: Owner | None, opened: contextlib.E
 
 
 def _without_terminal(opened: contextlib.ExitStack) -> tuple[int, int, int]:
-    """Our standard streams for who is not to read what is typed: a terminal is open for writing alone."""
+    """Our standard streams for a program that must not read the typed text: a terminal is open for writing alone."""
 
     def unread(stream: int) -> int:
         if not os.isatty(stream):
@@ -414,7 +414,7 @@ def birth_of(state: State, elapsed_ns: int, own_session: bool) -> Birth:
 def _lacks_its_ids(state: State) -> bool:
     """Whether a program of several processes or threads finds one of its ids taken, or may not choose them at all.
 
-    Ids of what has just ended are waited for, for a while: its parent, or init, has yet to take note of that.
+    It waits a while for the ids of processes that have just ended: their parent, or init, has yet to take note of that.
     """
     threads = (*state.threads, *(thread for member in state.members for thread in member.threads))
     ids = {thread.tid for thread in threads} | {zombie.pid for zombie in state.zombies}
@@ -471,7 +471,7 @@ def _print_notes(notes: tuple[str, ...]) -> None:
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Say whether a process, or this machine, can be protected, and what to change; or what can be in general."""
+    """Say whether a process can be protected, or this machine protect, and what to change; or list all that can be kept."""
     if arguments.table:
         return _show_table(arguments)
     if arguments.pid is None:
@@ -493,7 +493,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _show_table(arguments: argparse.Namespace) -> int:
-    """Show what comes back of any program, by which rule, and what is refused."""
+    """Show which things come back of any program, by which rule, and which are refused."""
     with Keeper.spawn() as keeper:
         rows = keeper.ask(messages.Tabulate(), messages.Tabulated)[0].rows
     if arguments.json:

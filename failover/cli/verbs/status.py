@@ -1,4 +1,4 @@
-"""status: shows what the team does."""
+"""status: shows the state of the team."""
 
 from __future__ import annotations
 

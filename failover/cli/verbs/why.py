@@ -23,7 +23,7 @@ NEAR_MS: Final = 1.0
 
 
 def why(arguments: argparse.Namespace) -> int:
-    """Tell what was seen, by whom, when, and what was done about it."""
+    """Tell which robot saw which facts, when, and what it decided."""
     wanted = {"name": arguments.name or "", "robot": arguments.robot or "", "age_ms_max": arguments.since or 0}
     with connect(arguments) as agent:
         answer = agent.ask("why", **wanted)
@@ -61,7 +61,7 @@ def paragraph(line: Mapping[str, Any]) -> str:
 
 
 def facts(line: Mapping[str, Any]) -> list[str]:
-    """What the robot knew when it decided, a sentence each; what goes without saying is left out."""
+    """The facts that the robot knew when it decided, a sentence each, without those that go without saying."""
     told = [sighting(one) for one in line.get("seen") or ()]
     if line.get("component"):
         told += _primacy(line)
@@ -99,7 +99,7 @@ def _primacy(line: Mapping[str, Any]) -> list[str]:
 
 
 def _at_stake(line: Mapping[str, Any]) -> list[str]:
-    """What would have been lost, had it gone on from the newest checkpoint in that instant."""
+    """The loss, had it gone on from the newest checkpoint in that instant."""
     number, age_ms, output = line.get("checkpoint"), line.get("checkpoint_age_ms"), line.get("output_pending")
     told = []
     if number:
@@ -113,7 +113,7 @@ def _at_stake(line: Mapping[str, Any]) -> list[str]:
 
 
 def told_of_robots(robots: Sequence[Mapping[str, Any]]) -> str:
-    """Which robots answered, whose clock is off, and who did not answer."""
+    """A sentence on the robots that answered, those whose clock is off, and those that did not answer."""
     told = []
     for one in robots:
         if not one.get("answered"):

@@ -37,7 +37,7 @@ def received(age_us: int, came_ns: int, transit_max_us: int, sender_error_us: in
     Args:
         came_ns: when the frame arrived, by the kernel's stamp.
         transit_max_us: no frame is under way for longer; `NO_ERROR_BOUND` while that is not known.
-        sender_error_us: what the sender's own reading had.
+        sender_error_us: the error of the sender's own reading.
     """
     stamp_ns = came_ns - age_us * NS_PER_US
     rounded_us = transit_max_us + sender_error_us + 1  # the age was rounded down by less than 1 µs

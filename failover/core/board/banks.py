@@ -66,7 +66,7 @@ class Area(Protocol):
 Clock = Callable[[int], int]
 """Of a kernel's clock's number: nanoseconds."""
 Fence = Callable[[], None]
-"""What was loaded or stored before it is so for other processors too before what comes after."""
+"""Loads and stores before it happen, for other processors too, before those after it."""
 
 
 class Place(Struct, frozen=True):
@@ -92,7 +92,7 @@ class Place(Struct, frozen=True):
 
 
 class Found(Struct, frozen=True, gc=False):
-    """What a bank held, whole."""
+    """The whole content of a bank."""
 
     value: bytes
     stamp_ns: int
@@ -101,13 +101,13 @@ class Found(Struct, frozen=True, gc=False):
 
 
 class Reading(Struct, frozen=True, gc=False):
-    """What a get returns.
+    """The result of a get.
 
     Attributes:
         value: as the item's type says.
         age_ns: since the value was produced, at least.
         age_max_ns: at most; `UNBOUNDED_NS` where that is not known.
-        robot: who wrote it.
+        robot: the robot that wrote it.
         number: of the put; to be given to `wait`.
         stale: it may be older than the item's bound.
     """
@@ -131,7 +131,7 @@ def place_of(record: Record, words: Words, area: Area, halves: Words) -> Place:
 
 
 def sum_of(value: bytes, stamp_ns: int, number: int) -> int:
-    """What a bank's sum must be, if it is not 0."""
+    """The sum that a bank must have, if it is not 0."""
     return xxhash.xxh3_64_intdigest(value) ^ stamp_ns ^ number
 
 
@@ -215,7 +215,7 @@ Remember = Callable[[int], None]
 UNKNOWN: Final = -1
 
 UNFIT: Final = (TypeError, ValueError, IndexError)
-"""What is raised for a value that is no bytes, or not as many bytes as it has elements."""
+"""The exceptions for a value that is no bytes, or not as many bytes as it has elements."""
 
 
 class Writer(Struct, frozen=True):
@@ -248,8 +248,8 @@ def writer(
     (A lock would do the same for a quarter of a microsecond more.)
 
     Args:
-        number: of the newest put, or what the first one is to come after.
-        skew_ns: what this process's CLOCK_BOOTTIME is ahead of the machine's.
+        number: of the newest put, or the one that the first one is to come after.
+        skew_ns: by how much this process's CLOCK_BOOTTIME is ahead of the machine's.
         slow: is called in place of ``put``.
         woken: wakes those that wait; is given the stamp.
         always_wake: readers cannot say that they wait.

@@ -110,7 +110,7 @@ def field_of(name: str) -> str:
 
 
 def macro_of(item: str) -> str:
-    """What the constants of an item begin with: ``ball.seen`` → ``BALL_SEEN``."""
+    """The prefix of an item's constants: ``ball.seen`` → ``BALL_SEEN``."""
     word = _ODD.sub("_", item).upper()
     return word if word[:1].isalpha() else f"ITEM_{word.strip('_')}"
 

@@ -1,4 +1,4 @@
-"""The type language of items: what a person writes, the C struct that it means, and the one text that names it.
+"""The type language of items: the text that a person writes, the C struct that it means, and the one text that names it.
 
 ::
 

@@ -56,7 +56,7 @@ NUMPY_NAMES: Final = {f"{_KINDS[code[0]]}{8 * int(code[1])}": code for code in N
 """numpy's name of a number → ours."""
 
 MISFITS: Final = (struct.error, TypeError, ValueError, AttributeError, LookupError, OverflowError)
-"""What an object raises that is not of its type."""
+"""The exceptions that an object raises that is not of its type."""
 
 
 class Values(Struct, frozen=True):
@@ -65,7 +65,7 @@ class Values(Struct, frozen=True):
     Attributes:
         pack: the value's bytes, of the type's size; of contents without a layout, at most so many.
             Raises ValueMisfitError: names the field and why.
-        unpack: the value of such bytes, whoever wrote them.
+        unpack: the value of such bytes, from any writer.
             Raises ValueMisfitError: only for contents without a layout, which need not be any.
     """
 

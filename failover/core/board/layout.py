@@ -99,7 +99,7 @@ NUMBER_WORD, STAMP_WORD, SUM_WORD, SIZE_WORD = range(4)
 
 
 class Header(Struct, frozen=True):
-    """What a file says of itself.
+    """The header of a file, in which it describes itself.
 
     Attributes:
         count: records in use, holes included.
@@ -192,7 +192,7 @@ def names_at(capacity: int) -> int:
 
 
 def read_header(view: Buffer) -> Header:
-    """What a mapped file says of itself.
+    """The header of a mapped file.
 
     Raises:
         BoardGoneError: the file is no board any more: made anew, or zeros in its place.
@@ -239,10 +239,10 @@ def read_records(view: Buffer, header: Header) -> Iterator[Record]:
 def read_record(view: Buffer, header: Header, index: int) -> Record | None:
     """One record; None where there is a hole.
 
-    All that it names lies inside of ``view``: the file may be longer than what is mapped, when others have added items since.
+    All that it names lies inside of ``view``: the file may be longer than the mapping, when others have added items since.
 
     Raises:
-        BoardError: it is damaged, or lies outside of what is mapped.
+        BoardError: it is damaged, or lies outside of the mapping.
     """
     id_, kind, banks, offset, size, stride, period, phase, digest, name_offset, bound, flags = DECLARATION.unpack_from(
         view, record_at(index)
@@ -327,7 +327,7 @@ class Addition(Struct, frozen=True):
 
 
 def addition(header: Header, wanted: Wanted) -> Addition:
-    """What to write for one more item; the generation is the caller's, who holds the table lock.
+    """The pieces to write for one more item; the generation is that of the caller, which holds the table lock.
 
     Raises:
         BoardError: there is no room, or the item is outside of the limits.
@@ -365,7 +365,7 @@ def addition(header: Header, wanted: Wanted) -> Addition:
 
 
 def removal(index: int) -> Piece:
-    """What makes a hole of a record; the generation is the caller's."""
+    """The piece that makes a hole of a record; the generation is the caller's."""
     return record_at(index) + BANKS_FIELD, LENGTH.pack(0)
 
 

@@ -10,7 +10,7 @@
     assignment = "ASSIGNMENT" {nl} "{" { nl | "schema" "=" id [";"] | "agents" "=" ids [";"] } "}" ;
     ids        = id { "," [nl] id } ;    comment = "#" … end of line ;    blanks between all tokens
 
-The grammar takes what CAMBADA's own parser takes, and what its documentation promises beyond that: ``period = 3`` is a syntax
+The grammar takes all that CAMBADA's own parser takes, and all that its documentation promises besides: ``period = 3`` is a syntax
 error there, and so is a line break in a list of agents. Numbers of items and agents are their places in the file, from 0. A
 schema named twice grows; an item or an agent listed twice counts once.
 
@@ -66,7 +66,7 @@ class Configuration(Struct, frozen=True):
     """A whole file.
 
     Attributes:
-        notes: sentences about what is allowed and probably not meant.
+        notes: sentences about lines that are allowed and probably not meant.
         lines: where each item is declared, from 1.
     """
 

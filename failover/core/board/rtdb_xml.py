@@ -1,7 +1,7 @@
 """RTDB2's ``rtdb2_configuration.xml`` and its successors' as items: keys with shared, period and phase.
 
-The file has no sizes, because RTDB2 stores whatever MessagePack makes of an object: each key is a msgpack item of `SIZE` bytes
-until somebody declares more. Networks, compression and time limits of the file concern RTDB2's own processes and are left out.
+The file has no sizes, because RTDB2 stores each object as MessagePack encodes it: each key is a msgpack item of `SIZE` bytes
+until a person declares more. Networks, compression and time limits of the file concern RTDB2's own processes and are left out.
 Source: config/rtdb2_configuration.xml of CAMBADA/cambada-rtdb2 and of Falcons-Robocup/code.
 """
 

@@ -18,7 +18,7 @@ ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKIN
 """It runs here, or is about to: a restore may take longer than a lease, and so may the last snapshot of a handover."""
 
 RACE_SHARE = 16
-"""What the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
+"""The lease that the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
 
 
 def watch(component: Component, turn: Turn) -> None:
@@ -57,7 +57,7 @@ def entrust(component: Component, turn: Turn, robot: str) -> bool:
 
 
 def counted_ns(component: Component, turn: Turn) -> int:
-    """Until when this robot may act; 0 where nobody else may start the component. What was granted once stays granted."""
+    """Until when this robot may act; 0 where no other robot may start the component. A lease granted once stays granted."""
     if not on_lease(component, turn):
         return 0
     if turn.config.by_majority:
@@ -73,7 +73,7 @@ def first_ns(component: Component, turn: Turn) -> int:
 
 
 def on_lease(component: Component, turn: Turn) -> bool:
-    """Whether anybody else may start the component."""
+    """Whether another robot may start the component."""
     return turn.config.quorum > 1 if turn.config.by_majority else bool(component.entrusted)
 
 
@@ -98,7 +98,7 @@ def _has_given_way(component: Component) -> bool:
 
 
 def _may_thaw(component: Component, turn: Turn) -> bool:
-    """Under majority and ``freeze`` a lease; otherwise everybody entrusted agrees by its newest word, or is dead."""
+    """Under majority and ``freeze`` a lease; otherwise each robot entrusted agrees by its newest word, or is dead."""
     if component.freezes or turn.config.by_majority:
         return not on_lease(component, turn) or turn.now_ns < component.lease_ns - turn.config.lease_ns // TELL_SHARE
     heard = (turn.dead(robot) or _granted_ns(component, turn, robot) > turn.now_ns for robot in component.entrusted)

@@ -8,7 +8,7 @@
   valid leases.
 * *Pre-vote.* Members say in heartbeats whether they are free. No robot claims before a majority is free: a robot that is cut off
   raises no epoch.
-* *Nothing acknowledged is lost.* A primary acknowledges what a standby holds once a majority has noted that standby. Members vote
+* *Nothing acknowledged is lost.* A primary acknowledges a standby's position once a majority has noted that standby. Members vote
   for robots that hold as much; for others only when those were out of reach for ``patience_ms``, or by an operator's order.
 * *The robot with a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that. A robot
   without one gives its copy up to an elected one, and to a later epoch's that holds as much; otherwise it contends for votes.
@@ -30,7 +30,7 @@ _BOUND = HOLDING | {State.STOPPING}
 
 
 def look(component: Component, turn: Turn) -> None:
-    """What this member would vote for now; its next beat says so."""
+    """Note how this member would vote now; its next beat says so."""
     component.free = is_free(component, turn)
     component.open = component.free and _all_gone(component, turn)
 
@@ -125,13 +125,13 @@ def starters(component: Component, turn: Turn) -> Iterator[str]:
 
 
 def _sure(component: Component, turn: Turn) -> tuple[str, ...]:
-    """The robots that hold what was acknowledged: the primary and whom it has entrusted; this one not, if it has lost it."""
+    """The robots that hold all that was acknowledged: the primary and those it has entrusted; this one not, if it has lost it."""
     lost = turn.me if component.bare else ""
     return tuple(robot for robot in (component.primary, *component.entrusted) if robot not in ("", lost))
 
 
 def holds_all(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
-    """Whether a robot is one of those, or has at least what one of them has."""
+    """Whether a robot is one of those, or has at least as much as one of them."""
     return _covers(component, turn, _sure(component, turn), robot, position)
 
 
@@ -143,7 +143,7 @@ def _covers(component: Component, turn: Turn, sure: tuple[str, ...], robot: str,
 
 
 def _position_at(component: Component, turn: Turn, robot: str) -> Position | None:
-    """What a living robot says that it can restore from."""
+    """The position from which a living robot says that it can restore."""
     if robot == turn.me:
         return component.newest
     peer = turn.team.peers.get(robot)
@@ -152,7 +152,7 @@ def _position_at(component: Component, turn: Turn, robot: str) -> Position | Non
 
 
 def _all_gone(component: Component, turn: Turn) -> bool:
-    """Whether those who hold what was acknowledged were waited for long enough, or are back without it."""
+    """Whether the robots that hold all that was acknowledged were waited for long enough, or are back without it."""
     return all(_lost(component, turn, robot) for robot in _sure(component, turn))
 
 
@@ -171,7 +171,7 @@ def _lost(component: Component, turn: Turn, robot: str) -> bool:
 
 
 def _would(component: Component, turn: Turn, peer: Peer, position: Position | None) -> bool:
-    """Whether a peer would vote for us, by what it has noted itself; one that does not know the component is bound to nobody."""
+    """Whether a peer would vote for us, by its own notes; one that does not know the component is bound to no robot."""
     entry = peer.entry(component.name)
     if entry is None:
         return peer.complete

@@ -1,4 +1,4 @@
-"""Decides which robot runs a component: claims, consent, and what follows from hearing another robot's.
+"""Decides which robot runs a component: claims, consent, and the consequences of another robot's word.
 
 A primacy is an epoch and the robot that all robots which know of it name as its primary. The rules:
 
@@ -69,8 +69,8 @@ def unheard(component: Component, turn: Turn) -> tuple[str, ...]:
 
 
 def _begins_in_the_dark(component: Component, turn: Turn) -> bool:
-    """Whether it is claimed without a word, in this life of ours, of a robot that may run it; of one that nobody is known to have
-    run that is any, but where an operator starts it.
+    """Whether we claim it although a robot that may run it has said nothing in this life of ours. If no robot is known to have
+    run it, that is any robot, except where an operator starts it.
     """
     if turn.config.by_majority:
         return False
@@ -79,7 +79,7 @@ def _begins_in_the_dark(component: Component, turn: Turn) -> bool:
 
 
 def exhaustion(component: Component, me: str) -> str:
-    """Why nobody can claim it, for an operator; "" where there are epochs left."""
+    """Why no robot can claim it, for an operator; "" where there are epochs left."""
     if not component.is_exhausted:
         return ""
     epoch = max(component.epoch, component.seen)
@@ -101,12 +101,12 @@ def waits_after_boot_ns(component: Component, turn: Turn) -> int:
 
 
 def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> bool:
-    """Nobody who lives holds it or knows its end, and everybody is heard or dead.
+    """No living member holds it or knows its end, and each member is heard or dead.
 
-    A server or a witness repeats what it has heard of an end: its word, or its silence, counts until a majority knows of none.
+    A server or a witness repeats an end that it has heard of: its word, or its silence, counts until a majority knows of none.
 
     Args:
-        is_ordered: an operator says so of robots that send what cannot be authenticated.
+        is_ordered: an operator says so of robots whose packets cannot be authenticated.
     """
     is_doubtful = False
     for robot, peer in turn.team.peers.items():
@@ -134,7 +134,7 @@ def _is_not_ended(component: Component, turn: Turn) -> bool:
 
 
 def _takes(component: Component, robot: str, entry: Entry) -> bool:
-    """Whether this word says that the component is somebody's, or has ended."""
+    """Whether this word says that a robot holds the component, or that it has ended."""
     state = state_of(entry)
     if state is State.FROZEN and component.elects and component.primary != robot:
         return False  # it contends for the primacy with a copy that stands still: votes decide
@@ -178,7 +178,7 @@ def _resumption(component: Component, turn: Turn, *, is_planned: bool) -> Resump
 
 
 def advance(component: Component, turn: Turn) -> None:
-    """A claim: go on once it is granted, or once nobody is left whose consent is needed."""
+    """A claim: go on once it is granted, or once no robot is left whose consent is needed."""
     if _consented(component, turn):
         entrust_holder(component, turn)
         begin(component, turn)
@@ -265,8 +265,8 @@ def living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
 def may_start_afresh(component: Component, turn: Turn) -> bool:
     """Configured to run, and no checkpoint of it was ever given away or is here, perhaps one that cannot be used just now.
 
-    What was known before a claim of our own in vain, or while a disk was there that was lost since, still counts; but where
-    everybody is back and has none, all of them are lost.
+    Checkpoints known before a claim of our own in vain, or before the loss of a disk, still count; but where all robots are back
+    and have none, all checkpoints are lost.
     """
     is_new = not component.has_begun or _is_nowhere(component, turn)
     return component.autostart and component.spec is not None and is_new
@@ -300,7 +300,7 @@ def _right_to_act_alone(component: Component, turn: Turn) -> bool:
 
 
 def _may_go_on(component: Component, turn: Turn) -> bool:
-    """Under ``freeze``, with somebody out of reach, only the robot that has the right to act alone."""
+    """Under ``freeze``, with a robot out of reach, only the robot that has the right to act alone."""
     somebody_gone = any(turn.dead(robot) for robot in turn.team.peers)
     return not component.freezes or not somebody_gone or _right_to_act_alone(component, turn)
 
@@ -309,7 +309,7 @@ def _may_go_on(component: Component, turn: Turn) -> bool:
 
 
 def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
-    """What another robot's word about this component changes here."""
+    """Take in another robot's word about this component."""
     theirs = state_of(entry)
     if theirs in HOLDING:
         _heard_holder(component, turn, sender, entry, theirs)
@@ -342,7 +342,7 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry, t
 
 
 def clear_away(component: Component, turn: Turn, epoch: int) -> None:
-    """Have the agent end the copy that is here, or what is left of it, before this robot stands by."""
+    """Have the agent end the copy that is here, or its remains, before this robot stands by."""
     component.move(Cause.OUTBID)
     component.until_ns = turn.now_ns + turn.config.retry_ms * MS
     turn.order(acts.Stop(component.name, epoch))
@@ -448,7 +448,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
 
 
 def _forget_lines_since(component: Component, turn: Turn, entry: Entry) -> None:
-    """The winner's copy was there before ours: what our primacy captured is not in its past, and is never resumed from."""
+    """The winner's copy was there before ours: no robot resumes from our primacy's captures, which are not in its past."""
     if turn.config.by_majority or not 0 < entry.born < component.epoch < entry.epoch:
         return
     beaten = tuple(sorted({held.generation for held in component.held if held.generation // (PEERS_MAX + 1) > entry.born}))
@@ -459,7 +459,7 @@ def _forget_lines_since(component: Component, turn: Turn, entry: Entry) -> None:
 
 
 def refuse_request(component: Component, turn: Turn, sentence: str) -> None:
-    """Answer whoever waits for this component to start."""
+    """Answer the client that waits for this component to start."""
     if component.request:
         turn.order(acts.Answer(component.request, False, sentence))
         component.request = 0
@@ -494,7 +494,7 @@ def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, their
 
 
 def _acted_all_along(component: Component, turn: Turn) -> bool:
-    """Under pair: what ended elsewhere was then another copy, begun from a checkpoint of ours."""
+    """Under pair: the copy that ended elsewhere was then another one, begun from a checkpoint of ours."""
     return component.state is State.PRIMARY and not component.stood and not turn.config.by_majority
 
 
@@ -508,7 +508,7 @@ def _go_on_above_the_end(component: Component, turn: Turn, sender: str, entry: E
 
 
 def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
-    """Somebody who does not run it knows a later epoch than ours."""
+    """A member that does not run it knows a later epoch than ours."""
     elsewhere = entry.primary not in ("", turn.me, sender)
     if component.state is State.CLAIMING:
         component.epoch = entry.epoch + 1
@@ -531,7 +531,7 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
 
 
 def admit(component: Component, turn: Turn, sender: str, epoch: int | None = None) -> None:
-    """Take snapshots from this robot, of the present epoch (or of that one), and from nobody else; "": from nobody at all."""
+    """Take snapshots from this robot, of the present epoch (or of that one), and from no other; "": from no robot at all."""
     wanted = (sender, component.epoch if epoch is None else epoch)
     if component.admitted != wanted and turn.config.keeps(turn.me):
         component.admitted = wanted

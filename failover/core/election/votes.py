@@ -64,7 +64,7 @@ def _newest_of(entries: list[tuple[str, Entry]]) -> Position | None:
 
 
 def _is_untold(component: Component, turn: Turn) -> bool:
-    """Whether a server that lives has not said yet what it keeps of the component."""
+    """Whether a server that lives has not told its checkpoint of the component yet."""
     return any(
         peer.entry(component.name) is None and not peer.complete
         for peer in turn.team.living(turn.now_ns)
@@ -73,7 +73,7 @@ def _is_untold(component: Component, turn: Turn) -> bool:
 
 
 def _waits_for_a_server(component: Component, turn: Turn, mine: Position, best: Position | None) -> bool:
-    """Whether a server may give us something newer: a standby has all that it can have, and nobody waits for it for ever."""
+    """Whether to wait for a server's newer checkpoint: a standby has all that it can have, and no robot waits for ever."""
     is_behind = (best is not None and mine < best) or _is_untold(component, turn)
     if not is_behind or turn.me in component.entrusted:
         component.behind_ns = 0
@@ -106,7 +106,7 @@ def _entrust_equal(component: Component, turn: Turn) -> None:
 
 
 def withdraw(component: Component, turn: Turn, why: str) -> None:
-    """Give a claim up; the vote for oneself in its epoch stands, and is of no use to anybody."""
+    """Give a claim up; our vote for ourselves in its epoch stands, and helps no robot."""
     component.move(Cause.YIELD_CLAIM)
     component.ordered = False
     place = sorted((turn.me, *turn.config.peers), key=weight).index(turn.me) + 1
@@ -126,7 +126,7 @@ def step_down(component: Component, turn: Turn) -> None:
 
 
 def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
-    """What another member's word about this component changes here."""
+    """Take in another member's word about this component."""
     theirs = state_of(entry)
     component.seen = max(component.seen, entry.epoch)
     if theirs in HOLDING and component.holding:
@@ -169,7 +169,7 @@ def _heard_rival(component: Component, turn: Turn, sender: str, entry: Entry, th
 
 
 def _prevails(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
-    """Whether a rival of ours, who have no lease, was elected, or loses nothing that was acknowledged if we follow it.
+    """Whether a rival was elected while we have no lease, or loses nothing that was acknowledged if we follow it.
 
     A later epoch alone says little: a robot that comes back with an old copy raises its epoch above all that it hears of.
     """
@@ -208,7 +208,7 @@ def _is_decided(component: Component, turn: Turn, entry: Entry) -> bool:
 
 
 def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
-    """Somebody who does not hold it knows a later epoch than ours."""
+    """A member that does not hold it knows a later epoch than ours."""
     decided = _is_decided(component, turn, entry)
     if component.state is State.CLAIMING:
         if turn.config.runs(sender):

@@ -1,4 +1,4 @@
-"""Record of a decision for ``failover why``: the sentence, and what this robot knew at that instant.
+"""Record of a decision for ``failover why``: the sentence, and the facts that this robot knew at that instant.
 
 The newest heartbeats that a robot had heard order the event logs of several robots without a comparison of their clocks: a robot
 that had heard a heartbeat sent after this robot's decision decided later (`failover.core.event_log.merge`).
@@ -19,7 +19,7 @@ class Sighting(Struct, frozen=True):
         limit_ns: silence from which on it counts as dead.
         links: (link, silence in ns) for each link it was ever heard on; nothing is taken off.
         hears_us: it has echoed a beat of ours within a lease.
-        says: what it says of the component: state there, epoch, primary; "" where it has said nothing, or too long ago.
+        says: its words on the component: state there, epoch, primary; "" where it has said nothing, or too long ago.
     """
 
     robot: str
@@ -34,7 +34,7 @@ class Sighting(Struct, frozen=True):
 
 
 class Facts(Struct, frozen=True):
-    """What this robot knew when it decided.
+    """The facts that this robot knew when it decided.
 
     Attributes:
         counter: the first beat of ours that left after it.
@@ -42,7 +42,7 @@ class Facts(Struct, frozen=True):
         state: of the component here, now; "" for a decision about the robot itself.
         late_ns: the most that our own loop was late within the last loyalty, this step included.
         lease_left_ns: until this robot may no longer act; None without a lease, never below 0.
-        checkpoint: number of the newest checkpoint that somebody could go on from, 0 for none.
+        checkpoint: number of the newest checkpoint that a robot could go on from, 0 for none.
         checkpoint_age_ns: since it was captured (at the primary), or since it came (at a standby); -1: not known.
         output_pending: bytes that the program has written here and that are in no acknowledged checkpoint; -1: not counted.
         seen: every peer.
@@ -61,7 +61,7 @@ class Facts(Struct, frozen=True):
 
 
 class Decision(Struct, frozen=True):
-    """What was decided about which component ("" for the robot), when by this robot's clock, and what it knew."""
+    """One decision: its sentence, its component ("" for the robot), its instant by this robot's clock, and the facts known."""
 
     at_ns: int
     component: str

@@ -1,1 +1,1 @@
-"""Replication of checkpoints to the standby and to the servers, and what waits there."""
+"""Replication of checkpoints to the standby and to the servers, and the programs that wait there."""

@@ -21,7 +21,7 @@ _IDLE = (State.ABSENT, State.STANDBY)
 
 
 def advance(component: Component, turn: Turn) -> None:
-    """What is due for each server of a running primary."""
+    """Do what is due for each server of a running primary."""
     for server in turn.config.servers:
         peer = turn.team.peers.get(server)
         if peer is not None and server != component.standby:
@@ -29,7 +29,7 @@ def advance(component: Component, turn: Turn) -> None:
 
 
 def ship_ended(component: Component, turn: Turn, event: ShipEnded) -> None:
-    """The bytes are over, or did not arrive; what the server says in its beats decides."""
+    """The bytes are over, or did not arrive; the server's beats decide."""
     flight = component.archives.get(event.to)
     if flight is None or flight.position != event.position or event.epoch != component.epoch:
         return
@@ -72,12 +72,12 @@ def _send(component: Component, turn: Turn, server: str, has: Position | None) -
 
 
 def give_back(component: Component, turn: Turn) -> None:
-    """Send what this server, or (``on_loss = hold``) this standby, keeps to the robot that is to run it."""
+    """Send the checkpoint of this server, or (``on_loss = hold``) this standby, to the robot that is to run it."""
     flight, mine = component.flight, component.newest
     if flight is not None and (turn.now_ns >= flight.until_ns or not turn.alive(flight.to)):
         component.flight = flight = None
     if flight is not None or mine is None or component.spec is None or turn.now_ns < component.due_ns:
-        return  # also after a refusal: what the other side says and what it takes may differ for a moment
+        return  # also after a refusal: the other side's words and its acts may differ for a moment
     heir = _heir(component, turn)
     if heir and turn.alive(heir) and _lacks(component, turn.team.peers[heir], mine):
         component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, heir, mine)
@@ -88,7 +88,7 @@ def give_back(component: Component, turn: Turn) -> None:
 
 
 def _heir(component: Component, turn: Turn) -> str:
-    """Who is to run it: whom an operator chose, else its primary.
+    """The robot that is to run it: the one that an operator chose, else its primary.
 
     A server also turns to others, and waits for robots that may hold something newer.
     """
@@ -115,7 +115,7 @@ def _lacks(component: Component, peer: Peer, mine: Position) -> bool:
 
 
 def admit_a_return(component: Component, turn: Turn) -> None:
-    """The checkpoint that a server, or (``on_loss = hold``) the standby, kept for us may come back; or what an operator wants."""
+    """The checkpoint that a server, or (``on_loss = hold``) the standby, kept for us may come back; or one an operator wants."""
     if not turn.config.runs(turn.me) or not vacant(component, turn):
         return
     best = offer(component, turn, is_ordered=component.wanted is not None)
@@ -124,7 +124,7 @@ def admit_a_return(component: Component, turn: Turn) -> None:
 
 
 def offer(component: Component, turn: Turn, *, is_ordered: bool) -> tuple[str, Position] | None:
-    """The newest checkpoint that somebody who lives would send this robot: who, and what. ``is_ordered``: by an operator."""
+    """The newest checkpoint that a living member would send us: the member, and the position. ``is_ordered``: by an operator."""
     offers = [
         (entry.position, turn.config.runs(robot), robot)
         for robot, entry in living_entries(component, turn)

@@ -1,7 +1,7 @@
 """Replication of a component's state to its standby, and its acknowledgement there.
 
 Invariants: one snapshot in flight per component (a slower link means fewer snapshots, not longer queues); a position is
-acknowledged to the keeper only when it is safe elsewhere, or no other robot is there; a delta counts from what the standby has.
+acknowledged to the keeper only when it is safe elsewhere, or no other robot is there; a delta counts from the standby's position.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SHOWS = frozenset({State.ABSENT, State.STANDBY, *ENDED})
 """States in which no guard of this robot writes the component's output."""
 
 STILL_SHARE = 10
-"""One part in so many of its time is what a program stands still at most for its snapshots: where nobody tells which pages were
+"""A program stands still for at most one part in so many of its time for its snapshots: where no kernel tells which pages were
 written, all of its memory is read meanwhile."""
 
 
@@ -127,7 +127,7 @@ def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
 
 
 def under_way(component: Component, turn: Turn, event: UnderWay) -> None:
-    """What is taken, or sent, still may take its time: a base of a large program, on a busy machine, takes minutes."""
+    """A capture or a transfer still may take its time: a base of a large program, on a busy machine, takes minutes."""
     if event.epoch != component.epoch:
         return
     for flight in (component.flight, component.archives.get(event.to)):
@@ -184,7 +184,7 @@ def ship_ended(component: Component, turn: Turn, event: ShipEnded) -> None:
 
 
 def acknowledged(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
-    """The standby's word on what it holds."""
+    """The standby's word on its newest snapshot."""
     flight = component.flight
     if flight is None or flight.position is None or flight.to != sender or not _follows_us(component, turn, entry):
         return
@@ -198,9 +198,9 @@ def acknowledged(component: Component, turn: Turn, sender: str, entry: Entry) ->
 
 
 def confirm(component: Component, turn: Turn) -> None:
-    """Under majority: what the standby holds is a checkpoint once a majority has noted whose word that is.
+    """Under majority: the standby's position is a checkpoint once a majority has noted that standby.
 
-    Whoever is named holds all that was acknowledged before: it is named when it has taken the newest snapshot.
+    The named standby holds all that was acknowledged before: it is named when it has taken the newest snapshot.
     """
     flight = component.flight
     if not turn.config.by_majority or flight is None or flight.position is None or flight.to != component.standby:
@@ -246,7 +246,7 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
 
 
 def _period_ns(component: Component, turn: Turn, flight: Flight) -> int:
-    """Between two captures: what the operator wants, or seldom: while no standby takes them, or its program bears no more."""
+    """Between two captures: the operator's period, or seldom: while no standby takes them, or its program bears no more."""
     is_alone = not flight.to or not turn.alive(component.standby)
     wanted_ns = (turn.config.alone_period_ms if is_alone else component.rules.period_ms) * MS
     return max(wanted_ns, least_period_ns(component))
@@ -308,7 +308,7 @@ def stored(component: Component, turn: Turn, event: Stored) -> None:
 
 
 def store_failed(component: Component, turn: Turn, event: StoreFailed) -> None:
-    """A snapshot did not fit or could not be written; what we hold stays."""
+    """A snapshot did not fit or could not be written; those that we hold stay."""
     if (event.sender, event.epoch) != component.admitted or component.holding:
         return
     component.needs_base = component.needs_base or event.needs_base
@@ -317,7 +317,7 @@ def store_failed(component: Component, turn: Turn, event: StoreFailed) -> None:
 
 
 def remember(component: Component, config: Config) -> None:
-    """After a restart: two alone, what a standby holds of the present primacy it had accepted, or accepts now."""
+    """After a restart, two alone: a standby had accepted, or accepts now, the snapshots of the present primacy that it holds."""
     newest = component.held[-1] if component.held else None
     follows = not config.by_majority and component.primary not in ("", config.robot)
     if newest is not None and follows and newest.generation // (PEERS_MAX + 1) == component.epoch:
@@ -327,8 +327,8 @@ def remember(component: Component, config: Config) -> None:
 def show(component: Component, turn: Turn) -> None:
     """Let readers here see the output up to the newest position that is held here and counts as acknowledged.
 
-    Two alone: what a standby has accepted. Under majority the primary says it: members may be about to elect a robot that
-    holds less than this one does, and it is the primary that knows when they are not.
+    Two alone: the snapshots that a standby has accepted. Under majority the primary says it: members may be about to elect a
+    robot that holds less than this one does, and it is the primary that knows when they are not.
     """
     told = component.vouched
     if told is None or told == component.shown or component.state not in _SHOWS:

@@ -18,10 +18,10 @@ from failover.core.wire.messages import WARM
 
 
 def review(component: Component, turn: Turn) -> None:
-    """Order what should wait here, and the end of what should wait no longer."""
-    if component.state is State.CLAIMING:  # what waits is about to be used
+    """Order the program that should wait here, and the end of one that should wait no longer."""
+    if component.state is State.CLAIMING:  # the waiting program is about to be used
         return
-    if component.holding:  # the order to run it has used what waited, or ended it
+    if component.holding:  # the order to run it has used the waiting program, or ended it
         _forget(component)
         component.stored_ns = -1
         return
@@ -36,7 +36,7 @@ def review(component: Component, turn: Turn) -> None:
 
 
 def warmed(component: Component, turn: Turn, event: Warmed) -> None:
-    """What waits here, or would, is ready now, or is not (any more)."""
+    """The program that waits here, or would, is ready now, or is not (any more)."""
     if component.waiting is None or event.epoch != component.waiting_epoch:
         return
     if event.ready and not component.warm:
@@ -56,9 +56,9 @@ def is_warm(component: Component, turn: Turn) -> bool:
 
 
 def _wanted(component: Component) -> ComponentSpec | None:
-    """What should wait here: None where nothing would be started here, or by nobody's leave."""
+    """The program that should wait here: None where this robot would start none, or may not."""
     stands_by = component.state is State.STANDBY and component.trusted and not component.waits
-    is_known = component.keeps_state or component.stored_ns >= 0  # of what ran here itself nobody has said whether it does
+    is_known = component.keeps_state or component.stored_ns >= 0  # no primary has said whether a program that ran here does
     return component.spec if stands_by and component.newest is not None and is_known else None
 
 

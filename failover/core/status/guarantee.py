@@ -11,13 +11,13 @@ from failover.core.types import ENDED, MS, Protection
 
 
 def grounds(turn: Turn) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What `team` depends on as time goes by: the peers that have another rule, and all that are heard."""
+    """The grounds of `team` that time changes: the peers that have another rule, and all that are heard."""
     living = turn.team.living(turn.now_ns)
     return tuple(peer.robot for peer in living if peer.at_odds), tuple(peer.robot for peer in living)
 
 
 def team(turn: Turn) -> str:
-    """What the rule in force promises, given who is heard."""
+    """The promise of the rule in force, given the robots that are heard."""
     at_odds, living = grounds(turn)
     if at_odds:
         return (
@@ -51,7 +51,7 @@ def _elected(turn: Turn, heard: int) -> str:
 
 
 def one(component: Component, turn: Turn, protection: Protection) -> str:
-    """What becomes of a component if its robot is lost now."""
+    """The promise for a component if its robot is lost now."""
     if component.state in ENDED:
         return f"It is {component.state}; no robot runs it."
     if not component.holding:
@@ -75,7 +75,7 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
 
 
 def differs(component: Component, turn: Turn) -> bool:
-    """Whether what was chosen for a component, or who stands by, promises something else than the team's sentence says."""
+    """Whether a component's own settings, or its standby, promise something else than the team's sentence says."""
     if not component.holding:
         return False
     if component.unprotected or component.waits or (component.freezes and not component.elects):
@@ -84,7 +84,7 @@ def differs(component: Component, turn: Turn) -> bool:
 
 
 def exception(component: Component, turn: Turn) -> str:
-    """For the journal: the component's promise where it differs and somebody stands by already; "" otherwise."""
+    """For the journal: the component's promise where it differs and a robot stands by already; "" otherwise."""
     if not differs(component, turn) or not (component.named or component.unprotected):
         return ""
     return one(component, turn, Protection.PROTECTED)

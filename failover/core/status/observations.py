@@ -16,7 +16,7 @@ TOLD_SHARE = 2
 
 
 class Watch(Struct):
-    """What was noticed so far.
+    """The facts noticed so far.
 
     Attributes:
         late_ns: the most that our loop was late within the last loyalty.
@@ -34,7 +34,7 @@ class Watch(Struct):
         self._stalled_ns = late_ns if late_ns * TOLD_SHARE >= loyalty_ns else 0
 
     def look(self, turn: Turn, event: Event) -> None:
-        """Tell of what is new. Called in each step after lateness was forgiven, and before the event is taken in."""
+        """Tell the news. Called in each step after lateness was forgiven, and before the event is taken in."""
         if self._stalled_ns:
             late_ms = self._stalled_ns // MS
             turn.say_of_robot(f"{turn.me} itself stood still for {late_ms} ms; that is not counted as its peers' silence")

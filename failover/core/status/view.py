@@ -21,7 +21,7 @@ SLOW_FACTOR = 2
 """Deltas that take so many periods to become checkpoints are told of: fewer are taken, and each carries more."""
 
 STALE_NS = 2 * NS_PER_S
-"""A checkpoint that is older is not what was promised: the protection is degraded while the next one does not arrive."""
+"""An older checkpoint breaks the promise: the protection is degraded while the next one does not arrive."""
 
 
 def status(components: dict[str, Component], turn: Turn, boot: int, testimony: Testimony) -> StatusView:

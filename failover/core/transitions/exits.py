@@ -1,4 +1,4 @@
-"""Decides what follows when a component's program ended, crashed, or could not be brought to run.
+"""Decides the next step when a component's program ended, crashed, or could not be brought to run.
 
 Invariants: an end is a record before any robot or client is told of it; crashes make no endless loop and throw no checkpoint
 away.
@@ -22,7 +22,7 @@ TRIES_MAX = 3
 """Takeovers that fail here, one after the other without a checkpoint in between, before this robot leaves it alone."""
 
 PAUSES = (1, 10, 10)
-"""Of ``retry_ms``, before a takeover that failed is tried again: what was in the way once may be gone at once."""
+"""Of ``retry_ms``, before a takeover that failed is tried again: an obstacle met once may be gone at once."""
 
 _WITH_PROCESS = frozenset({State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING})
 
@@ -107,7 +107,7 @@ def retry(component: Component, turn: Turn) -> None:
 
 
 def report(component: Component, turn: Turn) -> None:
-    """Tell whoever waits for the end, once every living robot has it on record too (and a majority), or this robot is alone."""
+    """Tell waiting clients of the end, once each living robot has it on record too (and a majority), or this robot is alone."""
     if component.state not in ENDED or component.reported or component.primary != turn.me:
         return
     living = turn.team.living(turn.now_ns)

@@ -16,7 +16,7 @@ from failover.core.types import MS, State
 
 
 def begin(component: Component, turn: Turn, to: str, request: int) -> None:
-    """Start a handover, or say why not. ``request`` 0: nobody waits for an answer."""
+    """Start a handover, or say why not. ``request`` 0: no client waits for an answer."""
     target = to or component.standby
     refusal = _refusal(component, turn, target)
     if refusal:
@@ -28,7 +28,7 @@ def begin(component: Component, turn: Turn, to: str, request: int) -> None:
 
 
 def resume_here(component: Component, turn: Turn, request: int) -> None:
-    """By order: run what nobody runs, from the checkpoint held here, unless another robot may have a newer one."""
+    """By order: run a component that no robot runs, from the checkpoint held here, unless another may have a newer one."""
     if component.newest is None:
         _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
     elif not turn.config.runs(turn.me):

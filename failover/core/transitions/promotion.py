@@ -1,4 +1,4 @@
-"""An operator's order that this robot runs a component now, although the rules still wait; and what that risks.
+"""An operator's order that this robot runs a component now, although the rules still wait; and its risks.
 
 Under ``pair`` the order stands for the consent of robots that are not heard: it brings a component back to life that
 ``on_loss = hold`` or ``when_alone = freeze`` holds still. Its epoch is above any that they could have opened meanwhile. Under
@@ -55,7 +55,7 @@ def advance(component: Component, turn: Turn) -> None:
 
 
 def risks(component: Component, turn: Turn) -> tuple[str, ...]:
-    """Why somebody should think before giving the order: copies that may act elsewhere, newer checkpoints that would be lost."""
+    """Why an operator should think before the order: copies that may act elsewhere, newer checkpoints that would be lost."""
     doubts = [] if turn.config.by_majority else [_double(turn, robot) for robot in _may_act(component, turn)]
     newer = _newer(component, turn)
     if newer:
@@ -100,7 +100,7 @@ def _no_majority(component: Component, turn: Turn) -> str:
 
 
 def _best(component: Component, turn: Turn) -> tuple[str, Position] | None:
-    """What this robot would go on from, and where that is: its own checkpoint, else the newest that another one would send."""
+    """The checkpoint that this robot would go on from, and its place: its own, else the newest that another one would send."""
     if component.newest is not None:
         return turn.me, component.newest
     return offer(component, turn, is_ordered=True) if component.state in _IDLE else None
@@ -150,7 +150,7 @@ def _go_on_with_the_claim(component: Component, turn: Turn, request: int) -> Non
 
 
 def _let_it_go_on(component: Component, turn: Turn, request: int) -> None:
-    """The copy that stands still here goes on, under an epoch in which nobody else may take it over."""
+    """The copy that stands still here goes on, under an epoch in which no other robot may take it over."""
     component.entrusted, component.standby, component.ordered = (), "", True
     renew(component, turn, max(component.epoch, component.seen) + SKIPPED_EPOCHS)
     turn.say(component, f"{turn.me} does not wait for the others: an operator promoted it")

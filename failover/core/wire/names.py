@@ -15,7 +15,7 @@ COMPONENT_SIZE_MAX = 200
 _RUNS = re.compile(r"(\d+)")
 
 Weight = tuple[tuple[tuple[int, int, str], ...], str, str]
-"""What ``weight`` compares by: the natural parts, then the normalised text, then the text as it was written."""
+"""The parts by which ``weight`` compares: the natural parts, then the normalised text, then the text as it was written."""
 
 
 def weight(name: str) -> Weight:
