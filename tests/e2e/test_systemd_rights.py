@@ -131,5 +131,3 @@ def test_without_the_server_copies_serve_also_after_a_restart_and_never_for_prog
     code, said = as_user(machine, "root", "failover", "rights", "why", "driver", "program", PWM)
     assert code == 1 and "program needs a live answer of the directory" in said, said
     assert "which has not answered" in status(machine)["rights"]
-    server.start()
-    assert as_user(machine, "root", "failover", "rights", "why", "driver", "program", PWM)[0] == 0
