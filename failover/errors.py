@@ -97,6 +97,22 @@ class NameFormatError(FailoverError):
     """A name of a robot, a team or a component is not of the documented form."""
 
 
+class NameUnknownError(FailoverError):
+    """Nothing that this process has heard of answers to a name."""
+
+
+class NameAmbiguousError(FailoverError):
+    """Several things answer to a name; the message lists their paths.
+
+    Attributes:
+        paths: of all of them.
+    """
+
+    def __init__(self, message: str, paths: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.paths = paths
+
+
 class StateError(FailoverError):
     """Something about the state that a program keeps (``failover.state``) does not work.
 
