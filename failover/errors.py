@@ -113,6 +113,14 @@ class NameAmbiguousError(FailoverError):
         self.paths = paths
 
 
+class EnvelopeError(FailoverError):
+    """Bytes that came as a message are none that can be carried out; nothing was done."""
+
+
+class MailboxFullError(FailoverError):
+    """As many messages as may wait are waiting; this one was not taken. Send it again later."""
+
+
 class StateError(FailoverError):
     """Something about the state that a program keeps (``failover.state``) does not work.
 

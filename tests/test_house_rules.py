@@ -41,7 +41,7 @@ PURE_FILES = (
 PURE_IMPORTS = frozenset(
     """
     __future__ abc bisect binascii blake3 collections contextlib dataclasses difflib enum fractions functools hashlib heapq hmac
-    ipaddress itertools math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
+    ipaddress itertools json math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
     """.split()  # noqa: SIM905
 )
 
