@@ -55,12 +55,11 @@ RESEND_MOST_NS: Final = 8_000 * MS
 # --- Sending ----------------------------------------------------------------------------------------------------------
 
 
-class Waiting(Struct):
-    """A posted message. ``until_ns``: its deadline, None: it has none; ``sent``: it may have arrived."""
+class Waiting(Struct, frozen=True):
+    """A posted message. ``until_ns``: its deadline; None: it has none."""
 
     envelope: Envelope
     until_ns: int | None = None
-    sent: bool = False
 
 
 class Outgoing(Struct):
@@ -82,20 +81,20 @@ class Outbox:
         self._sender = sender
         self._boot = kept.boot if kept is not None else boot
         self._seq = kept.seq if kept is not None else 0
-        self._waiting = deque(kept.waiting if kept is not None else ())
+        self._sent = deque(kept.waiting if kept is not None else ())
+        """May have arrived: all that was kept, too, as it may have left after the commit."""
+        self._unsent: deque[Waiting] = deque()
         self._free = self._seq
         self._is_connected = True
-        self._again_ns: int | None = 0 if self._waiting else None
+        self._again_ns: int | None = 0 if self._sent else None
         self._pause_ns = RESEND_FIRST_NS
-        for one in self._waiting:
-            one.sent = True  # it may have left after the commit
 
     def __len__(self) -> int:
-        return len(self._waiting)
+        return len(self._sent) + len(self._unsent)
 
     def kept(self) -> Outgoing:
         """What must be kept with the state of the program that posts."""
-        return Outgoing(self._boot, self._seq, [Waiting(one.envelope, one.until_ns, one.sent) for one in self._waiting])
+        return Outgoing(self._boot, self._seq, [*self._sent, *self._unsent])
 
     def post(self, envelope: Envelope, now_ns: int) -> Envelope:
         """Take a message; it leaves after the next `committed`.
@@ -106,13 +105,13 @@ class Outbox:
         Raises:
             MailboxFullError: `WINDOW` wait already.
         """
-        if len(self._waiting) >= WINDOW:
-            raise MailboxFullError(f"{len(self._waiting)} messages to {envelope.to} wait, and that is the limit; try again later")
+        if len(self) >= WINDOW:
+            raise MailboxFullError(f"{len(self)} messages to {envelope.to} wait, and that is the limit; try again later")
         self._seq += 1
         name = envelope.id or f"{self._sender}-{self._boot:x}-{self._seq}"
         envelope = msgspec.structs.replace(envelope, sender=self._sender, boot=self._boot, seq=self._seq, id=name)
         until_ns = None if envelope.deadline_ms is None else now_ns + int(envelope.deadline_ms * MS)
-        self._waiting.append(Waiting(envelope, until_ns))
+        self._unsent.append(Waiting(envelope, until_ns))
         return envelope
 
     def committed(self) -> None:
@@ -128,62 +127,61 @@ class Outbox:
         self._is_connected = False
 
     def next_ns(self) -> int | None:
-        """When `due` has something without anything else happening; None: never."""
-        unanswered = any(one.sent for one in self._waiting)
-        deadlines = [one.until_ns for one in self._waiting if one.until_ns is not None and not one.sent]
-        again = [self._again_ns] if self._is_connected and unanswered and self._again_ns is not None else []
-        return min([*deadlines, *again], default=None)
+        """When `due` or `expired` has something without anything else happening; None: never."""
+        times = [one.until_ns for one in self._unsent if one.until_ns is not None]
+        if self._is_connected and self._sent and self._again_ns is not None:
+            times.append(self._again_ns)
+        return min(times, default=None)
 
     def due(self, now_ns: int) -> list[Envelope]:
         """What is to be sent now, in order."""
         if not self._is_connected:
             return []
-        again = self._again_ns is not None and now_ns >= self._again_ns
-        if again:
+        found: list[Envelope] = []
+        if self._again_ns is not None and now_ns >= self._again_ns:
+            after = 0
+            for one in self._sent:
+                found.append(_as_sent(one, after, now_ns))
+                after = one.envelope.seq if one.envelope.reliable else after
+            self._sent = deque(one for one in self._sent if one.envelope.reliable)
             self._again_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, RESEND_MOST_NS)
-        found: list[Envelope] = []
-        after = 0
-        for one in self._waiting:
-            if one.envelope.seq > self._free:
-                break
-            if again or not one.sent:
-                found.append(self._as_sent(one, after, now_ns))
-                one.sent = True
+        while self._unsent and self._unsent[0].envelope.seq <= self._free:
+            one = self._unsent.popleft()
+            found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, now_ns))
             if one.envelope.reliable:
-                after = one.envelope.seq
-        if found:
-            self._waiting = deque(one for one in self._waiting if one.envelope.reliable or not one.sent)
-            if self._again_ns is None:
-                self._again_ns = now_ns + self._pause_ns
+                self._sent.append(one)
+        if self._again_ns is None and self._sent:
+            self._again_ns = now_ns + self._pause_ns
         return found
-
-    def _as_sent(self, one: Waiting, after: int, now_ns: int) -> Envelope:
-        """With what is left of its time: the receiver counts it by its own clock."""
-        left_ms = None if one.until_ns is None else max(one.until_ns - now_ns, 0) / MS
-        return msgspec.structs.replace(one.envelope, after=after, deadline_ms=left_ms)
 
     def answered(self, answer: Envelope) -> bool:
         """Whether this is the first final answer to one of our reliable messages; ``busy`` is none: it is sent again."""
         if answer.boot != self._boot or (answer.error is not msgspec.UNSET and answer.error.kind == "busy"):
             return False
-        for place, one in enumerate(self._waiting):
-            if one.envelope.seq == answer.seq and one.sent:
-                del self._waiting[place]
+        for place, one in enumerate(self._sent):
+            if one.envelope.seq == answer.seq:
+                del self._sent[place]
                 self._pause_ns = RESEND_FIRST_NS
-                if not any(rest.sent for rest in self._waiting):
+                if not self._sent:
                     self._again_ns = None
                 return True
         return False
 
     def expired(self, now_ns: int) -> list[Envelope]:
         """Answers to messages whose deadline passed before they left. One that left is answered by its receiver, who knows."""
-        late = [one for one in self._waiting if not one.sent and one.until_ns is not None and one.until_ns <= now_ns]
+        late = [one for one in self._unsent if one.until_ns is not None and one.until_ns <= now_ns]
         if late:
-            self._waiting = deque(one for one in self._waiting if one not in late)
+            self._unsent = deque(one for one in self._unsent if one not in late)
         return [
             refusal(one.envelope, "expired", "its deadline passed while it waited to be sent; it was not handled") for one in late
         ]
+
+
+def _as_sent(one: Waiting, after: int, now_ns: int) -> Envelope:
+    """With what is left of its time: the receiver counts it by its own clock."""
+    left_ms = None if one.until_ns is None else max(one.until_ns - now_ns, 0) / MS
+    return msgspec.structs.replace(one.envelope, after=after, deadline_ms=left_ms)
 
 
 # --- Receiving --------------------------------------------------------------------------------------------------------

@@ -124,7 +124,7 @@ class Tree:
         places = self.claimants(text)
         able = [place for place in places if not place.refused]
         if not able:
-            because = places[0].refused if places else "no driver registered it; failover names lists those that did"
+            because = places[0].refused if places else "no process that was heard lately has registered it"
             raise NameUnknownError(f"{text!r} names nothing: {because}")
         paths = sorted({place.record.path for place in able})
         if len(paths) > 1:

@@ -197,7 +197,7 @@ class World:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_hundred_thousand_messages_of_ten_senders_over_cuts_kills_of_both_ends_and_takeovers() -> None:
-    world = World(1, 10, 10_000)
+    world = World(1, 10, 10_000, loss=0.0002, double=0.01)
     world.run(1_000_000)
     world.check()
     assert world.deaths["sender"] > 5 and world.deaths["actor"] > 5

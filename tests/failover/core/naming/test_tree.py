@@ -121,7 +121,7 @@ def test_names_are_listed_below_a_prefix_in_natural_order() -> None:
     found = tree_of(*(("r1", Record(f"L/r1/{number}")) for number in (10, 2, 1)), ("r1", Record("L/r10/1")))
     assert [place.record.path for place in found.under("/L/r1")] == ["L/r1/1", "L/r1/2", "L/r1/10"]
     assert len(found.under()) == len(found) == 4
-    with pytest.raises(NameUnknownError, match="failover names lists"):
+    with pytest.raises(NameUnknownError, match="no process that was heard"):
         found.resolve("nothing")
 
 
