@@ -37,9 +37,10 @@ class Way:
     """One way to hand a value from a writer to a reader."""
 
     who: str
-    put: Callable[[], object]
+    put: Callable[[Any], object]
     get: Callable[[], object]
     read: Callable[[], bytes]
+    value: Any = VALUE
 
 
 def board(quick: bool, directory: Path) -> Findings:
@@ -53,7 +54,7 @@ def board(quick: bool, directory: Path) -> Findings:
             else:
                 ways.append(stack.enter_context(way(directory)))
         for one in ways:
-            one.put()
+            one.put(one.value)
             if one.read() != VALUE:
                 raise BenchmarkError(f"{one.who} gives back another value than was put")
         figures = _measured(ways, QUICK_BATCHES if quick else BATCHES)
@@ -71,11 +72,16 @@ def _measured(ways: list[Way], batches: int) -> list[Figure]:
     values: dict[tuple[str, str], list[float]] = {}
     for _ in range(batches):
         for way in ways:
-            for name, call in (("put", way.put), ("get", way.get)):
-                begun = time.perf_counter_ns()
-                for _ in range(BATCH):
-                    call()
-                values.setdefault((name, way.who), []).append((time.perf_counter_ns() - begun) / BATCH / 1000)
+            put, get, value = way.put, way.get, way.value
+            begun = time.perf_counter_ns()
+            for _ in range(BATCH):
+                put(value)
+            between = time.perf_counter_ns()
+            for _ in range(BATCH):
+                get()
+            ended = time.perf_counter_ns()
+            values.setdefault(("put", way.who), []).append((between - begun) / BATCH / 1000)
+            values.setdefault(("get", way.who), []).append((ended - between) / BATCH / 1000)
     return [Figure(name, f"{SIZE} bytes", "µs", tuple(found), who) for (name, who), found in sorted(values.items())]
 
 
@@ -89,7 +95,7 @@ def _ours(directory: Path) -> Iterator[Way]:
         writer, get = writing.item("value", bytes), item.get
         writer.put(VALUE)
         fast = writer.put
-        yield Way(OURS, lambda: fast(VALUE), get, lambda: bytes(get().value))
+        yield Way(OURS, fast, get, lambda: bytes(get().value))
 
 
 @contextmanager
@@ -98,8 +104,8 @@ def _bare(directory: Path) -> Iterator[Way]:
     path.write_bytes(bytes(4096))
     with path.open("r+b") as file, mmap.mmap(file.fileno(), 4096) as writing, mmap.mmap(file.fileno(), 4096) as reading:
 
-        def put() -> None:
-            writing[0:SIZE] = VALUE
+        def put(value: bytes) -> None:
+            writing[0:SIZE] = value
 
         def get() -> bytes:
             return reading[0:SIZE]
@@ -118,13 +124,12 @@ def _redis(directory: Path) -> Iterator[Way]:
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=directory) as server:
         try:
             link = _connected(place, server)
-            order = b"*3\r\n$3\r\nSET\r\n$4\r\nball\r\n$%d\r\n%s\r\n" % (SIZE, VALUE)
             question = b"*2\r\n$3\r\nGET\r\n$4\r\nball\r\n"
             head = len(b"$%d\r\n" % SIZE)
             answer_size = head + SIZE + 2
 
-            def put() -> None:
-                link.sendall(order)
+            def put(value: bytes) -> None:
+                link.sendall(b"*3\r\n$3\r\nSET\r\n$4\r\nball\r\n$%d\r\n%s\r\n" % (len(value), value))
                 if link.recv(16) != b"+OK\r\n":
                     raise BenchmarkError("redis-server refuses SET")
 
@@ -171,4 +176,4 @@ def _iceoryx2(directory: Path) -> Iterator[Way]:
     service = node.service_builder(name).blackboard_creator(ctypes.c_uint32).add(key, Value()).create()
     writer, reader = service.writer_builder().create(), service.reader_builder().create()
     put, get = writer.entry(key, Value), reader.entry(key, Value)
-    yield Way("iceoryx2", lambda: put.update_with_copy(value), get.get, lambda: bytes(get.get().data))
+    yield Way("iceoryx2", put.update_with_copy, get.get, lambda: bytes(get.get().data), value)

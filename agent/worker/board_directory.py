@@ -16,7 +16,7 @@ from typing import Final
 
 from agent.config import Settings
 from agent.errors import AgentError
-from failover.boards import boottime, directory
+from failover.boards import LINK_NAME, boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.items import Item
@@ -42,7 +42,7 @@ def provide(settings: Settings) -> Path | None:
         AgentError, BoardError, OSError: it cannot be had.
     """
     board = settings.team.items()
-    link = Path(settings.config.runtime_directory) / directory.LINK_NAME
+    link = Path(settings.config.runtime_directory) / LINK_NAME
     if not board.items or settings.me.role != "robot":
         link.unlink(missing_ok=True)
         return None

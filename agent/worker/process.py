@@ -22,7 +22,6 @@ from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.system.crash import end_worker_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
-from agent.worker import board_directory
 from agent.worker.components import launch, prerequisites
 from agent.worker.components.context import Surroundings
 from agent.worker.components.hooks import Hooks
@@ -51,6 +50,7 @@ from checkpoint.snapshot.required_files import Need, names_of_contents, needs
 from checkpoint.store.content_store import FOLDER as CONTENTS_FOLDER
 from checkpoint.store.store import Store, open_store
 from checkpoint.store.xor_cache_budget import PageBudget
+from failover.boards import LINK_NAME
 from failover.config.quantities import size_bytes
 from failover.core import acts, events
 from failover.core.types import HISTORY_MAX, Found, Held
@@ -133,6 +133,10 @@ class Worker(Switchboard):
         return Inventory(_held(store), found)
 
     async def _provide_board(self) -> None:
+        if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):
+            return
+        from agent.worker import board_directory  # here: a team without a board does not load it
+
         try:
             place = await asyncio.to_thread(board_directory.provide, self.settings)
         except (AgentError, FailoverError, OSError) as error:

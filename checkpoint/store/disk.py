@@ -83,42 +83,35 @@ class Disk:
         path.unlink(missing_ok=True)
 
 
-class Writeback:
-    """Has the disk write a long file while the file grows. May be called from any thread, one at a time.
-
-    Else the kernel keeps gigabytes of it in memory until ``sync_file``, and a sync of any other file meanwhile waits for them:
-    the vote record's, without which no robot takes over, for one. Source: sync_file_range(2). It makes nothing durable.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._begun = 0
-
-    def grown_to(self, size: int) -> None:
-        """Begin to write what the file has grown by, and wait for what was begun before; a disk that refuses writes later."""
-        while size - self._begun >= WRITEBACK_SIZE:
-            _sync_file_range(self._descriptor, self._begun, WRITEBACK_SIZE, _WRITE)
-            if self._begun:
-                before = self._begun - WRITEBACK_SIZE
-                _sync_file_range(self._descriptor, before, WRITEBACK_SIZE, _WAIT_BEFORE | _WRITE | _WAIT_AFTER)
-            self._begun += WRITEBACK_SIZE
-
-
 class DiskFile:
-    """A file that the store writes: what ``format.encode`` needs of a file."""
+    """An empty file that is written from its beginning: what ``format.encode`` needs of a file. From any thread, one at a time.
+
+    The disk writes a long file while the file grows. Else the kernel keeps gigabytes of it in memory until ``sync_file``, and a
+    sync of any other file meanwhile waits for them: the vote record's, without which no robot takes over, for one. This makes
+    nothing durable. Source: sync_file_range(2).
+    """
 
     def __init__(self, disk: Disk, descriptor: int) -> None:
         self._disk = disk
         self._descriptor = descriptor
         self._size = 0
-        self._writeback = Writeback(descriptor)
+        self._begun = 0
 
     def write(self, content: bytes | memoryview, /) -> int:
         """Append all of the content."""
         written = self._disk.write(self._descriptor, content)
         self._size += written
-        self._writeback.grown_to(self._size)
+        while self._size - self._begun >= WRITEBACK_SIZE:
+            self._write_back()
         return written
+
+    def _write_back(self) -> None:
+        """Begin to write what the file has grown by, and wait for what was begun before; a disk that refuses writes later."""
+        _sync_file_range(self._descriptor, self._begun, WRITEBACK_SIZE, _WRITE)
+        if self._begun:
+            before = self._begun - WRITEBACK_SIZE
+            _sync_file_range(self._descriptor, before, WRITEBACK_SIZE, _WAIT_BEFORE | _WRITE | _WAIT_AFTER)
+        self._begun += WRITEBACK_SIZE
 
     def copy_from(self, source: int) -> None:
         """Append the whole of another file."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import os
 import sys
 import threading
@@ -16,6 +15,7 @@ from typing import Any, Final
 
 from msgspec import Struct
 
+from checkpoint.sentences import near
 from failover.boards import boottime, directory
 from failover.boards.fence import FENCE
 from failover.boards.item import Item, ItemWriter, Source, values_for
@@ -382,8 +382,7 @@ class Board:
         raise BoardError(self._unknown(name, opened.robot))
 
     def _unknown(self, name: str, robot: str) -> str:
-        nearest = difflib.get_close_matches(name, self.names(), 1)
-        cure = f"; did you mean {nearest[0]!r}?" if nearest else "; declare it in team.toml, or with board.add()"
+        cure = near(name, self.names()) or "; declare it in team.toml, or with board.add()"
         return f"{robot} has no item {name!r} on the board {self.ensured().directory}{cure}"
 
     def _private(self, opened: _Opened) -> MappedFile:

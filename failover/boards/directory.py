@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from failover.boards import boottime, locks
+from failover.boards import LINK_NAME, boottime, locks
 from failover.boards.mapping import GENERATION, MappedFile
 from failover.client.control import socket_path
 from failover.core.board import layout
@@ -23,8 +23,6 @@ from failover.core.wire.names import check_robot
 from failover.errors import BoardError, BoardGoneError, NameFormatError
 
 VARIABLE: Final = "FAILOVER_BOARD"
-LINK_NAME: Final = "board"
-"""A symbolic link in the agent's runtime directory, to the board of its robot."""
 SHARED_MEMORY: Final = Path("/dev/shm")
 
 OWN_NAME: Final = "own"

@@ -11,11 +11,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from failover.errors import FileMistakeError, ItemError
 
@@ -115,14 +116,14 @@ def _type(kind: Type) -> str:
 
 def _value(said: object) -> str:
     if isinstance(said, str | bool):
-        return json.dumps(said, ensure_ascii=False)
+        return msgspec.json.encode(said).decode()
     if isinstance(said, tuple):
         return "[" + ", ".join(map(_value, said)) + "]"
     return repr(said)
 
 
 def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else json.dumps(name, ensure_ascii=False)
+    return name if _BARE.fullmatch(name) else msgspec.json.encode(name).decode()
 
 
 def text_of_board(text: str) -> str:

@@ -52,6 +52,7 @@ def test_the_worker_loads_no_numpy_before_a_snapshot_comes(worker: str) -> None:
     loaded = loaded_by(worker)
     assert worker in loaded
     assert not loaded & {"numpy", "importlib.metadata", "ssl", "_ssl", "_hashlib", "unicodedata", *seldom_used()}
+    assert not any(name.startswith(("failover.boards.", "failover.core.board.")) for name in loaded), "the team may have no board"
 
 
 USED: Final = """

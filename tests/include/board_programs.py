@@ -6,23 +6,22 @@ import os
 import secrets
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.include.programs import program
+from tests.include.programs import STRICT, program
 
 SHARED_MEMORY = Path("/dev/shm")
+EMULATOR = "qemu-aarch64-static"
 
 
 class Tool:
     """board_tool.c: each order is a line, each answer one too."""
 
-    def __init__(self, place: Path, **variables: str) -> None:
+    def __init__(self, place: Path, command: Sequence[str | Path], **variables: str) -> None:
         environment = {"PATH": os.environ["PATH"], "FAILOVER_BOARD": str(place), **variables}
-        self.process = subprocess.Popen(
-            [program("board_tool")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-        )
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
     @property
     def pid(self) -> int:
@@ -49,9 +48,24 @@ class Tool:
 
 
 @contextmanager
-def tool(place: Path, *, opened: bool = True, **variables: str) -> Iterator[Tool]:
-    """One that runs for the body."""
-    started = Tool(place, **variables)
+def tool(place: Path, *, opened: bool = True, sums: bool = False, **variables: str) -> Iterator[Tool]:
+    """One that runs for the body; ``sums``: it writes and examines sums, as on processors that reorder."""
+    made = program("board_tool_sums", "board_tool.c", flags=("-O2", *STRICT, "-DFB_SUMS=1")) if sums else program("board_tool")
+    with _running([made], place, opened, variables) as started:
+        yield started
+
+
+@contextmanager
+def emulated_tool(place: Path) -> Iterator[Tool]:
+    """One for aarch64, run by an emulator."""
+    made = program("board_tool_aarch64", "board_tool.c", flags=("-O2", *STRICT, "-static"), compiler="aarch64-linux-gnu-gcc")
+    with _running([EMULATOR, made], place, True, {}) as started:
+        yield started
+
+
+@contextmanager
+def _running(command: Sequence[str | Path], place: Path, opened: bool, variables: Mapping[str, str]) -> Iterator[Tool]:
+    started = Tool(place, command, **variables)
     try:
         if opened:
             started.ok("open")

@@ -16,12 +16,12 @@ import xxhash
 from failover.boards import boottime, directory
 from failover.boards.board import Board, board
 from failover.core.board import layout
-from failover.core.board.banks import put_carefully
+from failover.core.board.banks import put_carefully, sum_of
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import RUN, Wanted
 from failover.errors import WriterTakenError
-from tests.include.board_programs import Tool, place_for_board, tool
-from tests.include.programs import STRICT, STRICT_CC, has
+from tests.include.board_programs import EMULATOR, Tool, emulated_tool, place_for_board, tool
+from tests.include.programs import STRICT, has
 
 pytestmark = pytest.mark.compiler
 
@@ -45,34 +45,6 @@ def added(python: Board, tool_: Tool, name: str = "ball", size: int = 379) -> No
     tool_.ok("add", name, size)
     tool_.ok("find", name, size)
     assert python.item(name).name == name
-
-
-# --- Compiling -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("header", ["failover_board.h", "failover_rtdb.h"])
-@pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
-@pytest.mark.parametrize(
-    ("compiler", "strict"),
-    [
-        ("gcc", STRICT),
-        ("clang", STRICT),
-        ("musl-gcc", STRICT),
-        ("aarch64-linux-gnu-gcc", STRICT),
-        ("g++", STRICT_CC),
-        ("clang++", STRICT_CC),
-    ],
-)
-def test_it_compiles_without_a_warning_as_c11_and_as_cxx17(
-    compiler: str, strict: tuple[str, ...], level: str, header: str, tmp_path: Path
-) -> None:
-    if not has(compiler):
-        pytest.skip(f"needs {compiler}, which is not installed here")
-    source = tmp_path / ("only.cc" if strict is STRICT_CC else "only.c")
-    source.write_text(f'#include "{header}"\nint main(void) {{ return fb_open(NULL) == NULL; }}\n')
-    command = [compiler, *strict, level, "-Iinclude", "-c", "-o", tmp_path / "only.o", source]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
-    assert done.returncode == 0, done.stderr
 
 
 # --- Values both ways ------------------------------------------------------------------------------------------------
@@ -304,6 +276,35 @@ def test_the_digest_is_xxh3(place: Path) -> None:
     with tool(place, opened=False) as c:
         for size in [*range(1200), 4096, 65535, 65536]:
             assert int(c.say("digest", size), 16) == xxhash.xxh3_64_intdigest(data[:size]), size
+
+
+def test_the_sums_of_c_are_those_of_python_and_a_value_that_does_not_match_is_not_read(place: Path) -> None:
+    with board(place) as python, tool(place, sums=True) as c:
+        added(python, c)
+        c.ok("put", "ball", "x" * 379)
+        assert python.item("ball").get().value == b"x" * 379
+        file, record = python.found("ball", python.robot)
+        bank = file.place(record).banks[1]
+        assert file.words[bank // 8 + 2] == sum_of(b"x" * 379, file.words[bank // 8 + 1], 1)
+        assert c.say("get", "ball", "-").startswith("x" * 379)
+        file.area[bank + 32 + 100 : bank + 32 + 101] = b"y"
+        assert "written 16 times" in c.say("get", "ball", "-")
+
+
+def test_a_program_for_aarch64_and_python_exchange_values_on_one_board(place: Path) -> None:
+    """Emulated: so it shows the layout, not the order of loads and stores."""
+    for needed in ("aarch64-linux-gnu-gcc", EMULATOR):
+        if not has(needed):
+            pytest.skip(f"needs {needed}, which is not installed here")
+    with board(place) as python, emulated_tool(place) as c:
+        added(python, c)
+        c.ok("put", "ball", "hello")
+        assert python.item("ball").get().value == b"hello"
+        c.ok("add", "plan", 20)
+        c.ok("find", "plan", 20)
+        python.item("plan").put(b"go")
+        assert c.say("get", "plan", "-").startswith("go age ")
+        assert {c.pid, os.getpid()} == {pid for pid, _, _ in python.users()}
 
 
 # --- CAMBADA's names -------------------------------------------------------------------------------------------------

@@ -72,9 +72,18 @@ def segment_of(pid: int) -> SegmentReader:
     raise AssertionError(f"pid {pid} committed nothing")
 
 
+CALLS = {
+    "failover.h": "failover_commit() < 0",
+    "failover_board.h": "fb_open(NULL) == NULL",
+    "failover_rtdb.h": "fb_open(NULL) == NULL",
+}
+"""Header → something that a program does by it."""
+
+
 # --- Compiling -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("header", "call"), CALLS.items(), ids=CALLS.keys())
 @pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
 @pytest.mark.parametrize(
     ("compiler", "strict"),
@@ -88,12 +97,12 @@ def segment_of(pid: int) -> SegmentReader:
     ],
 )
 def test_it_compiles_without_a_warning_as_c11_and_as_cxx17(
-    compiler: str, strict: tuple[str, ...], level: str, tmp_path: Path
+    compiler: str, strict: tuple[str, ...], level: str, header: str, call: str, tmp_path: Path
 ) -> None:
     if not has(compiler):
         pytest.skip(f"needs {compiler}, which is not installed here")
     source = tmp_path / ("only.cc" if strict is STRICT_CC else "only.c")
-    source.write_text('#include "failover.h"\nint main(void) { return failover_commit() < 0; }\n')
+    source.write_text(f'#include "{header}"\nint main(void) {{ return {call}; }}\n')
     command = [compiler, *strict, level, "-Iinclude", "-c", "-o", tmp_path / "only.o", source]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
     assert done.returncode == 0, done.stderr

@@ -23,7 +23,7 @@ from agent.errors import LaneError
 from agent.system.crash import end_worker_on_mistake
 from agent.system.threads import to_its_end
 from checkpoint.errors import StoreError
-from checkpoint.store.disk import Writeback
+from checkpoint.store.disk import Disk, DiskFile
 from failover.core.wire.messages import (
     CHUNK_SIZE_MAX,
     SNAPSHOT_SIZE_MAX,
@@ -326,7 +326,7 @@ class Receiver:
     async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
         offer, digest, end = transfer.offer, blake3(), 0
         what = SNAPSHOT if isinstance(offer, Offer) else FILE
-        writeback = Writeback(descriptor)
+        file = DiskFile(Disk(), descriptor)
         self._link.say(peer, Credit(offer.transfer, transfer.credit))
         while end < offer.size:
             try:
@@ -336,7 +336,7 @@ class Receiver:
                 raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
             if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
                 raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
-            await to_its_end(_keep, descriptor, chunk, digest, writeback)
+            await to_its_end(_keep, file, chunk.content, digest)
             end += len(chunk.content)
             transfer.credit = end + WINDOW
             self._link.say(peer, Credit(offer.transfer, transfer.credit))
@@ -355,10 +355,9 @@ def _named(offer: Offered) -> str:
     return f"a file of {offer.size} bytes ({offer.digest.hex()[:16]}…)"
 
 
-def _keep(descriptor: int, chunk: Chunk, digest: blake3, writeback: Writeback) -> None:
-    os.pwrite(descriptor, chunk.content, chunk.offset)
-    digest.update(chunk.content)
-    writeback.grown_to(chunk.offset + len(chunk.content))
+def _keep(file: DiskFile, content: bytes, digest: blake3) -> None:
+    file.write(content)
+    digest.update(content)
 
 
 def digest_of(descriptor: int, size: int) -> bytes:

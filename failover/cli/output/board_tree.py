@@ -82,11 +82,8 @@ def _row(branch: str, item: Mapping[str, Any], text_of: Any) -> Row:
     private = " (private)" if item["area"] == "private" else ""
     age_ns, most_ns, bound_ns = (_ns(item[key]) for key in ("age_ms", "age_max_ms", "bound_ms"))
     value = "" if item["put"] == 0 or item["complaint"] else shortened(text_of(item["value"]))
-    return Row(
-        (f"{branch}{item['item']}{private}", value, "" if age_ns is None else span(age_ns), bar(most_ns, bound_ns or 0))
-        + (rate(item["rate_per_s"]), state),
-        mood,
-    )
+    age, bound = ("", "") if age_ns is None else (span(age_ns), bar(most_ns, bound_ns or 0))
+    return Row((f"{branch}{item['item']}{private}", value, age, bound, rate(item["rate_per_s"]), state), mood)
 
 
 def _ns(milliseconds_: float | None) -> int | None:

@@ -85,7 +85,9 @@ def show(arguments: argparse.Namespace) -> int:
             name: {"role": robot.role, "beats": robot.beats, "bulk": robot.bulk, "public_key": robot.public_key}
             for name, robot in members.robots.items()
         }
-        render.as_json({"team": members.team, "robots": robots})
+        board = members.items()
+        of_board = {"items": [item.name for item in board.items], "digest": f"{board.digest:016x}"}
+        render.as_json({"team": members.team, "robots": robots, "board": of_board})
         return 0
     lines = [
         (name, robot.role, " ".join(robot.beats), robot.bulk, robot.public_key or "none")
@@ -94,6 +96,10 @@ def show(arguments: argparse.Namespace) -> int:
     print(f"team {members.team}: {len(lines)} members")
     if lines:
         render.table(("robot", "role", "beats", "bulk", "public key"), lines)
+    if members.board.items:
+        print(
+            f"board: {len(members.board.items)} items, digest {members.items().digest:016x}: it must be the same on every member"
+        )
     return 0
 
 

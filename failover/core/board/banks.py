@@ -328,6 +328,7 @@ def reader(
     words, area, banks = place.words, place.area, _bank_words(place)
     least, limit, newest, count = place.least, place.limit, place.newest, len(place.banks)
     learned = 0 if bound_ns or not is_received else place.formula
+    bounded = bool(bound_ns or learned)
     generation = UNKNOWN
 
     def get(of: str | None = None) -> Reading:
@@ -351,6 +352,8 @@ def reader(
             except ValueMisfitError:
                 return slow(of)
         age = clock(7) - skew_ns - stamp
+        if not error_ns and not bounded:
+            return Reading(value, age, age, robot, number, False)
         age_max = age + error_ns
         bound = words[learned] if learned else bound_ns
         return Reading(value, age, age_max, robot, number, 0 < bound < age_max)

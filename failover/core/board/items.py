@@ -92,6 +92,7 @@ class Item(Struct, frozen=True):
     keep: bool = False
 
     def __post_init__(self) -> None:
+        _check_kinds(self)
         check_name(self.name)
         kind = _typed(self.type, self.size)
         msgspec.structs.force_setattr(self, "type", kind)
@@ -166,6 +167,17 @@ def _typed(said: Any, size: int) -> Type:
     if size and size != size_of(kind):
         raise ItemError(f"size {size} contradicts the type: {canonical(kind)} has {size_of(kind)} bytes; leave size out", "size")
     return kind
+
+
+def _check_kinds(item: Item) -> None:
+    """Refuse what a program gives in a key's place that is of another kind altogether."""
+    for key, default in zip(item.__struct_fields__[2:], item.__struct_defaults__[1:], strict=True):
+        said = getattr(item, key)
+        kinds = {bool: (bool,), int: (int, float) if key == "bound_ms" else (int,), str: (str,)}.get(type(default), ())
+        if kinds and key != "shared" and (not isinstance(said, kinds) or (isinstance(said, bool) and bool not in kinds)):
+            raise ItemError(f"{key} {said!r} is no {kinds[-1].__name__}", key)
+    if not isinstance(item.name, str):
+        raise ItemError(f"{item.name!r} cannot name an item: it is no text", "name")
 
 
 def _check_numbers(item: Item) -> None:

@@ -123,6 +123,8 @@ class Identities:
             place = f"{procfs.outlook(self._pid)}{living}" if living else self._place(line)
             is_memory = is_shared_object(line) and bool(line.protection & abi.PROT_WRITE or not living)
             identity = self._identity(path, place, deleted, is_memory=is_memory)
+            if not identity.inode and key in self._known:  # the program runs by now, and has just unmapped it
+                return self._known[key]
             if deleted and not identity.inode:  # an ordinary user may not look at it, but is told which it is
                 identity = replace(identity, device=line.device, inode=line.inode)
             self._known[key] = identity

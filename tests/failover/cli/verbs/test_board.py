@@ -75,6 +75,7 @@ def test_the_tree_has_every_robot_with_its_items_values_ages_and_states(board: B
     assert "[#.........] 60 min" in lines[3]
     assert "fresh" in lines[3]
     assert "never put" in lines[4]
+    assert "[" not in lines[4]
     assert "plan (private)" in lines[5]
     assert '"x": 5.0' in lines[7]
 

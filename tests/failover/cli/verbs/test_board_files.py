@@ -112,6 +112,14 @@ def test_the_header_as_json_has_every_item(place: Path, capsys: pytest.CaptureFi
     assert answer["digest"] == f"{team.read(place).items().digest:016x}"
 
 
+def test_the_digest_by_which_robots_compare_their_boards_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    digest = f"{team.read(place).items().digest:016x}"
+    assert main.main(["team", "show", "--directory", "."]) == 0
+    assert f"board: 4 items, digest {digest}: it must be the same on every member" in capsys.readouterr().out
+    assert main.main(["team", "show", "--directory", ".", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["board"] == {"items": ["ball", "cmd.vel", "plan", "ROBOT_WS"], "digest": digest}
+
+
 def test_two_items_of_one_name_in_c_are_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "team.toml").write_text('team = "lab"\n[board.items."a.b"]\nsize = 4\n[board.items.A_B]\nsize = 4\n')
     status, _, err = said(capsys, "board", "header", "--directory", ".")

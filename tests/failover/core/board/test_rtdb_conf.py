@@ -164,11 +164,17 @@ def test_the_caret_stands_below_the_word_also_in_a_long_line() -> None:
     assert len(line) < 130
 
 
-@pytest.mark.parametrize("letter", ["", "#", "{", "}", ";", ",", "=", "x", "9", ".", "\n", "\0", "é"])
-def test_a_file_with_any_one_letter_damaged_is_read_or_its_line_is_named(letter: str) -> None:
+LETTERS = ("", "#", "{", "}", ";", ",", "=", "x", "9", ".", "\n", "\0", "é")
+HIDING = ("#", ";", "\0", "é")
+"""What makes a comment of a line, or joins one to a comment: then a name is missed far below."""
+
+
+@pytest.mark.parametrize("turn", range(3))
+def test_a_file_with_any_one_letter_damaged_is_read_or_its_line_is_named(turn: int) -> None:
     text = SAMPLE.read_text()
     refusals = 0
     for at in range(len(text)):
+        letter = LETTERS[(at * 3 + turn * 4) % len(LETTERS)]
         damaged = text.count("\n", 0, at) + 1
         try:
             parse((text[:at] + letter + text[at + 1 :]).encode(), "f")
@@ -178,9 +184,9 @@ def test_a_file_with_any_one_letter_damaged_is_read_or_its_line_is_named(letter:
             named = int(first.split(":")[1])
             begun = [int(number) for number in re.findall(r"line (\d+)", first)]
             near = {damaged, damaged + 1}  # a damaged line break joins two lines, another one parts them
-            if not near.intersection((named, *begun)) and not (begun and begun[0] <= damaged <= named) and letter not in "#;\0é":
+            if not near.intersection((named, *begun)) and not (begun and begun[0] <= damaged <= named) and letter not in HIDING:
                 raise AssertionError(f"letter {at} of line {damaged}: {first}") from error
-    assert refusals > 100
+    assert refusals > 500
 
 
 NAMES = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,6}", fullmatch=True).filter(lambda name: name not in KEYWORDS)
