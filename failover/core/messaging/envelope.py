@@ -124,7 +124,7 @@ def decode(content: bytes) -> Envelope:
         )
     content = content.lstrip(_JSON_BLANKS)
     fields = _fields(content)
-    _check(fields)
+    check(fields)
     for key in fields:
         if not key.isprintable():
             raise EnvelopeError(f"the message has a field {key!r}: names of fields are visible characters")
@@ -225,8 +225,12 @@ def _containers(value: object) -> list[Any]:
     return found
 
 
-def _check(fields: object) -> None:
-    """Refuse what is too deep, too much, or not the same number in every language."""
+def check(fields: object) -> None:
+    """Refuse what is too deep, too much, or not the same number in every language.
+
+    Raises:
+        EnvelopeError: says which.
+    """
     level: list[object] = [fields]
     count = 0
     for _ in range(DEPTH_MAX + 1):

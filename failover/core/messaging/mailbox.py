@@ -299,8 +299,24 @@ class Mailbox:
             one = self._queue.popleft()
             if one.until_ns is None or now_ns < one.until_ns:
                 return one.envelope
-            self.done(one.envelope, refusal(one.envelope, "expired", "its deadline passed while it waited; it was not handled"))
+            self._expire(one.envelope)
         return None
+
+    def first(self) -> Envelope | None:
+        """What `take` would look at next; it stays."""
+        return self._queue[0].envelope if self._queue else None
+
+    def take_same(self, verb: str, now_ns: int) -> Envelope | None:
+        """The next message to handle, if it has this verb; None: it has another one, or there is none."""
+        while self._queue and self._queue[0].envelope.verb == verb:
+            one = self._queue.popleft()
+            if one.until_ns is None or now_ns < one.until_ns:
+                return one.envelope
+            self._expire(one.envelope)
+        return None
+
+    def _expire(self, envelope: Envelope) -> None:
+        self.done(envelope, refusal(envelope, "expired", "its deadline passed while it waited; it was not handled"))
 
     def done(self, envelope: Envelope, answer: Envelope) -> None:
         """A message was handled, with this answer; it leaves after the next `committed`."""
