@@ -233,7 +233,7 @@ class Scan:
         own = self.own
         self._keep(Table(own.origin, own.boot, entry.serial, own.address, {**own.entries, entry.path: entry}))
         if urgent:
-            self._next_ns = min(self._next_ns, max(now_ns, self._scanned_ns + self.terms.urgent_ns))
+            self.soon(now_ns)
 
     def _begin(self, boot: int) -> None:
         """A new life with the same names: all others take the table anew."""
@@ -256,6 +256,10 @@ class Scan:
         """When `tick` is due."""
         return self._next_ns
 
+    def soon(self, now_ns: int) -> None:
+        """Scan at once: others are to learn what this process has heard, and not only what it says itself."""
+        self._next_ns = min(self._next_ns, max(now_ns, self._scanned_ns + self.terms.urgent_ns))
+
     def tick(self, now_ns: int) -> list[Send]:
         """Scan if it is due: forget who is silent for long, and tell everyone known what we have."""
         if now_ns < self._next_ns:
@@ -271,7 +275,7 @@ class Scan:
         self._beats[self.origin] += 1
         self._heard_ns[self.origin] = self._scanned_ns = now_ns
         self._next_ns = now_ns + self._pause_ns()
-        digest = self._digest(now_ns)
+        digest = self.digest(now_ns)
         sends = [Send(to, digest) for to in sorted(self._known())]
         if self._multicast:
             sends.append(Send(MULTICAST, Digest(self.own.address, (self._row(self.own, now_ns),), whole=False)))
@@ -285,7 +289,8 @@ class Scan:
     def _known(self) -> set[str]:
         return {*self._seeds, *(table.address for table in self._tables.values())} - {self.own.address, ""}
 
-    def _digest(self, now_ns: int) -> Digest:
+    def digest(self, now_ns: int) -> Digest:
+        """Up to where this process has which table."""
         return Digest(self.own.address, tuple(self._row(table, now_ns) for table in self._tables.values()))
 
     def _row(self, table: Table, now_ns: int) -> Row:
@@ -333,7 +338,7 @@ class Scan:
         is_new = not digest.whole and bool(wants)
         if (lacks or is_new) and now_ns - self._told_ns.get(digest.address, now_ns - self.terms.ask_ns) >= self.terms.ask_ns:
             self._told_ns[digest.address] = now_ns
-            sends.append(Send(digest.address, self._digest(now_ns)))
+            sends.append(Send(digest.address, self.digest(now_ns)))
         return sends
 
     def _compare_own(self, row: Row, now_ns: int) -> None:
@@ -341,7 +346,7 @@ class Scan:
         if (row.boot, row.serial) > self.own.version:
             self.outbid += 1
             self._begin(row.boot + 1)
-            self._next_ns = min(self._next_ns, max(now_ns, self._scanned_ns + self.terms.urgent_ns))
+            self.soon(now_ns)
 
     def _may_ask(self, row: Row, now_ns: int) -> bool:
         asked_ns = self._asked_ns.get(row.origin)
@@ -405,6 +410,10 @@ class Scan:
         self._keep(table)
         self._hear(page.origin, page.boot, page.beat, page.age_s, now_ns)
         return True
+
+    def versions(self) -> dict[str, tuple[int, int]]:
+        """Origin → boot and serial of its table here."""
+        return {origin: table.version for origin, table in self._tables.items()}
 
     # --- What is known ----------------------------------------------------------------------------------------------------
 
