@@ -55,7 +55,7 @@ IMPURE_CALLS = frozenset({"open", "print", "input", "exec", "eval"})
 DOORS = {
     "ptrace": ("checkpoint/linux/trace/tracee.py",),
     "zstandard": ("checkpoint/snapshot/compression.py",),
-    "zmq": ("agent/worker/network/replication_link.py",),
+    "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),
     "rich": ("failover/cli/output/render.py",),
