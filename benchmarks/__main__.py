@@ -32,6 +32,7 @@ from benchmarks import (
     costs,
     crowd,
     cuts,
+    driver_call,
     encoding,
     engine,
     families,
@@ -117,6 +118,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "task": task.task,
     "board": board.board,
     "board_in_c": board_in_c.board_in_c,
+    "driver_call": driver_call.driver_call,
 }
 
 BY_ITSELF: Final = "soak"

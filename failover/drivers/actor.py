@@ -147,7 +147,7 @@ class Actor:
         return self._mailbox.committed()
 
     def _done(self, message: Envelope, said: Envelope, left_ns: int) -> None:
-        hops = envelopes.left(message, left_ns).hops
+        hops = envelopes.left_hops(message, left_ns)
         if message.id:
             self._paths[message.id] = hops
             if len(self._paths) > PATHS_MAX:

@@ -208,21 +208,23 @@ class Serving:
         """All messages that have come by ZeroMQ, up to `TURN_MAX`."""
         is_team = listening is self._team
         for _ in range(TURN_MAX):
-            message = sockets.receive(listening)
+            message = sockets.receive(listening, is_team=is_team)
             if message is None:
                 return
             identity, content, robot = message
-            self._came(content, Peer(is_team, identity), robot if is_team else "")
+            self._came(content, Peer(is_team, identity), robot)
+            if not sockets.has_message(listening):
+                return
 
-    def _came(self, content: bytes, whose: Whose, robot: str) -> None:
-        """One message. ``robot``: which its key proves; "": it came from this robot."""
+    def _came(self, content: bytes, whose: Whose, robot: str | None) -> None:
+        """One message. ``robot``: which its key proves; None: it came from this robot."""
         now_ns = self.now_ns()
         try:
             envelope = envelopes.decode(content)
         except EnvelopeError as error:
             self._publish(whose, Envelope(error=Fault("no_message", str(error))))
             return
-        if robot and robot_of(envelope.sender) != robot:
+        if robot is not None and robot_of(envelope.sender) != robot:
             self._publish(
                 whose,
                 envelopes.refusal(envelope, "wrong_sender", f"{envelope.sender!r} is no process of {robot}, whose key this is"),
@@ -284,7 +286,7 @@ class Serving:
             typing.is_over |= not content
         for one in found:
             typing.waiting += 1
-            self._came(one, hand, "")
+            self._came(one, hand, None)
         self._flush(hand, typing)
 
     def _write(self, hand: Hand, content: bytes) -> bool:

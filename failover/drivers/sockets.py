@@ -8,7 +8,6 @@ Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3).
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from typing import Final
 
@@ -119,14 +118,24 @@ def connect(context: Context, address: str, here: Here, robot: str, *, queued: i
     return socket
 
 
-def receive(socket: Socket) -> tuple[bytes, bytes, str] | None:
-    """The next message of a listening socket: (whose, content, robot that its key proves; "" by ipc); None: there is none.
+def has_message(socket: Socket) -> bool:
+    """Whether a listening socket has one more."""
+    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+
+
+def receive(socket: Socket, *, is_team: bool) -> tuple[bytes, bytes, str | None] | None:
+    """The next message of a listening socket: (whose, content, robot that its key proves); None: there is none.
 
     A message of several parts is dropped: nothing of ours sends one.
     """
     while True:
         try:
-            frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            if not is_team:
+                parts = socket.recv_multipart(zmq.NOBLOCK)
+                if len(parts) == 2:
+                    return parts[0], parts[1], None
+                continue
+            frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)  # only frames say whose key it was
         except zmq.Again:
             return None
         if len(frames) == 2:
@@ -160,15 +169,17 @@ def send(socket: Socket, content: bytes) -> bool:
 
 def await_message(socket: Socket, timeout_ns: int) -> bytes | None:
     """What comes by a way made with `connect`; None: nothing within the time."""
-    if not socket.poll(max(-(-timeout_ns // 1_000_000), 0)):
+    socket.setsockopt(zmq.RCVTIMEO, max(-(-timeout_ns // 1_000_000), 0))
+    try:
+        return socket.recv()
+    except zmq.Again:
         return None
-    with contextlib.suppress(zmq.Again):
-        return socket.recv(zmq.NOBLOCK)
-    return None
 
 
 def await_sent(socket: Socket, content: bytes, timeout_ns: int) -> bool:
     """Send as soon as there is a connection; False: there was none within the time."""
+    if send(socket, content):
+        return True
     return bool(socket.poll(max(-(-timeout_ns // 1_000_000), 0), zmq.POLLOUT)) and send(socket, content)
 
 

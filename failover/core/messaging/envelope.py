@@ -125,7 +125,8 @@ def decode(content: bytes) -> Envelope:
     content = content.lstrip(_JSON_BLANKS)
     fields = _fields(content)
     check(fields)
-    for key in fields:
+    unknown = fields.keys() - _KNOWN
+    for key in unknown:
         if not key.isprintable():
             raise EnvelopeError(f"the message has a field {key!r}: names of fields are visible characters")
     try:
@@ -133,8 +134,9 @@ def decode(content: bytes) -> Envelope:
     except msgspec.ValidationError as error:
         raise EnvelopeError(f"the message has a field of another kind than documented: {error}") from error
     _check_numbers(envelope)
-    rest = {key: value for key, value in fields.items() if key not in _KNOWN}
-    return msgspec.structs.replace(envelope, rest=rest) if rest else envelope
+    if not unknown:
+        return envelope
+    return msgspec.structs.replace(envelope, rest={key: value for key, value in fields.items() if key in unknown})
 
 
 def _fields(content: bytes) -> dict[str, Any]:
@@ -236,20 +238,22 @@ def check(fields: object) -> None:
     for _ in range(DEPTH_MAX + 1):
         inner: list[object] = []
         for one in level:
-            if isinstance(one, dict):
-                if not all(isinstance(key, str) for key in one):
-                    raise EnvelopeError("the message has a field whose name is no text")
-                inner.extend(one.values())
-            elif isinstance(one, list):
-                inner.extend(one)
-            elif isinstance(one, float):
-                if not math.isfinite(one):
-                    raise EnvelopeError("the message holds a number that is not finite")
+            if isinstance(one, str):
+                if not one.isascii():
+                    _check_text(one)
             elif isinstance(one, int):
                 if not -INTEGER_MAX <= one <= INTEGER_MAX:
                     raise EnvelopeError(f"the message holds the integer {one}: above 2^53 it must be written as text")
-            elif isinstance(one, str):
-                _check_text(one)
+            elif isinstance(one, float):
+                if not math.isfinite(one):
+                    raise EnvelopeError("the message holds a number that is not finite")
+            elif isinstance(one, dict):
+                for key in one:
+                    if not isinstance(key, str):
+                        raise EnvelopeError("the message has a field whose name is no text")
+                inner.extend(one.values())
+            elif isinstance(one, list):
+                inner.extend(one)
             elif one is not None:
                 raise EnvelopeError(f"the message holds {type(one).__name__}, which JSON does not have; write it as text")
         count += len(inner)
@@ -307,8 +311,13 @@ def came(envelope: Envelope, who: str, now_ns: int) -> Envelope:
 
 def left(envelope: Envelope, now_ns: int) -> Envelope:
     """The message as it leaves: the last hop gets its second stamp."""
+    return msgspec.structs.replace(envelope, hops=left_hops(envelope, now_ns))
+
+
+def left_hops(envelope: Envelope, now_ns: int) -> tuple[Hop, ...]:
+    """The hops of a message that leaves."""
     *before, last = envelope.hops
-    return msgspec.structs.replace(envelope, hops=(*before, Hop(last.who, last.came, _stamp(now_ns))))
+    return (*before, Hop(last.who, last.came, _stamp(now_ns)))
 
 
 def _stamp(now_ns: int) -> int | str:
