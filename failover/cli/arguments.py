@@ -416,6 +416,7 @@ def send(room: argparse.ArgumentParser) -> None:
     _name_of_driver(room)
     room.add_argument("message", metavar="JSON", help="a message, as ENVELOPE.md says; - reads it from standard input")
     _timeout(room)
+    _json(room)
 
 
 def path(room: argparse.ArgumentParser) -> None:

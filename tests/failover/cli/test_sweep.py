@@ -27,6 +27,7 @@ FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/z
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")
 TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
 BOARDS = ([], ["get", "ball"], ["put", "ball", "1"], ["top"], ["users"], ["header"], ["import", "missing"], ["import", "junk"])
+DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
@@ -101,6 +102,16 @@ def test_with_a_board_that_is_none(act: list[str], at: str, capsys: pytest.Captu
     assert sorted(Path("directory").iterdir()) == []
 
 
+@pytest.mark.parametrize("at", ["directory", "junk", "missing/place"])
+@pytest.mark.parametrize("act", DRIVERS, ids=" ".join)
+def test_with_drivers_that_are_not_there(
+    act: list[str], at: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FAILOVER_DRIVERS", at)
+    assert told(capsys, *act) == main.FAILED
+    assert sorted(Path("directory").iterdir()) == []
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -110,5 +121,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 
 def test_the_sweep_leaves_no_verb_out() -> None:
-    swept = {*UNDER_AN_AGENT, "restore", "inspect", "capture", "check", "team", "board", "completion"}
+    without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
+    swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}

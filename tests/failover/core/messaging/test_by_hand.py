@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from failover.core.messaging.by_hand import Typed
@@ -19,6 +19,7 @@ values = st.recursive(
 )
 
 
+@settings(suppress_health_check=list(HealthCheck))
 @given(st.lists(st.dictionaries(st.text(), values, max_size=4), max_size=5), st.integers(1, 30), st.sampled_from([None, 2]))
 def test_every_object_comes_out_as_it_went_in(objects: list[dict[str, object]], cut: int, indent: int | None) -> None:
     content = "\n ".join(json.dumps(one, ensure_ascii=False, indent=indent) for one in objects).encode(errors="surrogatepass")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.pacing import SECOND, Pace, merged
 
 
+@settings(suppress_health_check=list(HealthCheck))
 @given(rate_hz=st.floats(0.1, 1_000), gaps_ns=st.lists(st.integers(0, 2 * SECOND), max_size=50))
 def test_no_command_begins_within_a_period_of_the_one_before(rate_hz: float, gaps_ns: list[int]) -> None:
     pace, now_ns = Pace(rate_hz), 0
