@@ -32,6 +32,7 @@ from benchmarks import (
     costs,
     crowd,
     cuts,
+    driver_call,
     encoding,
     engine,
     families,
@@ -121,6 +122,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "board": board.board,
     "board_in_c": board_in_c.board_in_c,
     "task_times": task_times.task_times,
+    "driver_call": driver_call.driver_call,
 }
 
 BY_ITSELF: Final = "soak"

@@ -22,6 +22,11 @@ and one that shares values with other programs and robots:
     ball = board.add(failover.Item("ball", {"x": "f4", "y": "f4"}))
     ball.put({"x": 1.0, "y": 2.0})
     print(ball.get().age_ns)
+
+and one that speaks for a device, and one that calls it (`failover.drivers.declare`):
+
+    with failover.proxy("engine") as engine:
+        engine.call("set", duty=0.4)
 """
 
 from __future__ import annotations
@@ -33,14 +38,20 @@ if TYPE_CHECKING:
     from failover.boards.board import board
     from failover.client.control import Control
     from failover.core.board.items import Item
+    from failover.drivers.declare import command, driver, query, stream
+    from failover.drivers.proxy import proxy
     from failover.errors import (
         AgentRefusedError,
         BoardError,
+        CallRefusedError,
+        DriverError,
         FailoverError,
         GatewayError,
         LostAgentError,
+        NameUnknownError,
         NeverWrittenError,
         NoAgentError,
+        NoAnswerError,
         NotCommittedError,
         OvertakenError,
         ScheduleError,
@@ -92,6 +103,15 @@ _HOMES = {
     "WriterTakenError": "failover.errors",
     "FailoverError": "failover.errors",
     "GatewayError": "failover.errors",
+    "command": "failover.drivers.declare",
+    "driver": "failover.drivers.declare",
+    "query": "failover.drivers.declare",
+    "stream": "failover.drivers.declare",
+    "proxy": "failover.drivers.proxy",
+    "CallRefusedError": "failover.errors",
+    "DriverError": "failover.errors",
+    "NameUnknownError": "failover.errors",
+    "NoAnswerError": "failover.errors",
     "StaleEpochError": "failover.errors",
     "LostAgentError": "failover.errors",
     "NoAgentError": "failover.errors",
@@ -104,14 +124,18 @@ __all__ = [
     "FINISHED",
     "AgentRefusedError",
     "BoardError",
+    "CallRefusedError",
     "Control",
+    "DriverError",
     "FailoverError",
     "Gateway",
     "GatewayError",
     "Item",
     "LostAgentError",
+    "NameUnknownError",
     "NeverWrittenError",
     "NoAgentError",
+    "NoAnswerError",
     "NotCommittedError",
     "OvertakenError",
     "Resumed",
@@ -124,17 +148,22 @@ __all__ = [
     "__version__",
     "activations",
     "board",
+    "command",
     "commit",
     "component",
+    "driver",
     "epoch",
     "every",
     "kept",
+    "proxy",
+    "query",
     "resumable",
     "resume",
     "resumed",
     "run",
     "scheduled",
     "scratch",
+    "stream",
     "transaction",
     "wait_committed",
 ]

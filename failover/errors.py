@@ -117,6 +117,50 @@ class RightsError(FailoverError):
         self.key = key
 
 
+class NameUnknownError(FailoverError):
+    """Nothing that this process has heard of answers to a name."""
+
+
+class NameAmbiguousError(FailoverError):
+    """Several things answer to a name; the message lists their paths.
+
+    Attributes:
+        paths: of all of them.
+    """
+
+    def __init__(self, message: str, paths: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.paths = paths
+
+
+class EnvelopeError(FailoverError):
+    """Bytes that came as a message are none that can be carried out; nothing was done."""
+
+
+class MailboxFullError(FailoverError):
+    """As many messages as may wait are waiting; this one was not taken. Send it again later."""
+
+
+class DriverError(FailoverError):
+    """A driver is declared in a way that cannot work, or cannot take messages; the message says why and what to do."""
+
+
+class CallRefusedError(FailoverError):
+    """The driver got the message, did not carry it out or failed at it, and says why.
+
+    Attributes:
+        kind: one word for programs: "failed", "unknown_verb", "bad_body", "busy", "expired" …
+    """
+
+    def __init__(self, message: str, kind: str = "") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class NoAnswerError(FailoverError, TimeoutError):
+    """A driver did not answer in time; whether the message was carried out is not known."""
+
+
 class StateError(FailoverError):
     """Something about the state that a program keeps (``failover.state``) does not work.
 

@@ -41,7 +41,7 @@ PURE_FILES = (
 PURE_IMPORTS = frozenset(
     """
     __future__ abc bisect binascii blake3 collections contextlib dataclasses difflib enum fractions functools hashlib heapq hmac
-    itertools math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
+    ipaddress itertools json math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
     """.split()  # noqa: SIM905
 )
 
@@ -55,7 +55,7 @@ IMPURE_CALLS = frozenset({"open", "print", "input", "exec", "eval"})
 DOORS = {
     "ptrace": ("checkpoint/linux/trace/tracee.py",),
     "zstandard": ("checkpoint/snapshot/compression.py",),
-    "zmq": ("agent/worker/network/replication_link.py",),
+    "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),

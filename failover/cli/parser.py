@@ -374,6 +374,59 @@ VERBS: Final = (
         "failover.cli.verbs.task_programs:wait_activation",
     ),
     Verb(
+        "names",
+        "the tree of names: which driver answers to which path and alias, on which robot, with which verbs",
+        """
+        Drivers register their names with one another; this command asks those of this robot, or of another one if there is none
+        here. It shows drivers of this user. Exit status 1: a name is unreachable, is claimed twice, or belongs to another robot.
+
+          failover names
+          failover names University/Lab/Robotino
+          failover names --json | jq .names[0].verbs
+        """,
+        arguments.names,
+        "failover.cli.verbs.drivers:names",
+    ),
+    Verb(
+        "call",
+        "have a driver carry out a verb, and print what it returns",
+        """
+        Find a driver by its path, an alias or an address, and have it carry out a verb. The answer is printed as JSON. The
+        message is sent again until it is answered or the time is over; the driver carries it out once.
+
+          failover call engine set '{"duty": 0.4}'
+          failover call University/Lab/Robotino/Engines/3/PWM read
+          failover call engine set 0.4 --timeout-s 0.5
+        """,
+        arguments.call,
+        "failover.cli.verbs.drivers:call",
+    ),
+    Verb(
+        "send",
+        "send a driver a message as it is written, and print the answer as it comes",
+        """
+        Send one JSON object. Fields may come in any order; "to" is added if it is not there. The answer is printed as it comes.
+        Nothing is sent again. Exit status 1: the answer is an error.
+
+          failover send engine '{"verb": "read"}'
+          failover send engine '{"verb": "set", "body": {"duty": 0.4}, "id": "mine-1"}'
+        """,
+        arguments.send,
+        "failover.cli.verbs.drivers:send",
+    ),
+    Verb(
+        "path",
+        "where a message to a driver spent its time, hop by hop",
+        """
+        Ask the drivers which of them remembers a message, and print where that was and for how long, with bounds: clocks of
+        different robots are compared by some messages to and fro. The way of the answer back is not remembered.
+
+          failover path robot1/failover-4711-1-18f3a2b-1
+        """,
+        arguments.path,
+        "failover.cli.verbs.drivers:path",
+    ),
+    Verb(
         "check",
         "can failover protect programs here, or this process; and what to change",
         """

@@ -13,6 +13,7 @@ failover.run(Mapper)
 from __future__ import annotations
 
 import copy
+import importlib
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Protocol, TypeVar, overload
@@ -32,6 +33,9 @@ C = TypeVar("C")
 D = TypeVar("D", bound=np.generic)
 
 DECLARED: Final = "__failover_component__"
+
+RUNNER: Final = "__failover_runner__"
+"""Of a class that is no component and may be run nevertheless: ``module:function``, called with it."""
 
 
 class Kept:
@@ -201,8 +205,12 @@ class Component(Protocol):
 R = TypeVar("R", bound=Component)
 
 
-def run(cls: type[R]) -> R:
-    """Make the component, give it its state, and run its steps; each that returns is committed.
+@overload
+def run(cls: type[R]) -> R: ...
+@overload
+def run(cls: type[C]) -> C: ...
+def run(cls: type[Any]) -> Any:
+    """Make the component, give it its state, and run its steps; each that returns is committed. Drivers: `failover.driver`.
 
     Kept attributes are there when ``__init__`` runs. After a resume they are set again afterwards, so that the beginnings which
     it sets do not take the place of the kept values; then ``on_resume`` is called, if there is one, and then the steps begin.
@@ -212,6 +220,9 @@ def run(cls: type[R]) -> R:
     Returns:
         The component after its last step.
     """
+    if runner := getattr(cls, RUNNER, ""):
+        module, _, function = runner.partition(":")
+        return getattr(importlib.import_module(module), function)(cls)
     declaration = getattr(cls, DECLARED, None)
     if not isinstance(declaration, Declaration):
         raise TaskError(f"cannot run {cls.__name__}: it is not declared; write @failover.component(name=…) above it")

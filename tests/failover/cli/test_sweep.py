@@ -31,6 +31,7 @@ TASKS = (
     *(["ps"], ["trace", "-o", "out", "--for", "1s"], ["task", "add", "x", "period_ms=9"], ["task", "set", "x", "period_ms=9"]),
     *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
 )
+DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
@@ -117,6 +118,16 @@ def test_with_a_program_that_no_task_runs(capsys: pytest.CaptureFixture[str], mo
     assert told(capsys, "wait-activation") == main.FAILED
 
 
+@pytest.mark.parametrize("at", ["directory", "junk", "missing/place"])
+@pytest.mark.parametrize("act", DRIVERS, ids=" ".join)
+def test_with_drivers_that_are_not_there(
+    act: list[str], at: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FAILOVER_DRIVERS", at)
+    assert told(capsys, *act) == main.FAILED
+    assert sorted(Path("directory").iterdir()) == []
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -126,6 +137,7 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 
 def test_the_sweep_leaves_no_verb_out() -> None:
-    swept = {*UNDER_AN_AGENT, "restore", "inspect", "capture", "check", "team", "board", "completion"}
-    swept |= {"ps", "task", "trace", "wait-activation"}
+    without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
+    without |= {"ps", "task", "trace", "wait-activation"}
+    swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}

@@ -1,0 +1,204 @@
+"""names, call, send, path: who answers to which name, and messages to drivers by hand."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from typing import Any, Final
+
+import msgspec
+
+from failover.cli.output import names_tree, render
+from failover.core.messaging import envelope as envelopes
+from failover.core.messaging.clocks import Bounds, ClockPair, Part, parts
+from failover.core.messaging.envelope import MESSAGE_SIZE_MAX, Envelope, Hop
+from failover.core.naming.tree import Place, Reach, Tree, robot_of
+from failover.drivers import sockets
+from failover.drivers.here import Here, here
+from failover.drivers.lookup import lookup, whole_tree
+from failover.drivers.proxy import Proxy, address_of
+from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError, RequestError
+
+EXCHANGES: Final = 8
+"""Messages to and fro from which the offset of a robot's clock is found: the fastest of each direction count."""
+
+ASK_S: Final = 2.0
+"""How long each driver is asked whether it remembers a message."""
+
+
+def names(arguments: argparse.Namespace) -> int:
+    """The tree of names. Exit status 1: a name is unreachable, claimed twice, or refused."""
+    tree = whole_tree(here())
+    found = [_told(place) for place in tree.under(arguments.prefix)]
+    if arguments.prefix and not found:
+        raise NameUnknownError(f"nothing is registered under {arguments.prefix}")
+    if arguments.json:
+        render.as_json({"names": found})
+    else:
+        render.painted(names_tree.COLUMNS, names_tree.rows(found), f"{len(found)} names")
+    return 1 if any(one["reach"] != Reach.LIVE or one["rivals"] or one["refused"] for one in found) else 0
+
+
+def _told(place: Place) -> dict[str, Any]:
+    """A place as JSON."""
+    record: dict[str, Any] = {"kind": place.record.kind} | msgspec.to_builtins(place.record)
+    lists = {key: record.get(key, []) for key in ("aliases", "addresses", "versions")}
+    stands = {"robot": place.robot, "origin": place.origin, "reach": str(place.reach), "rivals": list(place.rivals)}
+    return record | lists | {"verbs": record.get("verbs", {})} | stands | {"refused": place.refused}
+
+
+def call(arguments: argparse.Namespace) -> int:
+    """Have a verb carried out, and print what it returns as JSON."""
+    body = _json(arguments.body, "body") if arguments.body is not None else None
+    place = here()
+    with Proxy(place, lookup(place, arguments.name)) as driver:
+        value = driver.call(arguments.call_verb, body, timeout=arguments.timeout_s)
+        if arguments.json:
+            render.as_json({"ok": value, "id": driver.last.re if driver.last is not None else "", "path": driver.path})
+        else:
+            print(render.spoken(render.json_text(value)), flush=True)
+    return 0
+
+
+def send(arguments: argparse.Namespace) -> int:
+    """Send a message as it was written, and print the answer as it came. Exit status 1: the answer is an error."""
+    text = sys.stdin.read(MESSAGE_SIZE_MAX + 1) if arguments.message == "-" else arguments.message
+    written = _json(text, "message")
+    if not isinstance(written, dict):
+        raise RequestError('a message is a JSON object, as in {"verb": "read"}')
+    fields = {"to": arguments.name} | written
+    content = json.dumps(fields, ensure_ascii=False).encode()
+    envelopes.decode(content)
+    place = here()
+    found = lookup(place, arguments.name)
+    answer = _exchanged(place, found, content, arguments.timeout_s)
+    print(render.spoken(answer.decode(errors="replace")), flush=True)
+    return 1 if envelopes.decode(answer).error is not msgspec.UNSET else 0
+
+
+def _exchanged(here: Here, place: Place, content: bytes, timeout_s: float) -> bytes:
+    """The answer to one message.
+
+    Raises:
+        NoAnswerError: there is none.
+    """
+    context = sockets.context()
+    timeout_ns = round(timeout_s * 1e9)
+    try:
+        way = sockets.connect(context, address_of(here, place), here, place.robot)
+        if sockets.await_sent(way, content, timeout_ns) and (answer := sockets.await_message(way, timeout_ns)) is not None:
+            return answer
+    finally:
+        sockets.close(context)
+    raise NoAnswerError(f"{place.record.path} did not answer within {timeout_s:g} s; it may still carry the message out")
+
+
+def _json(text: str, what: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"the {what} is not JSON: {error}; text stands in double quotes, as in '\"blue\"'") from error
+
+
+# --- The way of a message --------------------------------------------------------------------------------------------
+
+
+def path(arguments: argparse.Namespace) -> int:
+    """Where a message spent its time, hop by hop."""
+    place = here()
+    tree = whole_tree(place)
+    hops = _remembered(place, tree, arguments.id)
+    clocks = _Clocks(place, tree)
+    found = [_part(one) for one in parts(hops, clocks.offset)]
+    if arguments.json:
+        render.as_json({"id": arguments.id, "parts": found})
+    else:
+        render.painted(names_tree.PATH_COLUMNS, names_tree.path_rows(found), f"message {arguments.id}")
+    return 0
+
+
+def _remembered(here: Here, tree: Tree, wanted: str) -> tuple[Hop, ...]:
+    """The hops of a message, from the driver that remembers it.
+
+    Raises:
+        NameUnknownError: none does.
+    """
+    asked = 0
+    for place in _live(tree):
+        try:
+            with Proxy(here, place) as driver:
+                hops = driver.call("_path", {"id": wanted}, timeout=ASK_S)
+        except (NoAnswerError, CallRefusedError, DriverError):
+            continue
+        asked += 1
+        if hops:
+            return tuple(msgspec.convert(hops, tuple[Hop, ...]))
+    raise NameUnknownError(
+        f"none of the {asked} drivers that answered remembers a message {wanted!r}: each keeps its last 4096; "
+        "failover call --json prints the id of a message"
+    )
+
+
+def _live(tree: Tree) -> list[Place]:
+    return [place for place in tree.under() if place.record.kind == "driver" and place.reach is Reach.LIVE and not place.refused]
+
+
+class _Clocks:
+    """Offsets of the robots' clocks from this one's, each found by some messages when it is first asked for.
+
+    All processes of a robot share one clock, so between them it is 0.
+    """
+
+    def __init__(self, here: Here, tree: Tree) -> None:
+        self._here = here
+        self._tree = tree
+        self._pairs: defaultdict[str, ClockPair] = defaultdict(ClockPair)
+        self._asked: set[str] = set()
+
+    def offset(self, who: str, other: str, at_ns: int) -> Bounds:
+        """Clock of ``other`` minus clock of ``who``."""
+        one, two = robot_of(who), robot_of(other)
+        if one == two:
+            return Bounds(0, 0)
+        first, second = self._from_here(one, at_ns), self._from_here(two, at_ns)
+        return Bounds(_less(second.low_ns, first.high_ns), _less(second.high_ns, first.low_ns))
+
+    def _from_here(self, robot: str, at_ns: int) -> Bounds:
+        if robot == self._here.robot:
+            return Bounds(0, 0)
+        if robot not in self._asked:
+            self._asked.add(robot)
+            self._ask(robot)
+        return self._pairs[robot].offset(at_ns)
+
+    def _ask(self, robot: str) -> None:
+        place = next((one for one in _live(self._tree) if one.robot == robot), None)
+        if place is None:
+            return
+        with Proxy(self._here, place) as driver:
+            for _ in range(EXCHANGES):
+                try:
+                    driver.call("_path", {"id": ""}, timeout=ASK_S)
+                except (NoAnswerError, CallRefusedError):
+                    return
+                self._take(robot, driver.last, driver.now_ns())
+
+    def _take(self, robot: str, answer: Envelope | None, came_ns: int) -> None:
+        if answer is None or len(answer.hops) != 2:
+            return
+        ours, theirs = answer.hops
+        if ours.left_ns is not None and theirs.left_ns is not None:
+            self._pairs[robot].forward(ours.left_ns, theirs.came_ns)
+            self._pairs[robot].backward(theirs.left_ns, came_ns)
+
+
+def _less(one: int | None, other: int | None) -> int | None:
+    return None if one is None or other is None else one - other
+
+
+def _part(one: Part) -> dict[str, Any]:
+    middle = one.took.middle_ns
+    bounds = {"took_ms": middle, "at_least_ms": one.took.low_ns, "at_most_ms": one.took.high_ns}
+    return {"who": one.who, "to": one.to} | {key: None if ns is None else round(ns / 1e6, 4) for key, ns in bounds.items()}

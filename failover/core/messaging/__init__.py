@@ -1,0 +1,1 @@
+"""Messages of programs and drivers: bytes, hops, and what an actor's mailbox promises; pure. For drivers and agent."""

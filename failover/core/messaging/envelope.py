@@ -1,0 +1,324 @@
+"""A message ⇄ bytes: JSON or msgpack, told apart by the first byte; ``ENVELOPE.md`` is normative.
+
+Fields may come in any order. Fields that this version does not know are kept and passed on. A message by hand needs three:
+``{"to": "engine", "verb": "set", "body": {"duty": 1}}``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, Final, Literal
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from failover.errors import EnvelopeError
+
+MESSAGE_SIZE_MAX: Final = 1 << 20
+"""Bytes of a message: an image of a camera; what is larger travels as a file."""
+
+DEPTH_MAX: Final = 32
+"""Tables and lists within each other."""
+
+ELEMENTS_MAX: Final = 1 << 16
+"""Values of one message: it is decoded within milliseconds."""
+
+INTEGER_MAX: Final = 1 << 53
+"""Larger integers are not the same in every language; who needs them writes them as text. Source: RFC 8259, section 6."""
+
+HOPS_MAX: Final = 16
+"""Processes that pass on a message; more is a circle of names."""
+
+Encoding = Literal["json", "msgpack"]
+
+
+class Hop(Struct, frozen=True, array_like=True):
+    """One process that passed the message on: when it came and when it left, in ns of that process's own clock.
+
+    A stamp above `INTEGER_MAX`, a machine that runs for 104 days, is written as text.
+    """
+
+    who: str
+    came: int | str
+    left: int | str | None = None
+
+    @property
+    def came_ns(self) -> int:
+        """When it came."""
+        return int(self.came)
+
+    @property
+    def left_ns(self) -> int | None:
+        """When it left; None: it has not."""
+        return None if self.left is None else int(self.left)
+
+
+class Fault(Struct, frozen=True):
+    """Why a message was not carried out. ``kind``: one word for programs; ``sentence``: for people."""
+
+    kind: str
+    sentence: str = ""
+
+
+class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from", "rest": "\x7frest"}):
+    """A message, or the answer to one.
+
+    Attributes:
+        to: a name of any kind; of an answer: the asking message's sender.
+        verb: what to do; body: with what.
+        id: by which the answer names it. re: whose answer it is.
+        sender: ``from`` on the wire. by: the person for whom it is done.
+        boot, seq: the sender's life and the message's number in it, see `failover.core.messaging.mailbox`.
+        after: the number of the message that must be handled before. reliable: it is sent until it is answered.
+        deadline_ms: how long from now on it is worth being handled.
+        hops: who passed it on.
+        ok, error: of an answer: the result or why there is none.
+        rest: fields that this version does not know.
+    """
+
+    to: str = ""
+    verb: str = ""
+    body: Any = UNSET
+    id: str = ""
+    sender: str = ""
+    by: str = ""
+    boot: int = 0
+    seq: int = 0
+    after: int = 0
+    reliable: bool = False
+    deadline_ms: float | None = None
+    hops: tuple[Hop, ...] = ()
+    re: str = ""
+    ok: Any | UnsetType = UNSET
+    error: Fault | UnsetType = UNSET
+    rest: Mapping[str, Any] = {}
+
+
+_REST: Final = "\x7frest"
+_KNOWN: Final = frozenset(field.encode_name for field in msgspec.structs.fields(Envelope)) - {_REST}
+_to_json = msgspec.json.Encoder().encode
+_to_msgpack = msgspec.msgpack.Encoder().encode
+_JSON_BLANKS: Final = b" \t\r\n"
+
+
+def encode(envelope: Envelope, encoding: Encoding = "json") -> bytes:
+    """The message's bytes; unknown fields go with it, and never replace a known one."""
+    fields = msgspec.to_builtins(envelope)
+    rest = fields.pop(_REST, None)
+    if rest:
+        fields = {**rest, **fields}
+    return _to_json(fields) if encoding == "json" else _to_msgpack(fields)
+
+
+def decode(content: bytes) -> Envelope:
+    """The message of these bytes.
+
+    Raises:
+        EnvelopeError: they are none; says why.
+    """
+    if len(content) > MESSAGE_SIZE_MAX:
+        raise EnvelopeError(
+            f"the message has {len(content)} bytes, {MESSAGE_SIZE_MAX} are the most; send the name of a file instead"
+        )
+    content = content.lstrip(_JSON_BLANKS)
+    fields = _fields(content)
+    check(fields)
+    unknown = fields.keys() - _KNOWN
+    for key in unknown:
+        if not key.isprintable():
+            raise EnvelopeError(f"the message has a field {key!r}: names of fields are visible characters")
+    try:
+        envelope = msgspec.convert(fields, Envelope)
+    except msgspec.ValidationError as error:
+        raise EnvelopeError(f"the message has a field of another kind than documented: {error}") from error
+    _check_numbers(envelope)
+    if not unknown:
+        return envelope
+    return msgspec.structs.replace(envelope, rest={key: value for key, value in fields.items() if key in unknown})
+
+
+def _fields(content: bytes) -> dict[str, Any]:
+    """All fields, each once."""
+    first = content[:1]
+    try:
+        if first == b"{":
+            fields = msgspec.json.decode(content)
+            if _to_json(fields) != content:  # not written by an encoder like ours: a field may be there twice
+                json.loads(content, object_pairs_hook=_once)
+        elif first and (0x80 <= first[0] <= 0x8F or first[0] in (0xDE, 0xDF)):
+            fields = msgspec.msgpack.decode(content)
+            if _to_msgpack(fields) != content:
+                _count_once(content, fields)
+        elif first == b"\xc3":
+            raise EnvelopeError("the message is Avro, which this version does not read; send JSON or msgpack")
+        else:
+            raise EnvelopeError(f"the message begins with {first!r}: it is neither a JSON object nor a msgpack map")
+    except (msgspec.DecodeError, UnicodeError, ValueError) as error:
+        raise EnvelopeError(f"the message cannot be read: {error}") from error
+    except RecursionError as error:
+        raise EnvelopeError(f"the message is nested deeper than {DEPTH_MAX}") from error
+    return fields  # type: ignore[no-any-return]
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for place, name in enumerate(names) if name in names[:place])
+        raise EnvelopeError(f"the message has the field {twice!r} twice")
+    return fields
+
+
+def _count_once(content: bytes, fields: object) -> None:
+    """Of msgpack: as many keys as maps announce."""
+    if _announced(content) != sum(len(one) for one in _containers(fields) if isinstance(one, dict)):
+        raise EnvelopeError("the message has a field twice")
+
+
+_SIZES: Final = {0xCA: 4, 0xCB: 8, 0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}
+"""First byte of a number → bytes that follow. Source: the msgpack specification."""
+
+_LENGTHS: Final = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}
+"""First byte of bytes and texts → bytes of their length."""
+
+
+def _announced(content: bytes) -> int:
+    """The keys that all maps of a valid msgpack message announce together, those that come twice counted twice."""
+    at = announced = 0
+    while at < len(content):
+        first = content[at]
+        at += 1
+        if 0x80 <= first <= 0x8F:
+            announced += first & 0x0F
+        elif 0xA0 <= first <= 0xBF:
+            at += first & 0x1F
+        elif first in (0xDE, 0xDF):
+            width = 2 if first == 0xDE else 4
+            announced += int.from_bytes(content[at : at + width])
+            at += width
+        elif first in (0xDC, 0xDD):
+            at += 2 if first == 0xDC else 4
+        elif first in _LENGTHS:
+            width = _LENGTHS[first]
+            at += width + int.from_bytes(content[at : at + width])
+        elif 0xC7 <= first <= 0xC9 or 0xD4 <= first <= 0xD8:
+            raise EnvelopeError("the message holds a msgpack extension; times and such travel as text")
+        else:
+            at += _SIZES.get(first, 0)
+    return announced
+
+
+def _containers(value: object) -> list[Any]:
+    """All tables and lists, outermost first."""
+    found: list[Any] = []
+    level: list[object] = [value]
+    while level:
+        inner: list[object] = []
+        for one in level:
+            if isinstance(one, dict):
+                found.append(one)
+                inner.extend(one.values())
+            elif isinstance(one, list):
+                found.append(one)
+                inner.extend(one)
+        level = inner
+    return found
+
+
+def check(fields: object) -> None:
+    """Refuse what is too deep, too much, or not the same number in every language.
+
+    Raises:
+        EnvelopeError: says which.
+    """
+    level: list[object] = [fields]
+    count = 0
+    for _ in range(DEPTH_MAX + 1):
+        inner: list[object] = []
+        for one in level:
+            if isinstance(one, str):
+                if not one.isascii():
+                    _check_text(one)
+            elif isinstance(one, int):
+                if not -INTEGER_MAX <= one <= INTEGER_MAX:
+                    raise EnvelopeError(f"the message holds the integer {one}: above 2^53 it must be written as text")
+            elif isinstance(one, float):
+                if not math.isfinite(one):
+                    raise EnvelopeError("the message holds a number that is not finite")
+            elif isinstance(one, dict):
+                for key in one:
+                    if not isinstance(key, str):
+                        raise EnvelopeError("the message has a field whose name is no text")
+                inner.extend(one.values())
+            elif isinstance(one, list):
+                inner.extend(one)
+            elif one is not None:
+                raise EnvelopeError(f"the message holds {type(one).__name__}, which JSON does not have; write it as text")
+        count += len(inner)
+        if count > ELEMENTS_MAX:
+            raise EnvelopeError(f"the message holds more than {ELEMENTS_MAX} values")
+        if not inner:
+            return
+        level = inner
+    raise EnvelopeError(f"the message is nested deeper than {DEPTH_MAX}")
+
+
+def _check_text(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise EnvelopeError("the message holds half of a character (a lone surrogate)") from error
+
+
+def _check_numbers(envelope: Envelope) -> None:
+    if min(envelope.boot, envelope.seq, envelope.after) < 0:
+        raise EnvelopeError("the message has a negative boot, seq or after")
+    if len(envelope.hops) > HOPS_MAX:
+        raise EnvelopeError(
+            f"the message was passed on {len(envelope.hops)} times, {HOPS_MAX} are the most: names lead in a circle"
+        )
+    for hop in envelope.hops:
+        for stamp in (hop.came, hop.left):
+            if isinstance(stamp, str) and not (stamp.isascii() and stamp.isdigit() and len(stamp) < 20):
+                raise EnvelopeError(f"the message has the stamp {stamp[:40]!r}: write nanoseconds, from 2^53 on as text")
+
+
+# --- Answers and hops -------------------------------------------------------------------------------------------------
+
+
+def answer(asked: Envelope, ok: Any) -> Envelope:
+    """That a message was carried out, with its result."""
+    return Envelope(to=asked.sender, re=asked.id, boot=asked.boot, seq=asked.seq, ok=ok)
+
+
+def refusal(asked: Envelope, kind: str, sentence: str) -> Envelope:
+    """That it was not, and why."""
+    return Envelope(to=asked.sender, re=asked.id, boot=asked.boot, seq=asked.seq, error=Fault(kind, sentence))
+
+
+def came(envelope: Envelope, who: str, now_ns: int) -> Envelope:
+    """The message with a hop of this process.
+
+    Raises:
+        EnvelopeError: so many have passed it on that it goes in a circle.
+    """
+    if len(envelope.hops) >= HOPS_MAX:
+        raise EnvelopeError(f"the message to {envelope.to!r} was passed on {HOPS_MAX} times: names lead in a circle")
+    return msgspec.structs.replace(envelope, hops=(*envelope.hops, Hop(who, _stamp(now_ns))))
+
+
+def left(envelope: Envelope, now_ns: int) -> Envelope:
+    """The message as it leaves: the last hop gets its second stamp."""
+    return msgspec.structs.replace(envelope, hops=left_hops(envelope, now_ns))
+
+
+def left_hops(envelope: Envelope, now_ns: int) -> tuple[Hop, ...]:
+    """The hops of a message that leaves."""
+    *before, last = envelope.hops
+    return (*before, Hop(last.who, last.came, _stamp(now_ns)))
+
+
+def _stamp(now_ns: int) -> int | str:
+    return now_ns if now_ns <= INTEGER_MAX else str(now_ns)

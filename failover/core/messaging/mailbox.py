@@ -1,0 +1,355 @@
+"""An actor's mailbox, and the outbox of who writes to it; pure: every instant is an argument, both are values that can be kept.
+
+Promised, of one sender to one receiver:
+
+* *order*: messages are handled in the order in which they were posted.
+* *at most once*: none is handled twice.
+* a *reliable* one is sent until it is answered, over any outage and any death of either side: with the lines above it is handled
+  *effectively once*, as long as both sides keep their state. It is answered only when what it did is kept.
+* one past its deadline is not handled, and its sender is told.
+
+Not promised: any order between different senders; that an unreliable message arrives. A receiver that keeps no state may, after
+its death, handle again what it had handled and not yet answered.
+
+How: the sender numbers its messages (`seq`) within its life (`boot`), and says in each which unanswered reliable one comes right
+before (`after`). The receiver takes a message whose number is above all it has taken, once it has taken the one before. It keeps
+its last `WINDOW` answers to reliable messages, and gives them again. The sender has never more than that unanswered.
+
+What must be kept together with the effects of the messages: `Mailbox.kept` and `Outbox.kept`. Nothing leaves before `committed`:
+a program that goes back to its last commit takes back nothing that others have heard.
+
+    Outbox:  post → (committed) → due → … → answered
+    Mailbox: arrived → take → done → (committed) → the answer leaves
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Mapping
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from failover.core.messaging.envelope import Envelope, refusal
+from failover.errors import MailboxFullError
+
+MAILBOX_MAX: Final = 1_024
+"""Messages that wait: a driver of 20 Hz is a minute behind."""
+
+WINDOW: Final = 1_024
+"""Reliable messages of one sender without an answer, and answers that the receiver keeps for it."""
+
+HELD_MAX: Final = 64
+"""Messages of one sender that came before one that must be handled first; the sender sends the others again."""
+
+SENDERS_MAX: Final = 1_024
+"""Senders that a mailbox remembers; the one silent for longest is forgotten."""
+
+MS: Final = 1_000_000
+RESEND_FIRST_NS: Final = 500 * MS
+RESEND_MOST_NS: Final = 8_000 * MS
+"""Until an unanswered message is sent again; doubled each time, and from the beginning when the link comes back."""
+
+
+# --- Sending ----------------------------------------------------------------------------------------------------------
+
+
+class Waiting(Struct, frozen=True):
+    """A posted message. ``until_ns``: its deadline; None: it has none."""
+
+    envelope: Envelope
+    until_ns: int | None = None
+
+
+class Outgoing(Struct):
+    """What an outbox keeps."""
+
+    boot: int
+    seq: int = 0
+    waiting: list[Waiting] = []
+
+
+class Outbox:
+    """What one sender has to tell one receiver."""
+
+    def __init__(self, sender: str, boot: int, kept: Outgoing | None = None) -> None:
+        """
+        Args:
+            boot: of a sender that keeps nothing: greater than in all its lives before. With ``kept`` its own goes on.
+        """
+        self._sender = sender
+        self._boot = kept.boot if kept is not None else boot
+        self._seq = kept.seq if kept is not None else 0
+        self._sent = deque(kept.waiting if kept is not None else ())
+        """May have arrived: all that was kept, too, as it may have left after the commit."""
+        self._unsent: deque[Waiting] = deque()
+        self._free = self._seq
+        self._is_connected = True
+        self._again_ns: int | None = 0 if self._sent else None
+        self._pause_ns = RESEND_FIRST_NS
+
+    def __len__(self) -> int:
+        return len(self._sent) + len(self._unsent)
+
+    def kept(self) -> Outgoing:
+        """What must be kept with the state of the program that posts."""
+        return Outgoing(self._boot, self._seq, [*self._sent, *self._unsent])
+
+    def post(self, envelope: Envelope, now_ns: int) -> Envelope:
+        """Take a message; it leaves after the next `committed`.
+
+        Returns:
+            It with its number; with an ``id`` if it had none.
+
+        Raises:
+            MailboxFullError: `WINDOW` wait already.
+        """
+        if len(self) >= WINDOW:
+            raise MailboxFullError(f"{len(self)} messages to {envelope.to} wait, and that is the limit; try again later")
+        self._seq += 1
+        name = envelope.id or f"{self._sender}-{self._boot:x}-{self._seq}"
+        envelope = msgspec.structs.replace(envelope, sender=self._sender, boot=self._boot, seq=self._seq, id=name)
+        until_ns = None if envelope.deadline_ms is None else now_ns + int(envelope.deadline_ms * MS)
+        self._unsent.append(Waiting(envelope, until_ns))
+        return envelope
+
+    def committed(self) -> None:
+        """All that was posted so far is kept, and may leave."""
+        self._free = self._seq
+
+    def connected(self, now_ns: int) -> None:
+        """The link stands again: what may not have arrived is sent again, in order, at once."""
+        self._is_connected, self._again_ns, self._pause_ns = True, now_ns, RESEND_FIRST_NS
+
+    def disconnected(self) -> None:
+        """The link is cut: messages wait."""
+        self._is_connected = False
+
+    def next_ns(self) -> int | None:
+        """When `due` or `expired` has something without anything else happening; None: never."""
+        times = [one.until_ns for one in self._unsent if one.until_ns is not None]
+        if self._is_connected and self._sent and self._again_ns is not None:
+            times.append(self._again_ns)
+        return min(times, default=None)
+
+    def due(self, now_ns: int) -> list[Envelope]:
+        """What is to be sent now, in order."""
+        if not self._is_connected:
+            return []
+        found: list[Envelope] = []
+        if self._again_ns is not None and now_ns >= self._again_ns:
+            after = 0
+            for one in self._sent:
+                found.append(_as_sent(one, after, now_ns))
+                after = one.envelope.seq if one.envelope.reliable else after
+            self._sent = deque(one for one in self._sent if one.envelope.reliable)
+            self._again_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, RESEND_MOST_NS)
+        while self._unsent and self._unsent[0].envelope.seq <= self._free:
+            one = self._unsent.popleft()
+            found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, now_ns))
+            if one.envelope.reliable:
+                self._sent.append(one)
+        if self._again_ns is None and self._sent:
+            self._again_ns = now_ns + self._pause_ns
+        return found
+
+    def answered(self, answer: Envelope) -> bool:
+        """Whether this is the first final answer to one of our reliable messages; ``busy`` is none: it is sent again."""
+        if answer.boot != self._boot or (answer.error is not msgspec.UNSET and answer.error.kind == "busy"):
+            return False
+        for place, one in enumerate(self._sent):
+            if one.envelope.seq == answer.seq:
+                del self._sent[place]
+                self._pause_ns = RESEND_FIRST_NS
+                if not self._sent:
+                    self._again_ns = None
+                return True
+        return False
+
+    def expired(self, now_ns: int) -> list[Envelope]:
+        """Answers to messages whose deadline passed before they left. One that left is answered by its receiver, who knows."""
+        late = [one for one in self._unsent if one.until_ns is not None and one.until_ns <= now_ns]
+        if late:
+            self._unsent = deque(one for one in self._unsent if one not in late)
+        return [
+            refusal(one.envelope, "expired", "its deadline passed while it waited to be sent; it was not handled") for one in late
+        ]
+
+
+def _as_sent(one: Waiting, after: int, now_ns: int) -> Envelope:
+    """With what is left of its time: the receiver counts it by its own clock."""
+    left_ms = None if one.until_ns is None else max(one.until_ns - now_ns, 0) / MS
+    return msgspec.structs.replace(one.envelope, after=after, deadline_ms=left_ms)
+
+
+# --- Receiving --------------------------------------------------------------------------------------------------------
+
+
+class Stream(Struct):
+    """What a mailbox keeps of one sender.
+
+    Attributes:
+        last: the highest number handled. reliable: the highest of a reliable one.
+        answers: to the last reliable ones, by number.
+    """
+
+    boot: int
+    last: int = 0
+    reliable: int = 0
+    answers: dict[int, Envelope] = {}
+
+
+class Taken(Struct):
+    """Up to where messages of one sender's life were taken into the mailbox; lost with the process. ``held``: came too early."""
+
+    boot: int
+    last: int = 0
+    reliable: int = 0
+    held: list[Envelope] = []
+
+
+class Arrived(Struct):
+    """A message that waits. ``until_ns``: its deadline by the receiver's clock."""
+
+    envelope: Envelope
+    until_ns: int | None
+
+
+class Mailbox:
+    """The messages of one actor, which handles one at a time."""
+
+    def __init__(self, kept: Mapping[str, Stream] | None = None) -> None:
+        self._streams = OrderedDict(
+            (sender, Stream(one.boot, one.last, one.reliable, dict(one.answers))) for sender, one in (kept or {}).items()
+        )
+        self._taken = {sender: Taken(one.boot, one.last, one.reliable) for sender, one in self._streams.items()}
+        self._queue: deque[Arrived] = deque()
+        self._held = 0
+        self._answers: list[Envelope] = []
+        self._free = {sender: one.reliable for sender, one in self._streams.items()}
+
+    def __len__(self) -> int:
+        return len(self._queue) + self._held
+
+    def kept(self) -> dict[str, Stream]:
+        """What must be kept with the effects of the messages that are done."""
+        return {sender: Stream(one.boot, one.last, one.reliable, dict(one.answers)) for sender, one in self._streams.items()}
+
+    # --- A message arrives ------------------------------------------------------------------------------------------------
+
+    def arrived(self, envelope: Envelope, now_ns: int) -> list[Envelope]:
+        """Take in a message; answers that are to be sent at once: one given before, or that there is no room."""
+        if not envelope.seq or not envelope.sender:  # by hand: nothing is promised
+            return self._queued(envelope, now_ns)
+        taken = self._taken.get(envelope.sender)
+        if taken is None or envelope.boot > taken.boot:
+            self._held -= len(taken.held) if taken is not None else 0
+            taken = self._taken[envelope.sender] = Taken(envelope.boot)
+        if envelope.boot < taken.boot:
+            return []
+        if envelope.seq <= taken.last:
+            return self._again(envelope)
+        if envelope.after > taken.reliable:
+            return self._hold(taken, envelope)
+        answers = self._accept(taken, envelope, now_ns)
+        while following := next((one for one in taken.held if one.after <= taken.reliable), None):
+            taken.held.remove(following)
+            self._held -= 1
+            if following.seq > taken.last:
+                answers += self._accept(taken, following, now_ns)
+        return answers
+
+    def _queued(self, envelope: Envelope, now_ns: int) -> list[Envelope]:
+        if len(self) >= MAILBOX_MAX:
+            return [refusal(envelope, "busy", f"{MAILBOX_MAX} messages wait; retry later")]
+        until_ns = None if envelope.deadline_ms is None else now_ns + int(envelope.deadline_ms * MS)
+        self._queue.append(Arrived(envelope, until_ns))
+        return []
+
+    def _accept(self, taken: Taken, envelope: Envelope, now_ns: int) -> list[Envelope]:
+        refused = self._queued(envelope, now_ns)
+        if not refused:
+            taken.last = envelope.seq
+            if envelope.reliable:
+                taken.reliable = envelope.seq
+        return refused
+
+    def _again(self, envelope: Envelope) -> list[Envelope]:
+        """One that was taken before: its answer, once what it did is kept."""
+        stream = self._streams.get(envelope.sender)
+        if stream is None or stream.boot != envelope.boot or envelope.seq > self._free.get(envelope.sender, 0):
+            return []
+        answer = stream.answers.get(envelope.seq)
+        return [] if answer is None else [answer]
+
+    def _hold(self, taken: Taken, envelope: Envelope) -> list[Envelope]:
+        if len(taken.held) < HELD_MAX and len(self) < MAILBOX_MAX and all(one.seq != envelope.seq for one in taken.held):
+            taken.held.append(envelope)
+            taken.held.sort(key=_seq)
+            self._held += 1
+        return []
+
+    # --- A message is handled ---------------------------------------------------------------------------------------------
+
+    def take(self, now_ns: int) -> Envelope | None:
+        """The next message to handle, then to be told `done`; None: there is none. Those past their deadline are answered."""
+        while self._queue:
+            one = self._queue.popleft()
+            if one.until_ns is None or now_ns < one.until_ns:
+                return one.envelope
+            self._expire(one.envelope)
+        return None
+
+    def first(self) -> Envelope | None:
+        """What `take` would look at next; it stays."""
+        return self._queue[0].envelope if self._queue else None
+
+    def take_same(self, verb: str, now_ns: int) -> Envelope | None:
+        """The next message to handle, if it has this verb; None: it has another one, or there is none."""
+        while self._queue and self._queue[0].envelope.verb == verb:
+            one = self._queue.popleft()
+            if one.until_ns is None or now_ns < one.until_ns:
+                return one.envelope
+            self._expire(one.envelope)
+        return None
+
+    def _expire(self, envelope: Envelope) -> None:
+        self.done(envelope, refusal(envelope, "expired", "its deadline passed while it waited; it was not handled"))
+
+    def done(self, envelope: Envelope, answer: Envelope) -> None:
+        """A message was handled, with this answer; it leaves after the next `committed`."""
+        self._answers.append(answer)
+        if not envelope.seq or not envelope.sender:
+            return
+        stream = self._streams.get(envelope.sender)
+        if stream is None or envelope.boot > stream.boot:
+            stream = self._streams[envelope.sender] = Stream(envelope.boot, answers={})
+            self._free.pop(envelope.sender, None)
+        self._streams.move_to_end(envelope.sender)
+        if envelope.boot == stream.boot:
+            stream.last = envelope.seq
+            if envelope.reliable:
+                stream.reliable = envelope.seq
+                stream.answers[envelope.seq] = answer
+                if len(stream.answers) > WINDOW:
+                    del stream.answers[next(iter(stream.answers))]
+        if len(self._streams) > SENDERS_MAX:
+            sender, _ = self._streams.popitem(last=False)
+            self._free.pop(sender, None)
+            taken = self._taken.pop(sender, None)
+            self._held -= len(taken.held) if taken is not None else 0
+
+    def committed(self) -> list[Envelope]:
+        """All that is done is kept: the answers that may leave now."""
+        answers, self._answers = self._answers, []
+        for answer in answers:
+            stream = self._streams.get(answer.to)
+            if stream is not None and stream.boot == answer.boot and answer.seq in stream.answers:
+                self._free[answer.to] = answer.seq
+        return answers
+
+
+def _seq(envelope: Envelope) -> int:
+    return envelope.seq

@@ -1,0 +1,274 @@
+"""What a driver does with messages, one at a time and in order; the sockets are `failover.drivers.server`'s.
+
+    came → mailbox → (paced) → method → answer
+
+A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_path`` where a message spent its time here,
+``_subscribe`` and ``_unsubscribe`` begin and end a stream.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+from msgspec import UNSET, Struct
+
+from failover.core.messaging import envelope as envelopes
+from failover.core.messaging.envelope import Envelope, Hop, answer, refusal
+from failover.core.messaging.mailbox import SENDERS_MAX, Mailbox
+from failover.core.messaging.pacing import SECOND, Pace, merged
+from failover.core.naming import names
+from failover.core.naming.names import Kind
+from failover.drivers.declare import Declaration, Verb
+from failover.errors import EnvelopeError, NameFormatError
+
+PATHS_MAX: Final = 4_096
+"""Messages whose way is remembered, for ``failover path``."""
+
+SUBSCRIBERS_MAX: Final = 256
+LEASE_NS: Final = 10 * SECOND
+"""How long a stream is sent without a new ``_subscribe``."""
+
+log = logging.getLogger("failover.drivers")
+
+Whose = Hashable
+"""The way back to who sent a message, as the sockets know it."""
+
+Publish = Callable[[Whose, Envelope], bool]
+"""Called with (whose, message): send it if that one takes it now; False: it is gone."""
+
+
+class Subscriber(Struct):
+    """One who gets a stream. ``until_ns``: unless it asks again."""
+
+    whose: Whose
+    verb: Verb
+    to: str
+    until_ns: int
+
+
+class Actor:
+    """One driver: its mailbox, its pace, its streams. Every instant is an argument."""
+
+    def __init__(self, instance: object, declaration: Declaration, who: str) -> None:
+        """
+        Args:
+            who: of this process in hops: ``robot1/NAME``.
+        """
+        self._instance = instance
+        self._declaration = declaration
+        self._who = who
+        self._mailbox = Mailbox()
+        self._pace = Pace(declaration.rate_hz)
+        self._paths: OrderedDict[str, tuple[Hop, ...]] = OrderedDict()
+        self._meant: dict[str, bool] = {}
+        self._subscribers: dict[tuple[Whose, str], Subscriber] = {}
+        self._samples_ns: dict[str, int] = {}
+        self._own: Mapping[str, Callable[[Envelope, int], Any]] = {
+            "_describe": self._describe,
+            "_path": self._path,
+            "_subscribe": self._subscribe,
+            "_unsubscribe": self._unsubscribe,
+        }
+        self._routes: OrderedDict[str, Whose] = OrderedDict()
+
+    def came(self, envelope: Envelope, whose: Whose, now_ns: int) -> list[Envelope]:
+        """Take in a message; answers that leave at once."""
+        if not envelope.sender:
+            envelope = msgspec.structs.replace(envelope, sender=f"by-hand-{hash(whose) & 0xFFFFFFFF:08x}")
+        self._routes[envelope.sender] = whose
+        if len(self._routes) > SENDERS_MAX:
+            self._routes.popitem(last=False)
+        if not self._is_meant(envelope.to):
+            here = f"this is {self._declaration.path}, and not {envelope.to}: look the name up anew"
+            return [refusal(envelope, "wrong_driver", here)]
+        try:
+            envelope = envelopes.came(envelope, self._who, now_ns)
+        except EnvelopeError as error:
+            return [refusal(envelope, "circle", str(error))]
+        return self._mailbox.arrived(envelope, now_ns)
+
+    def route(self, sender: str) -> Whose | None:
+        """The way back to a sender; None: it is forgotten."""
+        return self._routes.get(sender)
+
+    def _is_meant(self, to: str) -> bool:
+        """Whether a name is this driver's; an address is: the message has come there."""
+        found = self._meant.get(to)
+        if found is None:
+            found = not to or self._is_name(to)
+            if len(self._meant) < PATHS_MAX:
+                self._meant[to] = found
+        return found
+
+    def _is_name(self, to: str) -> bool:
+        try:
+            name = names.parse(to)
+        except NameFormatError:
+            return False
+        return name.kind is Kind.ADDRESS or name.text in (self._declaration.path, *self._declaration.aliases)
+
+    # --- Handling ---------------------------------------------------------------------------------------------------------
+
+    def wait_ns(self, now_ns: int) -> int | None:
+        """How long until something is to be done although nothing comes; 0: at once; None: for ever."""
+        waits = [max(sample_ns - now_ns, 0) for sample_ns in self._samples_ns.values()]
+        if (first := self._mailbox.first()) is not None:
+            waits.append(self._pace.wait_ns(now_ns) if self._is_paced(first) else 0)
+        return min(waits, default=None)
+
+    def _is_paced(self, envelope: Envelope) -> bool:
+        verb = self._declaration.verbs.get(envelope.verb)
+        return verb is not None and verb.marked.role == "command"
+
+    def handle(self, clock: Callable[[], int]) -> list[Envelope]:
+        """Carry out the next message, if there is one and it is its turn; answers that leave now."""
+        now_ns = clock()
+        first = self._mailbox.first()
+        if first is None or (self._is_paced(first) and self._pace.wait_ns(now_ns)):
+            return []
+        message = self._mailbox.take(now_ns)
+        if message is None:
+            return self._mailbox.committed()
+        run = [message]
+        if self._is_paced(message):
+            self._pace.begun(now_ns)
+            if self._declaration.verbs[message.verb].marked.coalesce == "latest":
+                while (following := self._mailbox.take_same(message.verb, now_ns)) is not None:
+                    run.append(following)
+        said = self._carried_out(run)
+        left_ns = clock()
+        for replaced in run[:-1]:
+            self._done(replaced, _as_merged(replaced, said), left_ns)
+        self._done(run[-1], said, left_ns)
+        return self._mailbox.committed()
+
+    def _done(self, message: Envelope, said: Envelope, left_ns: int) -> None:
+        hops = envelopes.left_hops(message, left_ns)
+        if message.id:
+            self._paths[message.id] = hops
+            if len(self._paths) > PATHS_MAX:
+                self._paths.popitem(last=False)
+        self._mailbox.done(message, msgspec.structs.replace(said, hops=hops))
+
+    def _carried_out(self, run: Sequence[Envelope]) -> Envelope:
+        message = merged(run) if len(run) > 1 else run[0]
+        if own := self._own.get(message.verb):
+            return answer(message, own(message, message.hops[-1].came_ns))
+        verb = self._declaration.verbs.get(message.verb)
+        if verb is None:
+            known = ", ".join(self._declaration.verbs)
+            return refusal(message, "unknown_verb", f"{self._declaration.path} has no verb {message.verb[:64]!r}; it has {known}")
+        try:
+            arguments = _arguments(verb, message.body)
+        except (msgspec.ValidationError, TypeError) as error:
+            return refusal(message, "bad_body", f"the body of {verb.name} is not as declared: {error}")
+        return self._called(verb, arguments, message)
+
+    def _called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
+        try:
+            return answer(message, _plain(getattr(self._instance, verb.name)(**arguments)))
+        except EnvelopeError as error:
+            return refusal(
+                message, "bad_result", f"{verb.name} was carried out, and no message can say what it returned: {error}"
+            )
+        except Exception as error:
+            log.warning("%s of %s failed", verb.name, self._declaration.path, exc_info=error)
+            return refusal(message, "failed", f"{verb.name} failed: {type(error).__name__}: {error}")
+
+    # --- The driver's own verbs -------------------------------------------------------------------------------------------
+
+    def _describe(self, _: Envelope, __: int) -> Any:
+        return {"path": self._declaration.path, "aliases": list(self._declaration.aliases), "verbs": self._declaration.schemas()}
+
+    def _path(self, message: Envelope, _: int) -> Any:
+        """The hops of a message that was carried out; None: this driver does not remember it."""
+        wanted = message.body.get("id") if isinstance(message.body, dict) else None
+        hops = self._paths.get(wanted) if isinstance(wanted, str) else None
+        return None if hops is None else [[hop.who, hop.came, hop.left] for hop in hops]
+
+    def _subscribe(self, message: Envelope, now_ns: int) -> Any:
+        """Send a stream to who asks, for `LEASE_NS`; what comes of it: the rate, or None without such a stream."""
+        name = message.body.get("stream") if isinstance(message.body, dict) else None
+        verb = self._declaration.verbs.get(name) if isinstance(name, str) else None
+        whose = self._routes.get(message.sender)
+        if verb is None or verb.marked.role != "stream" or whose is None:
+            return None
+        key = (whose, verb.name)
+        if key in self._subscribers or len(self._subscribers) < SUBSCRIBERS_MAX:
+            self._subscribers[key] = Subscriber(whose, verb, message.sender, now_ns + LEASE_NS)
+            self._samples_ns.setdefault(verb.name, now_ns)
+        return verb.marked.rate_hz if key in self._subscribers else None
+
+    def _unsubscribe(self, message: Envelope, _: int) -> Any:
+        whose = self._routes.get(message.sender)
+        for key in [key for key in self._subscribers if key[0] == whose]:
+            del self._subscribers[key]
+        return None
+
+    # --- Streams ----------------------------------------------------------------------------------------------------------
+
+    def sample(self, publish: Publish, clock: Callable[[], int]) -> None:
+        """Send the streams that are due to those that have subscribed."""
+        now_ns = clock()
+        for name in [name for name, due_ns in self._samples_ns.items() if due_ns <= now_ns]:
+            those = [one for one in self._subscribers.values() if one.verb.name == name and now_ns < one.until_ns]
+            self._subscribers = {key: one for key, one in self._subscribers.items() if now_ns < one.until_ns}
+            if not those:
+                del self._samples_ns[name]
+                continue
+            period_ns = round(SECOND / those[0].verb.marked.rate_hz)
+            self._samples_ns[name] = max(self._samples_ns[name] + period_ns, now_ns)
+            said = self._called(those[0].verb, {}, Envelope(verb=name))
+            for one in those:
+                envelope = msgspec.structs.replace(said, to=one.to, verb=name, sender=self._declaration.path)
+                if not publish(one.whose, envelope):
+                    self._subscribers.pop((one.whose, name), None)
+
+
+def _as_merged(replaced: Envelope, said: Envelope) -> Envelope:
+    """The answer to a message that became part of a later one: which one that is, or why that failed."""
+    if said.error is UNSET:
+        return answer(replaced, {"merged_into": said.re})
+    return refusal(replaced, said.error.kind, said.error.sentence)
+
+
+def _arguments(verb: Verb, body: Any) -> Mapping[str, Any]:
+    """The body as a method's arguments; what is no table is the only argument of one that has just one.
+
+    Raises:
+        msgspec.ValidationError: it does not fit.
+    """
+    fields = verb.arguments.__struct_fields__
+    if body is UNSET or body is None:
+        body = {}
+    elif not isinstance(body, dict) and len(fields) == 1:
+        body = {fields[0]: body}
+    made = msgspec.convert(body, verb.arguments)
+    return {name: getattr(made, name) for name in fields}
+
+
+def _plain(value: Any) -> Any:
+    """A result as JSON can say it.
+
+    Raises:
+        EnvelopeError: JSON cannot.
+    """
+    if value is None or value is True or value is False:
+        return value
+    try:
+        found = msgspec.to_builtins(value, enc_hook=_of_arrays, str_keys=True)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise EnvelopeError(str(error)) from error
+    envelopes.check(found)
+    return found
+
+
+def _of_arrays(value: Any) -> Any:
+    """Arrays and numbers of numpy."""
+    if callable(listed := getattr(value, "tolist", None)):
+        return listed()
+    raise TypeError(f"{type(value).__name__} is no value of JSON")

@@ -1,0 +1,234 @@
+"""A driver as a class: its path, and which of its methods are commands, queries and streams.
+
+@failover.driver("University/Lab/Robotino/Engines/3/PWM", alias="engine", rate_hz=20)
+class Pwm:
+    duty = 0.0
+
+    @failover.command(coalesce="latest")
+    def set(self, duty: float) -> None: ...
+
+    @failover.query
+    def read(self) -> dict[str, float]: ...
+
+    @failover.stream(rate_hz=10)
+    def current(self) -> float: ...
+
+failover.run(Pwm)
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Literal, TypeVar, overload
+
+import msgspec
+from msgspec import Struct
+
+from failover.core.messaging.pacing import Coalesce
+from failover.core.naming import names
+from failover.errors import DriverError, NameFormatError
+from failover.task.component import DECLARED, RUNNER, kept_of
+
+C = TypeVar("C")
+F = TypeVar("F", bound=Callable[..., Any])
+
+VERB: Final = "__failover_verb__"
+DRIVER: Final = "__failover_driver__"
+
+RATE_HZ_MAX: Final = 10_000.0
+"""Above it the loop of a driver is the limit."""
+
+VERB_SIZE_MAX: Final = 64
+VERBS_MAX: Final = 64
+
+Role = Literal["command", "query", "stream"]
+
+
+class Marked(Struct, frozen=True):
+    """What a decorator says about a method.
+
+    Attributes:
+        role: command: goes to the device, paced; query: answers at once; stream: is called ``rate_hz`` times a second for those
+            that have subscribed.
+    """
+
+    role: Role
+    coalesce: Coalesce = "queue"
+    rate_hz: float = 0
+
+
+class Verb(Struct, frozen=True):
+    """One verb of a driver. ``arguments``: a Struct of the method's arguments; what does not fit it is refused."""
+
+    name: str
+    marked: Marked
+    arguments: type[Struct]
+
+
+class Declaration(Struct, frozen=True):
+    """What `driver` was told about a class."""
+
+    path: str
+    aliases: tuple[str, ...]
+    rate_hz: float | None
+    verbs: Mapping[str, Verb]
+    labels: Mapping[str, str]
+
+    def schemas(self) -> dict[str, Any]:
+        """Verb → role, and the JSON schema of its arguments, for the record."""
+        return {one.name: {"role": one.marked.role} | _schema(one.arguments) for one in self.verbs.values()}
+
+
+@overload
+def command(function: F, /) -> F: ...
+@overload
+def command(*, coalesce: Coalesce = ...) -> Callable[[F], F]: ...
+def command(function: Any = None, /, *, coalesce: Coalesce = "queue") -> Any:
+    """A method that makes the device do something; at most ``rate_hz`` of the driver are carried out in a second.
+
+    Args:
+        coalesce: ``queue``: each waits its turn; ``latest``: those in a row that wait become one, later fields win.
+    """
+    if coalesce not in typing.get_args(Coalesce):
+        raise DriverError(f"coalesce={coalesce!r} is none of {', '.join(typing.get_args(Coalesce))}")
+    return _marker(function, Marked("command", coalesce), "command")
+
+
+def query(function: F, /) -> F:
+    """A method that tells something and changes nothing; it is never paced, but waits for commands that came before."""
+    return _marker(function, Marked("query"), "query")  # type: ignore[no-any-return]
+
+
+def stream(*, rate_hz: float) -> Callable[[F], F]:
+    """A method without arguments whose value is sent to all that have subscribed, so many times a second."""
+    _check_rate(rate_hz)
+    return _marker(None, Marked("stream", rate_hz=rate_hz), "stream")  # type: ignore[no-any-return]
+
+
+def _marker(function: Any, marked: Marked, word: str) -> Any:
+    def mark(chosen: F) -> F:
+        setattr(chosen, VERB, marked)
+        return chosen
+
+    if function is None:
+        return mark
+    if not inspect.isfunction(function):
+        raise DriverError(f"@failover.{word} is above no method: {function!r}")
+    return mark(function)
+
+
+def driver(
+    path: str,
+    /,
+    *,
+    alias: str | tuple[str, ...] = (),
+    rate_hz: float | None = None,
+    labels: Mapping[str, str] | None = None,
+) -> Callable[[type[C]], type[C]]:
+    """Declare a class that speaks for one device; `failover.run` runs it.
+
+    Args:
+        path: where the device is in the team's tree of names: ``University/Lab/Robotino/Engines/3/PWM``.
+        alias: one free text or several by which it may be called, too.
+        rate_hz: the most commands a second that the device takes; None: as many as come.
+        labels: whatever others may want to know.
+
+    Raises:
+        DriverError: the class or an argument cannot work.
+    """
+    aliases = (alias,) if isinstance(alias, str) else tuple(alias)
+    try:
+        normal, aliases = names.path(path), tuple(names.alias(one) for one in aliases)
+    except NameFormatError as error:
+        raise DriverError(f"cannot declare a driver: {error}") from error
+    if rate_hz is not None:
+        _check_rate(rate_hz)
+
+    def declared(chosen: type[C]) -> type[C]:
+        if not isinstance(chosen, type):
+            raise DriverError(f"@failover.driver is above {chosen!r}, which is no class")
+        if hasattr(chosen, DECLARED) or kept_of(chosen):
+            raise DriverError(
+                f"{chosen.__name__} keeps attributes (failover.kept), and a driver keeps none yet: what it knows ends with it"
+            )
+        verbs = _verbs(chosen)
+        if not verbs:
+            raise DriverError(f"{chosen.__name__} has no verb: write @failover.command or @failover.query above a method")
+        setattr(chosen, DRIVER, Declaration(normal, aliases, rate_hz, verbs, dict(labels or {})))
+        setattr(chosen, RUNNER, "failover.drivers.server:run")
+        return chosen
+
+    return declared
+
+
+def declaration_of(cls: type) -> Declaration:
+    """What was declared.
+
+    Raises:
+        DriverError: nothing was.
+    """
+    found = getattr(cls, DRIVER, None)
+    if not isinstance(found, Declaration):
+        raise DriverError(f"{cls.__name__} is no driver: write @failover.driver(path) above it")
+    return found
+
+
+def _verbs(cls: type) -> dict[str, Verb]:
+    found: dict[str, Verb] = {}
+    for origin in reversed(cls.__mro__):
+        for name, function in vars(origin).items():
+            marked = getattr(function, VERB, None)
+            if isinstance(marked, Marked):
+                if name.startswith("_") or len(name.encode()) > VERB_SIZE_MAX:
+                    raise DriverError(f"{cls.__name__}.{name} cannot be a verb: it begins with _, or is too long")
+                found[name] = Verb(name, marked, _arguments(cls, name, function, marked))
+    if len(found) > VERBS_MAX:
+        raise DriverError(f"{cls.__name__} has {len(found)} verbs, {VERBS_MAX} are the most")
+    return found
+
+
+def _arguments(cls: type, name: str, function: Callable[..., Any], marked: Marked) -> type[Struct]:
+    """The arguments of a method as a Struct.
+
+    Raises:
+        DriverError: an argument has no name or no type that a message can say.
+    """
+    try:
+        hints = typing.get_type_hints(function, include_extras=True)
+    except NameError as error:
+        raise DriverError(
+            f"{cls.__name__}.{name}: its annotations name {error.name}, which is not there; import it outright"
+        ) from error
+    fields: list[Any] = []
+    for one in list(inspect.signature(function).parameters.values())[1:]:
+        if one.kind in (one.POSITIONAL_ONLY, one.VAR_POSITIONAL, one.VAR_KEYWORD):
+            raise DriverError(f"{cls.__name__}.{name}: {one} cannot be in a message; give each argument a name of its own")
+        kind = hints.get(one.name, Any)
+        fields.append((one.name, kind) if one.default is one.empty else (one.name, kind, one.default))
+    if fields and marked.role == "stream":
+        raise DriverError(f"{cls.__name__}.{name} is a stream, and takes no argument")
+    try:
+        made = msgspec.defstruct(name, fields, forbid_unknown_fields=True, kw_only=True)
+        msgspec.json.Decoder(made)
+    except TypeError as error:
+        raise DriverError(f"{cls.__name__}.{name} has an argument that no message can say: {error}") from error
+    return made
+
+
+def _schema(arguments: type[Struct]) -> dict[str, Any]:
+    """Name → JSON schema of each argument; {} where there is none for a type."""
+    try:
+        _, components = msgspec.json.schema_components([arguments])
+    except TypeError:
+        return {}
+    properties = components[arguments.__name__].get("properties", {}) if arguments.__name__ in components else {}
+    return {
+        "arguments": {name: {key: value for key, value in one.items() if key != "default"} for name, one in properties.items()}
+    }
+
+
+def _check_rate(rate_hz: float) -> None:
+    if not 0 < rate_hz <= RATE_HZ_MAX:
+        raise DriverError(f"rate_hz={rate_hz} is no rate: write a number above 0, at most {RATE_HZ_MAX:.0f}")

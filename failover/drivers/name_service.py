@@ -1,0 +1,130 @@
+"""The name service of one driver: a thread that registers it, and knows all names that others have registered."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from typing import Final
+
+from failover.boards import boottime
+from failover.core.naming.records import Record
+from failover.core.naming.scan import MULTICAST, Scan, Send, Terms
+from failover.core.naming.tree import Place, Tree, robot_of
+from failover.drivers.exchange import DOOR_RETRY_NS, ENDING, Exchange
+from failover.drivers.here import Here, stem
+
+BOOT_SHIFT: Final = 20
+"""A boot is the wall clock in ns, shifted: it grows each millisecond. If the clock was set back, the scan mends it."""
+
+
+FAREWELL_NS: Final = 50_000_000
+"""How long a driver that ends answers those that ask what has changed."""
+
+
+def new_boot() -> int:
+    """Greater than in all lives before, unless the wall clock was set back."""
+    return time.time_ns() >> BOOT_SHIFT
+
+
+class NameService:
+    """Registers one record as long as it is open. `resolve` and `tree` may be called from any thread."""
+
+    def __init__(self, here: Here, record: Record, terms: Terms = Terms()) -> None:  # noqa: B008  frozen
+        """
+        Raises:
+            NameFormatError: the record cannot be registered.
+            DriverError: the sockets cannot be made.
+        """
+        name = stem(record.path, here.directory)
+        self._exchange = Exchange(here, f"{name}.{ENDING}")
+        self._lock = threading.Lock()
+        self._skew = boottime.skew_ns()
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._is_over = False
+        self._told: dict[str, tuple[int, int]] = {}
+        self._scan = Scan(
+            f"{here.robot}/{name}",
+            new_boot(),
+            self._now_ns(),
+            address=self._exchange.address,
+            seeds=[f"{robot}/" for robot in here.others],
+            multicast=True,
+            terms=terms,
+            claims=here.claims,
+        )
+        try:
+            self.record = self._scan.put(record, self._now_ns())
+        except BaseException:
+            self._close()
+            raise
+        self._thread = threading.Thread(target=self._serve, name="failover names", daemon=True)
+
+    def start(self) -> None:
+        """Tell the others."""
+        self._exchange.be_door(self._now_ns())
+        self._thread.start()
+
+    def tree(self) -> Tree:
+        """All names as this process knows them now."""
+        with self._lock:
+            return self._scan.tree(self._now_ns())
+
+    def resolve(self, name: str) -> Place:
+        """What answers to a name of any kind; raises as `Tree.resolve`."""
+        return self.tree().resolve(name)
+
+    def close(self) -> None:
+        """Withdraw the record, and tell the others at once."""
+        self._is_over = True
+        os.eventfd_write(self._wake, 1)
+        if self._thread.is_alive():
+            self._thread.join()
+        self._close()
+
+    def _close(self) -> None:
+        self._exchange.close()
+        os.close(self._wake)
+
+    def _now_ns(self) -> int:
+        return boottime.now_ns(self._skew)
+
+    def _serve(self) -> None:
+        while not self._is_over:
+            now_ns = self._now_ns()
+            self._exchange.be_door(now_ns)
+            self._turn(now_ns, now_ns + DOOR_RETRY_NS)
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._wake)
+        with self._lock:
+            self._scan.remove(self.record.path, self._now_ns(), urgent=True)
+            until_ns = self._scan.next_ns() + FAREWELL_NS
+        while (now_ns := self._now_ns()) < until_ns:
+            self._turn(now_ns, until_ns)
+
+    def _turn(self, now_ns: int, until_ns: int) -> None:
+        """Scan if it is due; then take in what comes, once it comes, until the next scan at most."""
+        with self._lock:
+            sends = self._scan.tick(now_ns)
+            until_ns = min(until_ns, self._scan.next_ns())
+        self._exchange.send(sends)
+        messages = self._exchange.receive(until_ns - now_ns, self._wake if not self._is_over else -1)
+        for message in messages:
+            with self._lock:
+                sends = self._scan.heard(message, self._now_ns())
+            self._exchange.send(sends)
+        if messages and self._exchange.is_door:
+            self._pass_on()
+
+    def _pass_on(self) -> None:
+        """The door tells other robots at once what is new on this one, and this one's drivers what is new elsewhere."""
+        with self._lock:
+            versions = self._scan.versions()
+            news = {robot_of(origin) for origin, version in versions.items() if self._told.get(origin) != version}
+            self._told = versions
+            if self._exchange.here.robot in news:
+                self._scan.soon(self._now_ns())
+            digest = self._scan.digest(self._now_ns())
+        if news - {self._exchange.here.robot}:
+            self._exchange.send([Send(MULTICAST, digest)])

@@ -1,0 +1,236 @@
+"""ZeroMQ for programs: ipc on this robot, tcp between robots, there by CURVE alone. The only ``zmq`` import of ``failover``.
+
+A server with CURVE and without an answer to ZAP admits any key: `Gate` answers, and admits only the keys of the team file. No
+socket sends ZMTP heartbeats: one that comes while the receive queue is full ends the process (libzmq issue 4767).
+
+Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import zmq
+from zmq.utils import z85
+
+from failover.core.messaging.envelope import MESSAGE_SIZE_MAX
+from failover.drivers.here import Here
+from failover.errors import DriverError
+
+HIGH_WATER: Final = 1_000
+"""Messages of one connection inside ZeroMQ."""
+
+RECONNECT_FIRST_MS: Final = 50
+RECONNECT_MOST_MS: Final = 2_000
+
+RETRANSMIT_LIMIT_MS: Final = 3_000
+"""A connection whose bytes stay unacknowledged so long is dead (TCP_USER_TIMEOUT)."""
+
+HANDSHAKE_LIMIT_MS: Final = 5_000
+
+ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
+ZAP_DOMAIN: Final = b"failover"
+
+NOW: Final = zmq.NOBLOCK
+
+Context = zmq.Context[zmq.Socket[bytes]]
+Socket = zmq.Socket[bytes]
+
+
+class Poller:
+    """Waits for sockets and descriptors."""
+
+    def __init__(self) -> None:
+        self._poller = zmq.Poller()
+
+    def add(self, what: Socket | int, *, reading: bool = True, writing: bool = False) -> None:
+        """From now on it is waited for, until it can be read or written; or for neither."""
+        self._poller.register(what, reading * zmq.POLLIN | writing * zmq.POLLOUT)
+
+    def wait(self, timeout_ns: int | None) -> list[Socket | int]:
+        """Those that can be read or written, once there is one or the time is over."""
+        timeout_ms = None if timeout_ns is None else max(-(-timeout_ns // 1_000_000), 0)
+        return [what for what, _ in self._poller.poll(timeout_ms)]
+
+
+def context() -> Context:
+    """One of this process's own; its sockets belong to the thread that makes them."""
+    return zmq.Context()
+
+
+def close(context: Context) -> None:
+    """Close all sockets of a context; nothing lingers."""
+    context.destroy(linger=0)
+
+
+def listen_local(context: Context, path: str) -> Socket:
+    """Take messages of this robot's programs.
+
+    Raises:
+        DriverError: the file cannot be made.
+    """
+    return _bound(_limited(context.socket(zmq.ROUTER)), f"ipc://{path}")
+
+
+def listen_team(context: Context, here: Here, port: int = 0) -> tuple[Socket, str]:
+    """Take messages of the team's robots, each told apart by its key. Needs a `Gate` in the same context.
+
+    Args:
+        port: 0: any free one.
+
+    Returns:
+        The socket, and its address.
+
+    Raises:
+        DriverError: the address cannot be had.
+    """
+    socket = _limited(context.socket(zmq.ROUTER))
+    socket.curve_server = True
+    socket.curve_secretkey = here.secret.encode()
+    socket.zap_domain = ZAP_DOMAIN
+    _bound(socket, f"tcp://{bracketed(here.host)}:{port or '*'}")
+    return socket, socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+
+def connect(context: Context, address: str, here: Here, robot: str, *, queued: int = 0) -> Socket:
+    """A way to one process.
+
+    Args:
+        address: ``ipc://PATH``, or ``tcp://HOST:PORT`` of that robot.
+        queued: so many messages wait while there is no connection; 0: what is sent then is refused.
+    """
+    socket = _limited(context.socket(zmq.DEALER))
+    if queued:
+        socket.setsockopt(zmq.SNDHWM, queued)
+    else:
+        socket.setsockopt(zmq.IMMEDIATE, 1)
+    socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
+    if address.startswith("tcp://"):
+        if here.team is None or robot not in here.team.robots:
+            socket.close(0)
+            raise DriverError(f"cannot reach {address}: {here.alone or f'{robot} is not in team.toml'}")
+        socket.curve_publickey = here.public.encode()
+        socket.curve_secretkey = here.secret.encode()
+        socket.curve_serverkey = here.team.robots[robot].public_key.encode()
+    socket.connect(address)
+    return socket
+
+
+def has_message(socket: Socket) -> bool:
+    """Whether a listening socket has one more."""
+    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+
+
+def receive(socket: Socket, *, is_team: bool) -> tuple[bytes, bytes, str | None] | None:
+    """The next message of a listening socket: (whose, content, robot that its key proves); None: there is none.
+
+    A message of several parts is dropped: nothing of ours sends one.
+    """
+    while True:
+        try:
+            if not is_team:
+                parts = socket.recv_multipart(zmq.NOBLOCK)
+                if len(parts) == 2:
+                    return parts[0], parts[1], None
+                continue
+            frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)  # only frames say whose key it was
+        except zmq.Again:
+            return None
+        if len(frames) == 2:
+            return frames[0].bytes, frames[1].bytes, _user(frames[1])
+
+
+def _user(frame: zmq.Frame) -> str:
+    try:
+        return str(frame.get("User-Id"))
+    except (zmq.ZMQError, UnicodeDecodeError):
+        return ""
+
+
+def answer(socket: Socket, whose: bytes, content: bytes) -> bool:
+    """Send to one who has sent; False: it is gone, or takes nothing."""
+    try:
+        socket.send_multipart((whose, content), zmq.NOBLOCK)
+    except zmq.ZMQError:
+        return False
+    return True
+
+
+def send(socket: Socket, content: bytes) -> bool:
+    """Send by a way made with `connect`; False: there is no connection, or its queue is full."""
+    try:
+        socket.send(content, zmq.NOBLOCK)
+    except zmq.Again:
+        return False
+    return True
+
+
+def await_message(socket: Socket, timeout_ns: int) -> bytes | None:
+    """What comes by a way made with `connect`; None: nothing within the time."""
+    socket.setsockopt(zmq.RCVTIMEO, max(-(-timeout_ns // 1_000_000), 0))
+    try:
+        return socket.recv()
+    except zmq.Again:
+        return None
+
+
+def await_sent(socket: Socket, content: bytes, timeout_ns: int) -> bool:
+    """Send as soon as there is a connection; False: there was none within the time."""
+    if send(socket, content):
+        return True
+    return bool(socket.poll(max(-(-timeout_ns // 1_000_000), 0), zmq.POLLOUT)) and send(socket, content)
+
+
+class Gate:
+    """Admits the robots of the team, by their keys, to all CURVE sockets of one context."""
+
+    def __init__(self, context: Context, keys: Mapping[str, str]) -> None:
+        """
+        Args:
+            keys: robot → public key, Z85.
+        """
+        self._robots = {z85.decode(key.encode()): robot for robot, key in keys.items()}
+        self.socket = context.socket(zmq.REP)
+        self.socket.bind(ZAP_ADDRESS)
+        self.refused = 0
+
+    def serve(self) -> None:
+        """Answer what was asked; to be called when `socket` can be read."""
+        while True:
+            try:
+                version, request, _domain, _address, _identity, mechanism, *credentials = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            robot = self._robots.get(credentials[0], "") if mechanism == b"CURVE" and credentials else ""
+            self.refused += not robot
+            status = (b"200", b"OK", robot.encode()) if robot else (b"400", b"this key is not in team.toml", b"")
+            self.socket.send_multipart([version, request, *status, b""])
+
+
+def bracketed(host: str) -> str:
+    """A host as it stands before a port."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _limited(socket: Socket) -> Socket:
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+    socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+    socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_SIZE_MAX)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_LIMIT_MS)
+    socket.setsockopt(zmq.TCP_MAXRT, RETRANSMIT_LIMIT_MS)
+    socket.setsockopt(zmq.IPV6, 1)
+    if socket.type == zmq.ROUTER:
+        socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+    return socket
+
+
+def _bound(socket: Socket, address: str) -> Socket:
+    try:
+        socket.bind(address)
+    except zmq.ZMQError as error:
+        socket.close(0)
+        raise DriverError(f"cannot listen at {address}: {error.strerror}") from error
+    return socket

@@ -1,0 +1,314 @@
+"""What a mailbox promises holds over cuts, kills of both ends, and a takeover; in virtual time."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections import Counter
+from collections.abc import Callable
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from msgspec import UNSET
+
+from failover.core.messaging import mailbox
+from failover.core.messaging.envelope import Envelope, answer
+from failover.core.messaging.mailbox import MAILBOX_MAX, MS, WINDOW, Mailbox, Outbox
+from failover.errors import MailboxFullError
+
+
+class Sender:
+    """A program that counts, keeps its outbox with its count, and is killed now and then."""
+
+    def __init__(self, name: str, count: int, reliable_of: int) -> None:
+        self.name = name
+        self.count = count
+        self.reliable_of = reliable_of
+        self.posted = 0
+        self.outbox = Outbox(name, 1)
+        self.outbox.connected(0)
+        self.kept = (0, self.outbox.kept())
+        self.told: dict[int, str] = {}
+
+    def post(self, now_ns: int) -> None:
+        """As many as there is room for, up to eight; then commit."""
+        for _ in range(8):
+            if self.posted < self.count and len(self.outbox) < WINDOW:
+                self.posted += 1
+                reliable = self.posted % self.reliable_of == 0
+                deadline_ms = 30.0 if self.posted % 97 == 0 else None
+                self.outbox.post(Envelope("actor", "add", self.posted, reliable=reliable, deadline_ms=deadline_ms), now_ns)
+        self.commit()
+
+    def commit(self) -> None:
+        self.kept = (self.posted, self.outbox.kept())
+        self.outbox.committed()
+
+    def die(self, now_ns: int) -> None:
+        """Everything since the last commit is lost."""
+        self.posted, kept = self.kept
+        self.outbox = Outbox(self.name, 99, kept)
+        self.outbox.connected(now_ns)
+
+    @property
+    def is_done(self) -> bool:
+        return self.posted == self.count and not len(self.outbox)
+
+
+class Actor:
+    """A program whose state is the list of what it handled; it keeps the list with its mailbox."""
+
+    def __init__(self) -> None:
+        self.handled: list[tuple[str, int]] = []
+        self.mailbox = Mailbox()
+        self.kept = (0, self.mailbox.kept())
+
+    def work(self, now_ns: int, most: int) -> None:
+        for _ in range(most):
+            if (envelope := self.mailbox.take(now_ns)) is None:
+                return
+            self.handled.append((envelope.sender, envelope.body))
+            self.mailbox.done(envelope, answer(envelope, envelope.body))
+
+    def commit(self) -> list[Envelope]:
+        self.kept = (len(self.handled), self.mailbox.kept())
+        return self.mailbox.committed()
+
+    def die(self) -> None:
+        """As a kill, or as a takeover by a robot that has the last commit."""
+        count, kept = self.kept
+        del self.handled[count:]
+        self.mailbox = Mailbox(kept)
+
+
+class World:
+    """A network that delays, reorders, doubles, loses and is cut, between senders and one actor."""
+
+    def __init__(
+        self, seed: int, senders: int, count: int, *, loss: float = 0.05, double: float = 0.05, reliable_of: int = 1
+    ) -> None:
+        self.random = random.Random(seed)
+        self.senders = {f"s{number}": Sender(f"s{number}", count, reliable_of) for number in range(senders)}
+        self.actor = Actor()
+        self.now_ns = 0
+        self.loss, self.double = loss, double
+        self.cut: set[str] = set()
+        self.deaths: Counter[str] = Counter()
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._numbers = itertools.count()
+
+    def at(self, after_ns: int, act: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (self.now_ns + after_ns, next(self._numbers), act))
+
+    def carry(self, name: str, act: Callable[[], None]) -> None:
+        """One way of a message between a sender and the actor."""
+        if name in self.cut or self.random.random() < self.loss:
+            return
+        for _ in range(2 if self.random.random() < self.double else 1):
+            self.at(self.random.randrange(1, 4 * MS), lambda: None if name in self.cut else act())
+
+    def say(self, name: str) -> None:
+        sender = self.senders[name]
+        for late in sender.outbox.expired(self.now_ns):
+            sender.told[late.seq] = "expired"
+        for envelope in sender.outbox.due(self.now_ns):
+            self.carry(name, lambda one=envelope: self.hear(one))  # type: ignore[misc]
+
+    def hear(self, envelope: Envelope) -> None:
+        for one in self.actor.mailbox.arrived(envelope, self.now_ns):
+            self.reply(one)
+
+    def reply(self, one: Envelope) -> None:
+        self.carry(one.to, lambda: self.get(one))
+
+    def get(self, one: Envelope) -> None:
+        sender = self.senders[one.to]
+        if sender.outbox.answered(one):
+            sender.told[one.seq] = "ok" if one.error is UNSET else one.error.kind
+            assert one.error is not UNSET or one.ok == one.seq, "the answer of another message"
+
+    def step(self) -> None:
+        """A millisecond."""
+        until_ns = self.now_ns + MS
+        while self._events and self._events[0][0] <= until_ns:
+            self.now_ns, _, act = heapq.heappop(self._events)
+            act()
+        self.now_ns = until_ns
+        for name, sender in self.senders.items():
+            if sender.posted < sender.count:
+                sender.post(self.now_ns)
+            if len(sender.outbox):
+                self.say(name)
+        self.actor.work(self.now_ns, 200)
+        if self.random.random() < 0.5:
+            for one in self.actor.commit():
+                self.reply(one)
+
+    def trouble(self) -> None:
+        """Now and then one of: a cut that heals later, a death of a sender, a death of the actor."""
+        drawn = self.random.random()
+        name = self.random.choice(list(self.senders))
+        if drawn < 0.01 and name not in self.cut:
+            self.cut.add(name)
+            self.senders[name].outbox.disconnected()
+            self.at(self.random.randrange(1, 400) * MS, lambda: self.heal(name))
+        elif drawn < 0.02:
+            self.deaths["sender"] += 1
+            self.senders[name].die(self.now_ns)
+            if name in self.cut:
+                self.senders[name].outbox.disconnected()
+        elif drawn < 0.03:
+            self.deaths["actor"] += 1
+            self.actor.die()
+
+    def heal(self, name: str) -> None:
+        self.cut.discard(name)
+        self.senders[name].outbox.connected(self.now_ns)
+
+    def run(self, steps_max: int) -> None:
+        for _ in range(steps_max):
+            self.step()
+            self.trouble()
+            if all(sender.is_done for sender in self.senders.values()):
+                break
+        for one in list(self.cut):
+            self.heal(one)
+        for _ in range(60_000):
+            if all(sender.is_done for sender in self.senders.values()) and not self._events and not len(self.actor.mailbox):
+                return
+            self.step()
+        raise AssertionError({name: (one.posted, len(one.outbox)) for name, one in self.senders.items()})
+
+    def check(self) -> None:
+        for name, sender in self.senders.items():
+            handled = [number for one, number in self.actor.handled if one == name]
+            assert handled == sorted(handled), f"out of order: {name}"
+            assert len(set(handled)) == len(handled), f"handled twice: {name}"
+            there = set(handled)
+            for number in range(1, sender.count + 1):
+                if number % sender.reliable_of == 0:
+                    told = sender.told.get(number)
+                    assert told in ("ok", "expired"), f"{name} was told nothing of {number}: {told}"
+                    assert (told == "ok") == (number in there), f"{name} was told {told} of {number}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_ten_thousand_messages_of_ten_senders_over_cuts_kills_of_both_ends_and_takeovers() -> None:
+    world = World(1, 10, 1_000, loss=0.0002, double=0.01)
+    world.run(1_000_000)
+    world.check()
+    assert world.deaths["sender"] > 5 and world.deaths["actor"] > 5
+    assert sum(len(sender.told) for sender in world.senders.values()) == 10_000
+
+
+@pytest.mark.timeout(600)
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.integers(0, 1 << 32), st.integers(1, 3), st.sampled_from([0.0, 0.1, 0.4]), st.sampled_from([1, 2, 5]))
+def test_order_and_once_hold_in_any_run(seed: int, senders: int, loss: float, reliable_of: int) -> None:
+    world = World(seed, senders, 60, loss=loss, double=loss, reliable_of=reliable_of)
+    world.run(200)
+    world.check()
+
+
+def test_queued_over_an_outage_they_arrive_in_order_or_their_sender_is_told_that_they_expired() -> None:
+    outbox, box = Outbox("s", 1), Mailbox()
+    outbox.disconnected()
+    for number in range(1, 5):
+        deadline_ms = 50.0 if number == 2 else None
+        outbox.post(Envelope("actor", "add", number, reliable=number % 2 == 0, deadline_ms=deadline_ms), 0)
+    outbox.committed()
+    assert outbox.due(60_000 * MS) == []
+    (late,) = outbox.expired(60_000 * MS)
+    assert (late.seq, late.error.kind) == (2, "expired")  # type: ignore[union-attr]
+    outbox.connected(60_000 * MS)
+    sent = outbox.due(60_000 * MS)
+    assert [(one.seq, one.after) for one in sent] == [(1, 0), (3, 0), (4, 0)]
+    for one in sent:
+        assert box.arrived(one, 0) == []
+    assert [box.take(0).body for _ in sent] == [1, 3, 4]  # type: ignore[union-attr]
+
+
+def test_nothing_leaves_before_it_is_kept() -> None:
+    outbox, box = Outbox("s", 1), Mailbox()
+    outbox.post(Envelope("actor", reliable=True), 0)
+    assert outbox.due(0) == []
+    outbox.committed()
+    (sent,) = outbox.due(0)
+    box.arrived(sent, 0)
+    taken = box.take(0)
+    assert taken is not None
+    box.done(taken, answer(taken, 1))
+    assert box.arrived(sent, 0) == []
+    (told,) = box.committed()
+    assert box.arrived(sent, 0) == [told]
+    assert outbox.answered(told)
+    assert not outbox.answered(told)
+
+
+def test_a_message_that_came_too_early_waits_for_the_one_before() -> None:
+    outbox, box = Outbox("s", 1), Mailbox()
+    for number in range(3):
+        outbox.post(Envelope("actor", body=number, reliable=number == 0), 0)
+    outbox.committed()
+    first, second, third = outbox.due(0)
+    assert box.arrived(third, 0) == box.arrived(second, 0) == []
+    assert box.take(0) is None
+    box.arrived(first, 0)
+    assert [box.take(0).body for _ in range(3)] == [0, 1, 2]  # type: ignore[union-attr]
+
+
+def test_a_full_mailbox_says_busy_and_a_full_outbox_takes_no_more() -> None:
+    box = Mailbox()
+    for _ in range(MAILBOX_MAX):
+        assert box.arrived(Envelope("actor"), 0) == []
+    (busy,) = box.arrived(Envelope("actor", id="x"), 0)
+    assert (busy.re, busy.error.kind) == ("x", "busy")  # type: ignore[union-attr]
+    outbox = Outbox("s", 1)
+    for _ in range(WINDOW):
+        outbox.post(Envelope("actor", reliable=True), 0)
+    with pytest.raises(MailboxFullError, match="1024 messages to actor wait"):
+        outbox.post(Envelope("actor"), 0)
+
+
+def test_a_sender_that_begins_a_new_life_is_heard_and_its_old_messages_are_not() -> None:
+    box = Mailbox()
+    box.arrived(Envelope("actor", sender="s", boot=2, seq=1, body="new"), 0)
+    assert box.arrived(Envelope("actor", sender="s", boot=1, seq=9, body="old"), 0) == []
+    assert len(box) == 1
+
+
+def test_a_deadline_that_passes_in_the_mailbox_is_told_and_not_handled() -> None:
+    box = Mailbox()
+    box.arrived(Envelope("actor", sender="s", boot=1, seq=1, id="x", deadline_ms=5, reliable=True), 0)
+    assert box.take(5 * MS) is None
+    (told,) = box.committed()
+    assert (told.re, told.error.kind) == ("x", "expired")  # type: ignore[union-attr]
+
+
+MUTANTS = {
+    "answers leave before they are kept": (
+        "_again",
+        lambda self, envelope: [one for one in self._answers if one.seq == envelope.seq],
+    ),
+    "the one before is not waited for": ("_hold", lambda self, taken, envelope: self._accept(taken, envelope, 0)),
+    "a number is taken again": ("_again", lambda self, envelope: self._queued(envelope, 0)),
+}
+
+
+@pytest.mark.parametrize("name", MUTANTS)
+def test_a_mistake_in_the_mailbox_is_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    attribute, wrong = MUTANTS[name]
+    monkeypatch.setattr(mailbox.Mailbox, attribute, wrong)
+    with pytest.raises(AssertionError):
+        look()
+
+
+def look() -> None:
+    """Twenty short runs with much trouble."""
+    for seed in range(20):
+        world = World(seed, 3, 100, loss=0.3, double=0.3)
+        world.run(300)
+        world.check()
