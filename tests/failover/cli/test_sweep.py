@@ -31,6 +31,7 @@ TASKS = (
     *(["ps"], ["trace", "-o", "out", "--for", "1s"], ["task", "add", "x", "period_ms=9"], ["task", "set", "x", "period_ms=9"]),
     *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
 )
+RIGHTS = (["list"], ["why", "root", "see", "/x"])
 DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
@@ -58,7 +59,8 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        statuses.append(main.main([*verb, *asked, *rest] if verb not in (("team",), ("board",), ("task",)) else [*argv, *asked]))
+        with_acts = verb in (("team",), ("board",), ("task",), ("rights",))
+        statuses.append(main.main([*argv, *asked] if with_acts else [*verb, *asked, *rest]))
         said = capsys.readouterr()
         if asked:
             assert said.err == ""
@@ -128,6 +130,14 @@ def test_with_drivers_that_are_not_there(
     assert sorted(Path("directory").iterdir()) == []
 
 
+@pytest.mark.parametrize("content", ["junk", "sparse", "directory"])
+@pytest.mark.parametrize("act", RIGHTS, ids=" ".join)
+def test_with_rights_that_are_none(act: list[str], content: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("team").mkdir()
+    Path(content).rename("team/rights.toml")
+    assert told(capsys, "rights", *act, "--directory", "team") == main.FAILED
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -138,6 +148,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"ps", "task", "trace", "wait-activation"}
+    without |= {"ps", "task", "trace", "wait-activation", "rights"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
