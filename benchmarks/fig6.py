@@ -81,7 +81,7 @@ class Run(Struct):
 
     Attributes:
         noise_ms: between two alien echoes, 0 for none.
-        sent, lost: frames handed to a card; those of them that nobody got.
+        sent, lost: frames handed to a card; those of them that no robot got.
         p50_ms, p90_ms, p99_ms, longest_ms: of the delays.
         delays: how many frames had each delay, in steps of `BIN_MS`.
         took_s: of this machine's processor.

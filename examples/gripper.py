@@ -1,4 +1,4 @@
-"""A gripper that obeys nobody who has been replaced, and the program that drives it.
+"""A gripper that obeys no replaced program, and the program that drives it.
 
     python gripper.py serve SOCKET STATE      at the gripper: STATE remembers the highest epoch
     failover run -- python gripper.py drive SOCKET

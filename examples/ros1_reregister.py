@@ -4,7 +4,7 @@
     failover run --after-resume "ros1_reregister.py /listener http://10.0.0.2:11311" -- python3 listener.py
 
 Why: a restore resets the TCP connections of a node with others. rospy connects anew only when the master tells it of publishers,
-and the master tells nobody, for nothing has changed there. This command registers all that the node offers and wants once more,
+and the master does not tell, for nothing has changed there. This command registers all that the node offers and wants once more,
 in the node's name. It tells each subscriber of its publishers: first without the lost ones, so that the subscriber forgets them,
 then with them, so that it connects.
 

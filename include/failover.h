@@ -7,7 +7,7 @@
  *         fprintf(stderr, "%s\n", failover_error());
  *     for (;;) {
  *         step(&pid);
- *         failover_commit();                              a point to return to: microseconds, waits for nobody
+ *         failover_commit();                              a point to return to: microseconds, never waits
  *     }
  *
  * Compile with -pthread. In C, include this header before all others or define _GNU_SOURCE. docs/c.md is the manual, SEGMENT.md
@@ -15,7 +15,7 @@
  * failover_error() says in a sentence what was tried, on what, why not. Nothing here prints, aborts or raises a signal.
  *
  * A process keeps one state. Regions are registered and the state is opened by one thread; commits come from any, one at a time, and
- * nobody writes to a region meanwhile. What regions hold must mean the same in another process: no pointers, no descriptors.
+ * no thread writes to a region meanwhile. What regions hold must mean the same in another process: no pointers, no descriptors.
  *
  * SPDX-License-Identifier: MIT */
 
@@ -96,7 +96,7 @@ static inline void failover_on_resume(failover_callback *called, void *context);
  * FAILOVER_STATE names, else in the working directory; FAILOVER_COMPONENT takes the place of `name`. */
 static inline int failover_open(const char *name);
 
-/* Number of the primacy under which this program runs, which only grows: the fencing token, for whoever must tell an old primary from a
+/* Number of the primacy under which this program runs, which only grows: the fencing token, for a device that must tell an old primary from a
  * new one. 0 without an agent. */
 static inline uint64_t failover_epoch(void);
 
@@ -111,7 +111,7 @@ static inline int64_t failover_commit(void);
  * milliseconds. Negative: no limit. */
 static inline int failover_wait(int timeout_ms);
 
-/* Write the newest commit (under an agent: whoever wants it to be safe waits before) and let everything go; regions are forgotten, their
+/* Write the newest commit (under an agent: a caller that wants it to be safe waits before) and let everything go; regions are forgotten, their
  * memory stays. At exit() this happens by itself. */
 static inline int failover_close(void);
 
@@ -159,7 +159,7 @@ typedef struct failover_entry_ {
 
 typedef struct failover_record_ {
     uint64_t number, realtime, monotonic, boottime;
-    uint64_t told, outputs[2]; /* whether somebody counts the program's output, and how much there was */
+    uint64_t told, outputs[2]; /* whether a guard counts the program's output, and how much there was */
     uint64_t sum;              /* in a file beside a program */
 } failover_record_;
 
@@ -252,14 +252,14 @@ typedef struct failover_task_ {
     uint64_t generation, table_sum;
     unsigned char *chunk;
     char file_name[256], fresh_name[260];
-    uint32_t pulse, hurry, safe;   /* atomic, futexes: a commit was made; somebody waits; a commit is safe */
+    uint32_t pulse, hurry, safe;   /* atomic, futexes: a commit was made; a thread waits; a commit is safe */
     uint32_t closing, trouble;     /* atomic; trouble: errno of the last write that failed */
     uint64_t committed, durable;   /* atomic: numbers */
     const char *step;              /* atomic: what failed */
 
     /* the guard, where there is one: then there is no recorder and no file */
     int guard;                  /* its socket, or -1 */
-    const uint64_t *counters;   /* of our output; NULL where nobody counts it */
+    const uint64_t *counters;   /* of our output; NULL where no guard counts it */
     uint64_t stuck[4], epoch;   /* the counters when they were last given up */
     const char *token;          /* the epoch's digits in the environment, renewed there; NULL without a guard */
     bool is_kept, is_pending;   /* the guard was told of a commit; the last commit does not know its output */
@@ -600,7 +600,7 @@ static inline bool failover_has_room_(FILE *file, int stream)
     return size < 0 || 2 * ((unread + page - 1) / page) + 2 + (held + page - 1) / page + 1 <= (uint64_t)size / page;
 }
 
-/* Flush a stream if that waits for nobody: neither for room in its pipe nor for a thread that is in the middle of printing. */
+/* Flush a stream if that does not wait: neither for room in its pipe nor for a thread that is in the middle of printing. */
 static inline bool failover_flush_(FILE *file, int stream)
 {
     if (ftrylockfile(file) != 0)
@@ -1119,7 +1119,7 @@ static inline int failover_is_whole_(int file, const failover_layout_ *layout, u
 
 /* --- The file beside the program: two banks in turn, each step on the disk before the next --------------------------------------- */
 
-/* 0, or -errno with the step that failed noted for whoever waits. */
+/* 0, or -errno with the step that failed noted for the waiting thread. */
 static inline int failover_step_(failover_task_ *task, int outcome, const char *step)
 {
     if (outcome < 0)
@@ -1491,7 +1491,7 @@ static inline int failover_fill_regions_(failover_task_ *task, int file, const f
     return 0;
 }
 
-/* Note what was resumed, for whoever asks. */
+/* Note the state that was resumed, for later questions. */
 static inline void failover_tell_(failover_task_ *task, uint64_t commit, uint64_t generation, uint64_t age_ns, const char *why)
 {
     task->is_resumed = true;

@@ -183,7 +183,7 @@ enum {
     FB_TURNS_ = 100,            /* of a call whose board is made anew each time it looks */
     FB_EPOCH_BITS_ = 40,        /* numbers of puts under epoch e begin above e << 40 */
     FB_SLICE_NS_ = 100000000,   /* the longest sleep without a look: a wake-up may be lost */
-    FB_TABLE_WAIT_MS_ = 5000,   /* for whoever changes a table, which takes microseconds */
+    FB_TABLE_WAIT_MS_ = 5000,   /* for a process that changes a table, which takes microseconds */
     FB_MAPS_ = 4096             /* mappings that are guarded against files that become shorter */
 };
 
@@ -560,7 +560,7 @@ static inline void fb_sleep_(const void *word, uint32_t value, int64_t ns)
 /* --- Files that become shorter ------------------------------------------------------------------------------------------------------------
  *
  * Who may write a board's file may also make it shorter; a touch of what is lost raises SIGBUS. Then zeros take the place of that
- * file's mapping, as after a restore: a generation of 0 has the next call open the board anew. Other SIGBUSes go to whoever had the signal
+ * file's mapping, as after a restore: a generation of 0 has the next call open the board anew. Other SIGBUSes go to the handler that had the signal
  * before. FB_NO_SIGBUS leaves the signal alone. */
 
 static inline void fb_bus_error_(int number, siginfo_t *about, void *context)
@@ -1359,7 +1359,7 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
             }
             if (generation % 2 == 0) {
                 __atomic_store_n(&place->remembered, generation, __ATOMIC_RELEASE);
-            } else if (place->area->is_writable && fb_take_(place->area->file, FB_TABLE_LOCK_)) { /* whoever made it odd has died */
+            } else if (place->area->is_writable && fb_take_(place->area->file, FB_TABLE_LOCK_)) { /* the process that made it odd has died */
                 fb_end_change_(place->area);
             }
         }

@@ -1,6 +1,6 @@
 """The directory server, by python-ldap (OpenLDAP's library, which blocks): the only file that imports it, and only when asked.
 
-Sources: RFC 4511 (LDAP), RFC 4513 section 5.1.2 (an empty password binds nobody, and succeeds), RFC 4515 (escapes in filters);
+Sources: RFC 4511 (LDAP), RFC 4513 section 5.1.2 (an empty password binds no user, and succeeds), RFC 4515 (escapes in filters);
 ldap.conf(5) for the options.
 """
 

@@ -1,7 +1,7 @@
 """This robot's items as the main loop takes them: by read(2), not from a mapping.
 
-Programs of a group may write the file, and so make it shorter. Whoever touches a page of a mapping that is gone is ended by the
-kernel (SIGBUS); a read only comes back short. The order of loads is that of `failover.core.board.banks.get_carefully`.
+Programs of a group may write the file, and so make it shorter. The kernel ends a process that touches a lost page of a mapping
+(SIGBUS); a read only comes back short. The order of loads is that of `failover.core.board.banks.get_carefully`.
 """
 
 from __future__ import annotations

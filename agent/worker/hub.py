@@ -53,7 +53,7 @@ ANSWER_PATIENCE_S: Final = 60.0
 MESSAGES_A_TURN: Final = 64
 
 SIGNS_MAX: Final = 256
-"""Kinds of them that are remembered: each names a key, and anybody has many keys."""
+"""Kinds of them that are remembered: each names a key, and a stranger can make many keys."""
 
 SIGN_S: Final = 1.0
 """Between two signs of one kind from a peer that cannot be authenticated: ZeroMQ tries twenty times a second."""

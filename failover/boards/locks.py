@@ -17,7 +17,7 @@ from failover.core.board.layout import TABLE_LOCK
 from failover.errors import BoardError, FailoverError
 
 TABLE_WAIT_S: Final = 5.0
-"""A change of a table takes microseconds. Whoever holds the lock for so long is stopped."""
+"""A change of a table takes microseconds. A process that holds the lock for so long is stopped."""
 PAUSE_S: Final = 0.001
 
 

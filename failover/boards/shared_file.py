@@ -129,7 +129,7 @@ class SharedFile:
         """The generation is odd for the body, and the table lock is held; the caller keeps other threads out."""
         with locks.table(self.descriptor, f"cannot change {self.path}", self.ERROR):
             generation = self.read_header().generation
-            generation += generation % 2  # an odd one: whoever changed the table has died
+            generation += generation % 2  # an odd one: the process that changed the table has died
             self.words[GENERATION] = generation + 1
             try:
                 yield

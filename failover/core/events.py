@@ -277,7 +277,7 @@ class Handover(Struct, frozen=True):
 
 
 class Promote(Struct, frozen=True):
-    """Operator: this robot runs what nobody else is heard to run, without waiting for robots that are silent.
+    """Operator: this robot runs components that no other robot is heard to run, without waiting for robots that are silent.
 
     Attributes:
         is_trial: nothing is done; the answer says what it would be, and what would be at risk.

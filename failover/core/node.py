@@ -60,7 +60,7 @@ LATE_NS = 5 * MS
 """A step this much after the instant asked for is our own lateness, taken back from the peers' silence. Less than the margin."""
 
 REST_NS = MS
-"""Between two deadlines: what waits for somebody else is looked at again, but not without a pause."""
+"""Between two deadlines: the core looks again at work that waits for another process, after a pause."""
 
 LIVES_MAX = 1 << 40
 """A peer that speaks of so many lives of this robot is not believed."""
@@ -146,7 +146,7 @@ class Node:
         return next((life for life in lives if life < LIVES_MAX), 0)
 
     def rests(self, now_ns: int) -> bool:
-        """Nothing runs or waits anywhere, as far as we know, and nobody is missing: what peers say may wait a little."""
+        """Nothing runs or waits anywhere, as far as we know, and no member is missing: what peers say may wait a little."""
         idle = self._begun and all(component.state in ENDED for component in self._components.values())
         return idle and self._team.steady(now_ns)
 

@@ -46,7 +46,7 @@ class Exchange:
     def __init__(self, here: Here, file: str) -> None:
         """
         Args:
-            file: of this process, in the directory where drivers meet; nobody else's.
+            file: of this process, in the directory where drivers meet; no other process uses it.
 
         Raises:
             DriverError: it cannot be made.

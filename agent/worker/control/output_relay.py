@@ -64,7 +64,7 @@ class OutputRelay:
 
         Args:
             committed: only what no takeover can take back; all of it once it has ended.
-            check: asked again and again whether a rule lets this user read it, whoever it belongs to; raises where it does not.
+            check: asked again and again whether a rule lets this user read it, with any owner; raises where it does not.
 
         Raises:
             RefusedError: another robot has them, and went away; or the user may not read on.

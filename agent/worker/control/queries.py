@@ -39,7 +39,7 @@ WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "prom
 """What takes a program, its output, or a word that others obey."""
 
 QUESTIONS: Final = ("standing", "picture", "story")
-"""What any member may ask of another one. The rest are orders, and a witness's are refused: it may be anybody's process."""
+"""What any member may ask of another one. The rest are orders, and a witness's are refused: it may be any user's process."""
 
 
 NOT_HERE: Final[dict[str, Any]] = {

@@ -76,7 +76,7 @@ class RightsGate:
         if may(uid, None) and verb not in NEVER_BY_DEFAULT:
             return Subject(
                 f"uid:{uid}", uid=uid, stands_above=True
-            )  # asks nobody: the robot's own console works without a network
+            )  # asks no directory: the robot's own console works without a network
         if self._mistake or self._rights is None:
             raise RefusedError(f"no right can be given: {self._mistake or 'there are no rules'}", "PermissionError")
         config = self._rights.config

@@ -16,7 +16,7 @@ from failover.errors import TeamFileError
 
 
 def create(arguments: argparse.Namespace) -> int:
-    """Begin a team: a directory with a team file that knows nobody yet."""
+    """Begin a team: a directory with a team file that has no member yet."""
     directory = Path(arguments.directory)
     path = directory / team.TEAM_FILE
     if path.exists():

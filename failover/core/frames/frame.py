@@ -374,7 +374,7 @@ class _Sender(Struct):
 class Receiver:
     """Opens the parts that reach one robot: right key, right sender, and each only once.
 
-    A sender's boot count can only grow, and only in a part whose code is right: nobody resets a window from outside.
+    A sender's boot count can only grow, and only in a part whose code is right: a stranger cannot reset a window.
     """
 
     def __init__(self, me: str, team: str, roster: Roster) -> None:

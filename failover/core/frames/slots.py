@@ -18,7 +18,7 @@ What a robot sees of each other one, at the end of each own round (`TABLE`; a fr
     any    -- a frame of a higher boot (at once) -->               INSERT
 
 Invariants: never two sends within half a slot; none later than two rounds after the one before, if the caller is on time; a peer
-counts once; own lateness accuses nobody; no frame, however odd, raises.
+counts once; own lateness makes no other robot missed; no frame, however odd, raises.
 
 Source: RA-TDMA is due to F. Santos, L. Almeida, L. S. Lopes (ETFA 2008).
 """
@@ -37,7 +37,7 @@ HOLD_US_MAX = (1 << 32) - 1
 """Longer holds are not told: an hour."""
 
 WHOLE_ROUND = 3 / 4
-"""A round of less than this part of T_tup, cut short by a move of the slot or by own lateness, accuses nobody of silence."""
+"""A round of less than this part of T_tup, cut short by a move of the slot or by own lateness, tells of no robot's silence."""
 
 WIDE = 2 / 3
 """A gap of this part of the widest one is wide, too: jitter makes no choice."""

@@ -146,7 +146,7 @@ def _own(content: bytes) -> Envelope | None:
 
 
 def _any(content: bytes) -> Envelope:
-    """The message, whoever wrote it."""
+    """The message, by hand or from another program."""
     fields = _fields(content)
     check(fields)
     unknown = fields.keys() - _KNOWN

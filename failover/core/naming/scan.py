@@ -2,7 +2,7 @@
 
 At each scan a process tells all that it knows of which tables it has, as a *digest*: boot, serial and *beat* of each origin. Who
 lacks something asks for it and gets pages of at most 64 KiB. An origin raises its beat with every scan; it is heard as long as
-its beat rises, whoever told. Thus a name is found although its origin cannot be reached from here directly.
+its beat rises, through any teller. Thus a name is found although its origin cannot be reached from here directly.
 
     Digest -- a row is newer than our table --> Ask       -- it lacks what we have --> our Digest, once
     Ask    --> Pages; what did not fit is named, and asked for at once

@@ -19,7 +19,7 @@ from failover.errors import FailoverError
 
 NUMBER_MAX = 1 << 62
 DIGEST_SIZE_MAX = 32
-"""Beyond these a number is somebody's mistake; believing it would leave no room to count on."""
+"""Beyond these a number is a mistake; believing it would leave no room to count on."""
 
 _encoder = msgspec.msgpack.Encoder()
 _bulk_decoder: msgspec.msgpack.Decoder[Bulk] = msgspec.msgpack.Decoder(Bulk)

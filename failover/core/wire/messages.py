@@ -81,7 +81,7 @@ ORDERED = 128
 """An operator asked for this claim: a robot with an older checkpoint may have it."""
 
 WANTS = 256
-"""An operator wants the sender to run it, and it has no checkpoint: whoever keeps one sends it."""
+"""An operator wants the sender to run it, and it has no checkpoint: a member that keeps one sends it."""
 
 
 SAFE = 512
@@ -101,7 +101,7 @@ class Beat(msgspec.Struct, frozen=True, array_like=True):
     Attributes:
         boot: start count of the sender's agent; ``counter``: of its beats since then, from 1.
         settled: counter of the beat since which no entry of the sender has changed its epoch, its state or its primary.
-            Whoever knows an entry only from a beat older than that does not know enough to act on it.
+            A receiver that knows an entry only from an older beat does not know enough to act on it.
         load: of the sender, 0 to 255.
         entries: those that fit; the others follow in the next beats, in turn. The changed ones go first.
         total: how many there are altogether.
@@ -277,7 +277,7 @@ class Errand(msgspec.Struct, frozen=True, tag="errand"):
         number: chosen by the sender, never used twice in one life of it.
         verb: as on the control socket (`failover.client.control`).
         arguments: its arguments, a msgpack map.
-        by: uid of who gave it, -1: the robot by itself; whoever carries it out looks whether he may.
+        by: uid of the user who gave it, -1: the robot by itself; the robot that carries it out checks the right.
     """
 
     number: int
