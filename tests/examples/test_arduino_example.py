@@ -1,4 +1,4 @@
-"""The Arduino of examples/: its sketch as a program of this machine, its driver at a pseudo-terminal that takes 50 ms a command."""
+"""The Arduino of examples/: its sketch as a program of this machine, its driver at a pseudo-terminal with 50 ms a command."""
 
 from __future__ import annotations
 
@@ -329,14 +329,15 @@ class Plugged:
         self._process.wait()
 
 
-@pytest.fixture
-def place(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the driver of this test and its callers meet; its port is there, too."""
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where the driver and its callers meet; its port is there, too."""
     found = tmp_path_factory.mktemp("d")
-    monkeypatch.setenv("FAILOVER_DRIVERS", str(found / "m"))
-    monkeypatch.setenv("FAILOVER_ROBOT", "robot1")
-    monkeypatch.delenv("FAILOVER_TEAM", raising=False)
-    return found
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("FAILOVER_DRIVERS", str(found / "m"))
+        environment.setenv("FAILOVER_ROBOT", "robot1")
+        environment.delenv("FAILOVER_TEAM", raising=False)
+        yield found
 
 
 @pytest.fixture
@@ -352,9 +353,9 @@ def plug(build: Build, place: Path) -> Iterator[Callable[..., Plugged]]:
         yield one
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def driver(place: Path) -> Iterator[Path]:
-    """The driver, once it takes messages: where it is typed to by hand."""
+    """The driver, once it takes messages: where it is typed to by hand. One process for all tests, with a new device in each."""
     told = place / "told"
     with (
         told.open("wb") as file,
@@ -385,7 +386,7 @@ def test_commands_at_20_hz_arrive_all_and_in_order(plug: Callable[..., Plugged],
             due += 0.05
             time.sleep(max(due - time.monotonic(), 0))  # it is offered 20 commands a second, not more
         assert arduino.call("read", timeout=LIMIT_S) == told
-    assert device.moved() == [-(number * 255 + 50) // 100 for number in range(1, count + 1)]
+    assert device.moved() == [-((number * 255 + 50) // 100) for number in range(1, count + 1)]
 
 
 def typed(hand: Path, sender: str, count: int) -> list[dict[str, Any]]:
