@@ -177,6 +177,8 @@ class Board:
     def add(self, declaration: Declaration) -> Item:
         """Declare an item while the board is in use; one that is declared alike already stays.
 
+        The handle takes and gives tables and numbers; `item` gives one for values of a class.
+
         Raises:
             BoardError: it is declared otherwise already, or there is no room.
         """

@@ -63,7 +63,8 @@ memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of
 healthy: nothing is degraded, nothing has failed, no robot is silent, as far as this robot knows; with ``team`` as far as any
     robot that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
 notes: [sentence, …]: what is missing or degraded on this robot
-beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps}: of this life; refused: {reason: count}
+beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps, items}: of this life; refused: {reason: count}
+    items: {reason: count} of the board's values that other robots did not get, or got a round later
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
     medium: wired | wireless | loopback; because: the fact that tells; carrier: its cable is in; snapshots: they may travel there
     bytes_in, bytes_out: all that the kernel counted on it
