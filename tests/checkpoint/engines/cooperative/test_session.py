@@ -144,7 +144,7 @@ def test_a_snapshot_of_another_engine_is_not_restored() -> None:
 def test_a_snapshot_that_does_not_say_what_its_pages_mean_is_not_restored(listed: list[object] | None) -> None:
     whole = base_of(1)
     resource = replace(whole.resources[0], facts={**whole.resources[0].facts, "regions": listed})  # type: ignore[dict-item]
-    with pytest.raises(RestoreError, match="does not say"):
+    with pytest.raises(RestoreError, match="does not describe its pages"):
         regions_of(replace(whole, resources=(resource,)))
 
 
