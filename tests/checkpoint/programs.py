@@ -225,7 +225,7 @@ print("the end", work.qsize(), done.qsize())
 NUMPY_POOL = """
 import numpy as np
 a = np.random.default_rng(7).random((160, 160))
-for i in range(200):
+for i in range(2_000):
     a = a @ a.T / 40 + np.sin(a)
     a /= np.abs(a).max()
     print(i, repr(float(a.sum())), flush=True)
