@@ -13,6 +13,7 @@ from typing import Final
 
 from msgspec import Struct
 
+from checkpoint.sentences import near
 from failover.core.naming import names
 from failover.core.naming.names import Kind
 from failover.core.naming.records import Record, numeric, unpack
@@ -125,7 +126,8 @@ class Tree:
         able = [place for place in places if not place.refused]
         if not able:
             because = places[0].refused if places else "no process that was heard lately has registered it"
-            raise NameUnknownError(f"{text!r} names nothing: {because}")
+            known = [*self._paths, *(other for kind, other in self._others if kind is Kind.TEXT)]
+            raise NameUnknownError(f"{text!r} names nothing: {because}{near(text, known)}")
         paths = sorted({place.record.path for place in able})
         if len(paths) > 1:
             lives = sorted({place.record.path for place in able if place.reach is Reach.LIVE})

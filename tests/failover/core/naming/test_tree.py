@@ -123,6 +123,8 @@ def test_names_are_listed_below_a_prefix_in_natural_order() -> None:
     assert len(found.under()) == len(found) == 4
     with pytest.raises(NameUnknownError, match="no process that was heard"):
         found.resolve("nothing")
+    with pytest.raises(NameUnknownError, match="did you mean 'L/r1"):
+        found.resolve("L/r1O/1")
 
 
 def test_a_record_of_a_later_version_passes_on_whole() -> None:
