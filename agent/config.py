@@ -13,7 +13,7 @@ from typing import Final, Literal
 
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
-from agent.task_config import TaskConfig, declaration, user_of
+from agent.task_config import TaskConfig, declaration
 from checkpoint.arch import EVERY_LEVEL
 from checkpoint.device_rules import RULES_MAX, DeviceRule, checked, rule_from
 from checkpoint.engine import contradiction
@@ -377,11 +377,19 @@ def _check_tasks(path: Path, config: Config, members: Team) -> None:
         if members.robots[config.robot].role != "robot":
             raise ConfigError(f"{where}: {config.robot} is a {members.robots[config.robot].role}, and runs no programs")
         try:
-            uid = user_of(task.user).pw_uid if task.user else os.geteuid()
+            uid = _uid_of(task.user)
         except KeyError as error:
             raise ConfigError(f"{where}: user = {task.user!r}: this robot has no such user; see getent passwd") from error
         if uid != os.geteuid() and os.geteuid() != 0:
             raise ConfigError(f"{where}: user = {task.user!r}: this agent has no root's rights: it runs programs of its own user")
+
+
+def _uid_of(user: str) -> int:
+    if not user:
+        return os.geteuid()
+    from failover.config.accounts import account_of  # here: an agent without tasks does not load it
+
+    return account_of(user).pw_uid
 
 
 def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:

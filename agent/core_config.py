@@ -10,7 +10,7 @@ from msgspec import msgpack
 from msgspec.structs import replace
 
 from agent.config import ComponentConfig, Config, Settings
-from agent.task_config import TaskConfig, user_of
+from agent.task_config import TaskConfig
 from checkpoint.device_rules import arrived, merged, travelling
 from checkpoint.engine import Carry, Terms
 from checkpoint.program import cpu_baseline
@@ -54,9 +54,10 @@ def _declared(settings: Settings, name: str, task: TaskConfig) -> types.Componen
         variables["FAILOVER_SOCKET"] = str(socket)
     inheritance, owner = b"", os.geteuid()
     if task.user:
-        from checkpoint.linux.spawn.inherited_limits import Inheritance  # here: an agent without tasks does not load it
+        from checkpoint.linux.spawn.inherited_limits import Inheritance  # here: an agent without tasks does not load them
+        from failover.config.accounts import account_of
 
-        user = user_of(task.user)
+        user = account_of(task.user)
         owner, groups = user.pw_uid, tuple(os.getgrouplist(user.pw_name, user.pw_gid))
         inheritance = msgpack.encode(Inheritance(user.pw_uid, user.pw_gid, groups))
         variables |= {"HOME": user.pw_dir, "USER": user.pw_name, "LOGNAME": user.pw_name}

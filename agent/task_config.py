@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from pwd import struct_passwd
-
     from failover.core.schedule.terms import Declaration
 
 
@@ -53,17 +51,6 @@ class TaskConfig:
         for name in self.environment:
             if not name or "=" in name:
                 raise ValueError(f"environment has a variable {name!r}; a name is not empty and has no '=' in it")
-
-
-def user_of(name: str) -> struct_passwd:
-    """A user by name or number.
-
-    Raises:
-        KeyError: this system has none.
-    """
-    import pwd  # here: an agent without tasks does not load it
-
-    return pwd.getpwuid(int(name)) if name.isdecimal() else pwd.getpwnam(name)
 
 
 def declaration(name: str, task: TaskConfig) -> Declaration | None:

@@ -169,8 +169,10 @@ def _as_user(caller: Caller, name: str) -> Inheritance:
     """The rights that a program inherits which is to run as another user."""
     if caller.uid != ROOT:
         raise RefusedError(f"only root may choose a user; uid {caller.uid} runs programs as itself", "PermissionError")
+    from failover.config.accounts import account_of  # here: few orders choose a user
+
     try:
-        found = pwd.getpwuid(int(name)) if name.isdecimal() else pwd.getpwnam(name)
+        found = account_of(name)
     except KeyError:
         raise RefusedError(f"this robot has no user {name!r}; see getent passwd") from None
     return caller.inheritance.as_user(found.pw_uid, found.pw_gid, tuple(os.getgrouplist(found.pw_name, found.pw_gid)))

@@ -39,6 +39,15 @@ def subject_of(uid: int, groups: Mapping[str, Sequence[str]]) -> Subject:
         return Subject(f"uid:{uid}", uid=uid)
 
 
+def account_of(name: str) -> pwd.struct_passwd:
+    """The account of a user by name or number.
+
+    Raises:
+        KeyError: this machine has none.
+    """
+    return pwd.getpwuid(int(name)) if name.isdecimal() else pwd.getpwnam(name)
+
+
 def uid_of(user: str) -> int | None:
     """The account's number; None without an account."""
     try:

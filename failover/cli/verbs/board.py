@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import os
-import pwd
 import sys
 import time
 from collections.abc import Iterator
@@ -274,7 +273,6 @@ def users(arguments: argparse.Namespace) -> int:
 
 
 def _user(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return str(uid)
+    from failover.config import accounts  # here: one act of failover board shows users
+
+    return accounts.name_of(uid) or str(uid)
