@@ -16,7 +16,7 @@ from typing import Final, Protocol
 import msgspec
 
 from agent.directory.messages import Answer, Question, spelled_age
-from agent.directory.server import UnknownUserError, WrongPasswordError
+from agent.directory.server import EMPTY_PASSWORD, UnknownUserError, WrongPasswordError
 from agent.errors import DirectoryError
 from checkpoint.errors import UNDECODABLE
 from failover.config.rights import LdapConfig
@@ -83,7 +83,7 @@ class Answers:
         """Who is it?"""
         user, password, strict = question.user, question.password, question.verb in NEVER_BY_DEFAULT
         if password == "":
-            return Answer(refusal="an empty password is never tried: a server may take it for nobody, and say yes")
+            return Answer(refusal=EMPTY_PASSWORD)
         tries, until = self._wrong.get((user, question.origin), (0, 0.0))
         if password is not None and self._now_s() < until:
             return Answer(refusal=f"{tries} wrong passwords of {user}: try again in {until - self._now_s():.0f} s")

@@ -16,6 +16,7 @@ from agent.errors import DirectoryError
 from failover.config.rights import LdapConfig, is_loopback
 
 CLASSES: Final = "(|(objectClass=groupOfNames)(objectClass=groupOfUniqueNames)(objectClass=posixGroup)(objectClass=group))"
+EMPTY_PASSWORD: Final = "an empty password is never tried: a server may take it for nobody, and say yes"
 
 
 class WrongPasswordError(DirectoryError):
@@ -47,7 +48,7 @@ class LdapServer:
             DirectoryError: it cannot be asked, or its answer cannot be used.
         """
         if password == "":
-            raise WrongPasswordError("an empty password is never tried: a server may take it for nobody, and say yes")
+            raise WrongPasswordError(EMPTY_PASSWORD)
         if not user or not user.isprintable() or "\0" in (password or ""):
             raise UnknownUserError(f"{user!r} is no name of a user, or the password holds a zero byte")
         ldap = _library()

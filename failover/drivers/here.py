@@ -25,7 +25,7 @@ import xxhash
 from msgspec import Struct
 
 from failover.boards import locks
-from failover.boards.directory import this_robot
+from failover.boards.directory import SHARED_MEMORY, this_robot
 from failover.config import team as team_file
 from failover.config.team import Team, split_address
 from failover.core.naming.tree import Claims
@@ -35,7 +35,6 @@ DIRECTORY: Final = "FAILOVER_DRIVERS"
 TEAM: Final = "FAILOVER_TEAM"
 ROBOT: Final = "FAILOVER_ROBOT"
 SYSTEM_TEAM: Final = Path("/etc/failover/team")
-SHARED_MEMORY: Final = Path("/dev/shm")
 
 ADDRESS_SIZE_MAX: Final = 107
 """Bytes of a unix socket's path. Source: unix(7)."""
