@@ -86,6 +86,7 @@ class Switchboard:
         self._numbers = itertools.count(1)
         self._questions: dict[int, asyncio.Future[Told]] = {}
         self._commands: dict[int, asyncio.Future[acts.Answer]] = {}
+        self._early: list[Event] | None = []
         self._life = Life(0, os.getppid(), ())
         self._begun: asyncio.Future[Life] = asyncio.get_running_loop().create_future()
         self._end: asyncio.Event = asyncio.Event()
@@ -150,7 +151,7 @@ class Switchboard:
         speaking = asyncio.create_task(self._speak_to_main_loop())
         living = asyncio.create_task(self._show_life())
         self._life = await self._begun
-        self._say(await self.prepare())
+        await self._begin()
         self._wires.watch()
         self._connections.open()
         server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.gated())
@@ -172,9 +173,19 @@ class Switchboard:
 
     # --- the main loop ---
 
+    async def _begin(self) -> None:
+        """Say what was found: the core is born with that."""
+        self._say(await self.prepare())
+        early, self._early = self._early or [], None
+        for event in early:
+            self.tell(event)
+
     def tell(self, event: Event) -> None:
-        """Pass an event to the core."""
-        self._say(messages.happened(event))
+        """Pass an event to the core; what happens before the core is born waits for that: a program that was found may end meanwhile."""
+        if self._early is not None:
+            self._early.append(event)
+        else:
+            self._say(messages.happened(event))
 
     async def ask(self, what: Literal["status", "why"]) -> Told:
         """Ask the main loop for the core's view, or for what it has not written down yet."""

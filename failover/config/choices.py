@@ -50,8 +50,8 @@ def _entries(value: object, hint: Any) -> Iterator[tuple[str, object, Any]]:
             yield from ((key, entry, hints[key]) for key, entry in value.items() if key in hints)
         elif typing.get_origin(kind) is dict:
             of_key, of_entry = typing.get_args(kind)
-            yield from ((key, key, of_key) for key in value)
-            yield from ((key, entry, of_entry) for key, entry in value.items())
+            yield from ((str(key), key, of_key) for key in value)
+            yield from ((str(key), entry, of_entry) for key, entry in value.items())
 
 
 def _is_union(hint: Any) -> bool:

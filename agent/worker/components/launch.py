@@ -411,7 +411,8 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
         with contextlib.suppress(FileNotFoundError):
             socket_path.unlink()
         raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
-    guard.heard = lambda message: isinstance(message, messages.Event)  # the end is told by the answer, too
+    early: list[Any] = []  # that come behind the answer, before the component is there to hear them
+    guard.heard = lambda message: isinstance(message, messages.Event) and not early.append(message)
     described, streams = await guard.ask(messages.Describe())
     if described.state == "none":
         guard.close()
@@ -423,6 +424,8 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
             component.guest = Guest(described.pid)
     if described.state == "ended" and not component.ended.done():
         component.ended.set_result(described.exit_status)
+    for event in early:
+        guard.heard(event)
     return component
 
 

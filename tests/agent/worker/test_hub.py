@@ -1,4 +1,4 @@
-"""A witness may be any user's process: what it says to a robot starts, ends and overwrites nothing."""
+"""What the worker process says to its main loop first; and that a witness's word starts, ends and overwrites nothing."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from typing import Any
 import pytest
 
 from agent import config as configuration
-from agent.main_loop.messages import ToWorker
+from agent.main_loop.messages import Happened, Inventory, ToMainLoop, ToWorker, event_of
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
+from agent.worker.witness import Witness
 from checkpoint.keeper.messages import Channel, pair
 from checkpoint.model import Position
 from failover.config import team
 from failover.config.team import Robot, Team
-from failover.core.types import ComponentSpec
+from failover.core.events import Exited
+from failover.core.types import ComponentSpec, Found
 from failover.core.wire.messages import Errand, ErrandDone, Offer, Refuse
 
 OFFER = Offer(7, "/lab/a", 1, Position(64, 1, b"d"), None, 10, b"x", ComponentSpec("/lab/a"))
@@ -71,3 +73,31 @@ def test_a_witness_may_ask_how_things_stand(settings: configuration.Settings, ve
 def test_a_snapshot_of_a_witness_is_refused(settings: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     (answer,) = heard(settings, "gate", OFFER, monkeypatch)
     assert isinstance(answer, Refuse) and "gate is a witness" in answer.reason
+
+
+def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(settings: configuration.Settings) -> None:
+    found, end = Found("/lab/a", 1, True, 0), Exited("/lab/a", 1, 7 << 8, "")
+
+    class Worker(Witness):
+        async def prepare(self) -> Inventory:
+            """A program that was found ends while the worker looks for the next one."""
+            self.tell(end)
+            await asyncio.sleep(0)  # what is to be said is sent meanwhile
+            return Inventory((), (found,))
+
+    async def first_words() -> list[ToMainLoop]:
+        ours, theirs = pair()
+        with ours, theirs:
+            worker = Worker(settings, Channel(ours, ToWorker))
+            speaking = asyncio.create_task(worker._speak_to_main_loop())
+            await worker._begin()
+            worker.tell(end)
+            while not worker._outgoing.empty():
+                await asyncio.sleep(0)
+            speaking.cancel()
+            main_loop = Channel(theirs, ToMainLoop)
+            return [main_loop.receive()[0] for _ in range(3)]
+
+    inventory, *later = asyncio.run(first_words())
+    assert isinstance(inventory, Inventory) and inventory.found == (found,)
+    assert [event_of(message) for message in later if isinstance(message, Happened)] == [end, end]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import signal
+import termios
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -20,9 +22,10 @@ from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard.output_logs import OutputLogs
 from agent.worker.components import launch, process_pool
 from agent.worker.components.component import Captured, Component
+from agent.worker.components.connection import Dialogue
 from agent.worker.components.launch import Program, RestoreOptions
 from agent.worker.components.paths import Places, guard_sockets
-from agent.worker.components.process_pool import ProcessPool
+from agent.worker.components.process_pool import ProcessPool, connect
 from checkpoint.engine import NO_TERMS
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError
 from checkpoint.model import OutputPiece
@@ -329,6 +332,37 @@ def test_an_agent_that_comes_back_too_late_is_told_how_it_ended(tmp_path: Path) 
         assert not path.exists()
 
     live(tmp_path, story)
+
+
+def test_an_end_right_behind_the_guards_answer_is_heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    guards: list[Dialogue] = []
+    monkeypatch.setattr(launch, "connect", lambda path: guards.append(connect(path)) or guards[0])
+
+    async def story(places: Places) -> None:
+        component = await launch.start(NAME, program("import time; time.sleep(3600)"), places)
+        path = guard_socket(component, places)
+        component.close()
+        finding = asyncio.create_task(launch.reconnect(path, places))
+        await asyncio.sleep(0)  # it asks; from here on the loop stands still
+        told = bytes_waiting(guards[0], more_than=0)
+        os.kill(component.pid, signal.SIGKILL)
+        bytes_waiting(guards[0], more_than=told)
+        again = await finding
+        assert await again.ended == signal.SIGKILL
+        await again.forget()
+
+    live(tmp_path, story)
+
+
+def bytes_waiting(guard: Dialogue, more_than: int) -> int:
+    """Wait, without the loop, until more than so many bytes of a guard have come that are not read yet."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        count = int.from_bytes(fcntl.ioctl(guard._channel.fileno(), termios.FIONREAD, bytes(4)), "little")
+        if count > more_than:
+            return count
+        time.sleep(POLL_S)
+    raise AssertionError(f"no more than {more_than} bytes came")
 
 
 def test_a_restore_that_nobody_resumes_leaves_nothing(tmp_path: Path) -> None:

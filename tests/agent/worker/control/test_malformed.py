@@ -226,6 +226,8 @@ def test_what_a_peer_says_that_it_lacks_is_sentences_or_nothing(lacking: Any, to
         (RunArguments, {"argv": ["/bin/sh"], "umask": 1 << 40}),
         (RunArguments, {"argv": ["/bin/sh"], "env": {"A=B": "C"}}),
         (RunArguments, {"argv": ["/bin/sh"], "env": {"A": "\0"}}),
+        (RunArguments, {"argv": ["/bin/sh"], "env": {1: "C"}}),
+        (RunArguments, {"argv": ["/bin/sh"], "hooks": {None: []}}),
         (ProtectArguments, {"pid": -1, "name": "a"}),
         (ProtectArguments, {"pid": 1 << 40, "name": "a"}),
         (StopArguments, {"name": "a", "signal": 65}),
