@@ -22,9 +22,9 @@ import numpy as np
 
 from benchmarks.figures import OURS, Figure, Findings
 from benchmarks.loop import loop
+from failover.kept_state.api import Task, open_task
+from failover.kept_state.state import KeptState
 from failover.state import Field, Schema
-from failover.task.api import Task, open_task
-from failover.task.state import KeptState
 
 BIG = 100 << 20
 CHANGED = 1 << 20

@@ -63,13 +63,13 @@ if TYPE_CHECKING:
     )
     from failover.fencing.epoch import epoch
     from failover.fencing.gateway import Gateway
+    from failover.kept_state.api import Resumed, activations, commit, resume, resumed, transaction, wait_committed
+    from failover.kept_state.component import component, kept, run
+    from failover.kept_state.loop import every
+    from failover.kept_state.period import FINISHED
+    from failover.kept_state.resumable import resumable
+    from failover.kept_state.scratch import scratch
     from failover.schedule.task import scheduled
-    from failover.task.api import Resumed, activations, commit, resume, resumed, transaction, wait_committed
-    from failover.task.component import component, kept, run
-    from failover.task.loop import every
-    from failover.task.period import FINISHED
-    from failover.task.resumable import resumable
-    from failover.task.scratch import scratch
 
 __version__ = "0.1.0"
 
@@ -77,23 +77,23 @@ _HOMES = {
     "board": "failover.boards.board",
     "Item": "failover.core.board.items",
     "Control": "failover.client.control",
-    "Resumed": "failover.task.api",
-    "activations": "failover.task.api",
-    "commit": "failover.task.api",
+    "Resumed": "failover.kept_state.api",
+    "activations": "failover.kept_state.api",
+    "commit": "failover.kept_state.api",
     "epoch": "failover.fencing.epoch",
     "Gateway": "failover.fencing.gateway",
-    "resume": "failover.task.api",
-    "resumed": "failover.task.api",
-    "transaction": "failover.task.api",
-    "wait_committed": "failover.task.api",
-    "component": "failover.task.component",
-    "kept": "failover.task.component",
-    "run": "failover.task.component",
-    "FINISHED": "failover.task.period",
-    "every": "failover.task.loop",
-    "resumable": "failover.task.resumable",
+    "resume": "failover.kept_state.api",
+    "resumed": "failover.kept_state.api",
+    "transaction": "failover.kept_state.api",
+    "wait_committed": "failover.kept_state.api",
+    "component": "failover.kept_state.component",
+    "kept": "failover.kept_state.component",
+    "run": "failover.kept_state.component",
+    "FINISHED": "failover.kept_state.period",
+    "every": "failover.kept_state.loop",
+    "resumable": "failover.kept_state.resumable",
     "scheduled": "failover.schedule.task",
-    "scratch": "failover.task.scratch",
+    "scratch": "failover.kept_state.scratch",
     "AgentRefusedError": "failover.errors",
     "BoardError": "failover.errors",
     "NeverWrittenError": "failover.errors",

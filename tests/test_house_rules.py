@@ -239,7 +239,7 @@ def test_each_dependency_enters_through_its_door() -> None:
 
 
 DATACLASSES = {
-    "failover/task/period.py": "a field that is not shown",
+    "failover/kept_state/period.py": "a field that is not shown",
     "failover/config/board.py": "read from TOML by its fields",
     "failover/config/rights.py": "read from TOML by its fields",
     "failover/config/team.py": "read from TOML by its fields",

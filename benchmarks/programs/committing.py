@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from failover.kept_state.api import Task, open_task
+from failover.kept_state.state import KeptState
 from failover.state import Field, Schema
-from failover.task.api import Task, open_task
-from failover.task.state import KeptState
 
 BIG = 100 << 20
 CHANGED = 1 << 20

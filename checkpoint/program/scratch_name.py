@@ -1,4 +1,4 @@
-"""The name that marks memory whose content need not be restored: see `failover.task.scratch`."""
+"""The name that marks memory whose content need not be restored: see `failover.kept_state.scratch`."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from msgspec import Struct
 from failover.core.messaging.pacing import Coalesce
 from failover.core.naming import names
 from failover.errors import DriverError, NameFormatError
-from failover.task.component import DECLARED, RUNNER, kept_of
+from failover.kept_state.component import DECLARED, RUNNER, kept_of
 
 C = TypeVar("C")
 F = TypeVar("F", bound=Callable[..., Any])

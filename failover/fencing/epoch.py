@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from checkpoint.program import epoch_variable
 
-TASK_MODULE: Final = "failover.task.api"
+TASK_MODULE: Final = "failover.kept_state.api"
 """Asked only where the program has loaded it: it brings numpy, whose threads an unprepared program must not have."""
 
 

@@ -58,7 +58,7 @@ def test_every_program_on_the_page_prints_what_the_page_shows(heading: str, tmp_
 
 
 def test_the_counter_is_the_one_of_the_readme() -> None:
-    """That one is killed and resumed in tests/failover/task/test_api.py."""
+    """That one is killed and resumed in tests/failover/kept_state/test_api.py."""
     (counter,) = HEADINGS[ENDLESS]
     assert f"```python\n{counter.text}```" in (PAGE.parent.parent / "README.md").read_text()
 

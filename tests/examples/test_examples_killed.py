@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engines.cooperative.session import regions_of
-from failover.task.file_store import StateFile, folder_of
+from failover.kept_state.file_store import StateFile, folder_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 KILLS = int(os.environ.get("FAILOVER_EXAMPLE_KILLS", "4"))

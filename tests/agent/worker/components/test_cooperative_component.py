@@ -33,7 +33,7 @@ NAME: Final = "/test/robot1/one"
 BEGIN = """
 import sys, time
 import failover
-from failover.task.api import resumed
+from failover.kept_state.api import resumed
 state = failover.resume("state", default={"step": 0})
 """
 PRINTS = BEGIN + "print('before')\nfailover.commit()\nprint('after', flush=True)\ntime.sleep(1000)\n"

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from typing import Final
 
 from failover.errors import TaskError
-from failover.task.api import PROCESS, Task
-from failover.task.period import FINISHED, Activations, Step
+from failover.kept_state.api import PROCESS, Task
+from failover.kept_state.period import FINISHED, Activations, Step
 
 LONGEST_PERIOD_S: Final = 1e6
 
@@ -73,7 +73,9 @@ class Turns:
                 stopping.is_between_steps = False
 
     def __aiter__(self) -> AsyncIterator[int]:
-        from failover.task.asyncio_loop import turns  # which takes its time to load: only a program with an asyncio loop pays
+        from failover.kept_state.asyncio_loop import (
+            turns,  # which takes its time to load: only a program with an asyncio loop pays
+        )
 
         return turns(self._task, self._period_ns)
 
@@ -100,7 +102,7 @@ def every(period: float) -> Turns:
 def run_steps(task: Task, step: Step, on_resume: Step | None, period_ns: int) -> None:
     """Call ``on_resume``, then the step again and again, committing each, until it returns `FINISHED` or SIGTERM comes."""
     if inspect.iscoroutinefunction(step):
-        from failover.task.asyncio_loop import run_steps_in_loop
+        from failover.kept_state.asyncio_loop import run_steps_in_loop
 
         run_steps_in_loop(task, step, on_resume, period_ns)
         return

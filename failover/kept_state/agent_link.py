@@ -40,7 +40,7 @@ from checkpoint.segment.task_messages import (
 )
 from checkpoint.sentences import in_words
 from failover.errors import NotCommittedError, TaskError
-from failover.task.output import OwnOutput
+from failover.kept_state.output import OwnOutput
 
 _CREDENTIALS: Final = struct.Struct("3i")
 _INT_SIZE: Final = array.array("i").itemsize

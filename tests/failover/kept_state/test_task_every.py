@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import failover
-from failover.task.api import PROCESS
+from failover.kept_state.api import PROCESS
 
 PERIOD_S = 0.001
 

@@ -6,8 +6,8 @@
         failover.commit()
 
 A process keeps one state; the functions here are about that one. Commits go to a segment in shared memory
-(`failover.task.state`). A folder beside the program takes them from there (`failover.task.file_store`). No call waits for a disk,
-except the one that says so.
+(`failover.kept_state.state`). A folder beside the program takes them from there (`failover.kept_state.file_store`). Only
+`wait_committed` waits for a disk.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from checkpoint.engines.cooperative.session import regions_of, this_machine
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Snapshot
 from failover.errors import NotCommittedError, TaskError
+from failover.kept_state.adopt_arrays import adopt
+from failover.kept_state.agent_link import Guarded, guarded
+from failover.kept_state.file_store import Recorder, StateFile, folder_of
+from failover.kept_state.period import Activations
+from failover.kept_state.state import KeptState
 from failover.state import Schema
-from failover.task.adopt_arrays import adopt
-from failover.task.agent_link import Guarded, guarded
-from failover.task.file_store import Recorder, StateFile, folder_of
-from failover.task.period import Activations
-from failover.task.state import KeptState
 
 S = TypeVar("S")
 

@@ -23,10 +23,10 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from failover.errors import SchemaError, TaskError
+from failover.kept_state.api import PROCESS, Resumed, Task, open_task
+from failover.kept_state.loop import LONGEST_PERIOD_S, run_steps
+from failover.kept_state.state import KeptState
 from failover.state import MISSING, Field, Schema
-from failover.task.api import PROCESS, Resumed, Task, open_task
-from failover.task.loop import LONGEST_PERIOD_S, run_steps
-from failover.task.state import KeptState
 
 T = TypeVar("T")
 C = TypeVar("C")

@@ -18,7 +18,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from typing import Any, Protocol, TypeVar, overload
 
 from failover.errors import TaskError
-from failover.task.api import PROCESS, commit, resume
+from failover.kept_state.api import PROCESS, commit, resume
 
 S = TypeVar("S")
 

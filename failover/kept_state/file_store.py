@@ -26,7 +26,7 @@ from checkpoint.store.store import open_store
 from failover.errors import NotCommittedError, StateTakenError, TaskError
 
 if TYPE_CHECKING:
-    from failover.task.state import KeptState
+    from failover.kept_state.state import KeptState
 
 log = logging.getLogger("failover.task")
 

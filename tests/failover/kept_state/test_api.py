@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 import failover
 from checkpoint.store.disk import Disk
 from failover.errors import FitError, KeepError, SchemaError
-from failover.task.api import PROCESS
-from failover.task.period import Activations
+from failover.kept_state.api import PROCESS
+from failover.kept_state.period import Activations
 
 ROOT = Path(__file__).parents[3]
 
@@ -330,7 +330,7 @@ def test_a_part_of_a_live_array_is_kept_as_that_part_whatever_its_size_was_befor
 
 
 def test_when_all_addresses_were_used_a_new_lineage_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("failover.task.state.MAX_PLACES", 6)
+    monkeypatch.setattr("failover.kept_state.state.MAX_PLACES", 6)
     state = failover.resume("maps", default=Maps(images={"fixed": np.ones(100_000, dtype=np.uint8)}))
     for number in range(20):
         state.images.pop(f"image {number - 1}", None)

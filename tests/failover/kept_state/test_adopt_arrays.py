@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from failover.kept_state.api import Task, open_task
 from failover.state import Schema
-from failover.task.api import Task, open_task
 
 LARGE = 1 << 20
 

@@ -8,7 +8,7 @@ import sys
 STUCK = """
 import os, sys
 from checkpoint.segment.output_counters import COUNTERS
-from failover.task.output import OwnOutput
+from failover.kept_state.output import OwnOutput
 counters = os.memfd_create("counters")
 os.pwrite(counters, COUNTERS.pack(1, 7, 0, 0, 0, 0), 0)
 output = OwnOutput(counters)

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from failover.task.state import LIVE_SIZE_MIN
+from failover.kept_state.state import LIVE_SIZE_MIN
 
 Make = Callable[[str, tuple[int, ...], np.dtype[Any]], NDArray[Any]]
 

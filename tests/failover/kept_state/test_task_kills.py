@@ -18,10 +18,10 @@ import pytest
 from numpy.typing import NDArray
 
 from checkpoint.engines.cooperative.session import CooperativeSession, regions_of
+from failover.kept_state.api import Task, open_task
+from failover.kept_state.file_store import StateFile, folder_of
+from failover.kept_state.state import KeptState
 from failover.state import Schema
-from failover.task.api import Task, open_task
-from failover.task.file_store import StateFile, folder_of
-from failover.task.state import KeptState
 from tests.checkpoint.store.test_store_power import CuttingDisk, PowerCutError, laid_out
 
 KILLS = int(os.environ.get("FAILOVER_TASK_KILLS", "200"))
@@ -152,8 +152,8 @@ def a_life_cut_short(root: Path, cut_at: int) -> tuple[CuttingDisk, int] | None:
 
 @pytest.mark.timeout(240)
 def test_power_may_be_cut_at_any_write_of_the_state_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("failover.task.file_store.SMALL_PAGES", 1)  # deltas, so that folding is cut, too
-    monkeypatch.setattr("failover.task.file_store.TIDY_S", 0.0)
+    monkeypatch.setattr("failover.kept_state.file_store.SMALL_PAGES", 1)  # deltas, so that folding is cut, too
+    monkeypatch.setattr("failover.kept_state.file_store.TIDY_S", 0.0)
     monkeypatch.setattr("checkpoint.store.fold_rules.CHEAP_DELTA_COUNT", 2)
     resumed = KeptState(schema_of("voyage"))
     for cut_at in itertools.count():

@@ -1,4 +1,4 @@
-"""Timed turns in an asyncio loop; `failover.task.loop` is the same for a thread."""
+"""Timed turns in an asyncio loop; `failover.kept_state.loop` is the same for a thread."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 
-from failover.task.api import Task
-from failover.task.period import FINISHED, Activations, Step
+from failover.kept_state.api import Task
+from failover.kept_state.period import FINISHED, Activations, Step
 
 
 async def turns(task: Task, period_ns: int) -> AsyncIterator[int]:
-    """The turns of an ``async for``, see `failover.task.loop.Turns`."""
+    """The turns of an ``async for``, see `failover.kept_state.loop.Turns`."""
     stopped = asyncio.Event()
     task.activations = Activations(period_ns, time.monotonic_ns())
     with _sigterm(stopped):
@@ -29,7 +29,7 @@ async def turns(task: Task, period_ns: int) -> AsyncIterator[int]:
 
 
 def run_steps_in_loop(task: Task, step: Step, on_resume: Step | None, period_ns: int) -> None:
-    """As `failover.task.loop.run_steps`, for a step that is a coroutine."""
+    """As `failover.kept_state.loop.run_steps`, for a step that is a coroutine."""
     asyncio.run(_run_steps(task, step, on_resume, period_ns))
 
 

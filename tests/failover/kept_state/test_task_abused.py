@@ -19,8 +19,8 @@ import pytest
 import failover
 from checkpoint.segment.task_messages import Begin, Safe, encode
 from failover.errors import KeepError, NotCommittedError, TaskError
-from failover.task.agent_link import Guarded
-from failover.task.api import PROCESS
+from failover.kept_state.agent_link import Guarded
+from failover.kept_state.api import PROCESS
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 60

@@ -28,7 +28,7 @@ from checkpoint.segment.task_messages import (
     from_program,
 )
 from failover.errors import NotCommittedError, TaskError
-from failover.task.agent_link import Guarded, guarded
+from failover.kept_state.agent_link import Guarded, guarded
 
 BEGIN = encode(Begin("/lab/heater", 3, (1, 2)))
 RESUMED = encode(Begin("/lab/heater", 4, (1, 2), Origin("robot1", 129, TAKEN_OVER, 5)))
