@@ -411,8 +411,14 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
         with contextlib.suppress(FileNotFoundError):
             socket_path.unlink()
         raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
-    early: list[Any] = []  # that come behind the answer, before the component is there to hear them
-    guard.heard = lambda message: isinstance(message, messages.Event) and not early.append(message)
+    early: list[Any] = []  # events behind the answer, which come before the component is there to hear them
+
+    def keep(message: Any) -> bool:
+        if is_event := isinstance(message, messages.Event):
+            early.append(message)
+        return is_event
+
+    guard.heard = keep
     described, streams = await guard.ask(messages.Describe())
     if described.state == "none":
         guard.close()
