@@ -181,7 +181,7 @@ class Switchboard:
             self.tell(event)
 
     def tell(self, event: Event) -> None:
-        """Pass an event to the core; what happens before the core is born waits for that: a program that was found may end meanwhile."""
+        """Pass an event to the core. An event waits until the core is born: a program that was found may end before."""
         if self._early is not None:
             self._early.append(event)
         else:
