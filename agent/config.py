@@ -381,7 +381,7 @@ def _check_tasks(path: Path, config: Config, members: Team) -> None:
         except KeyError as error:
             raise ConfigError(f"{where}: user = {task.user!r}: this robot has no such user; see getent passwd") from error
         if uid != os.geteuid() and os.geteuid() != 0:
-            raise ConfigError(f"{where}: user = {task.user!r}: this agent has no root's rights: it runs programs of its own user")
+            raise ConfigError(f"{where}: user = {task.user!r}: this agent does not run as root: it runs programs of its own user")
 
 
 def _uid_of(user: str) -> int:

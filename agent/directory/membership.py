@@ -37,7 +37,7 @@ def groups_of(direct: Mapping[str, str], holding: Callable[[Sequence[str]], Mapp
         names |= set(found.values())
         if len(seen) > GROUPS_MAX:
             raise DirectoryError(
-                f"the directory tells more than {GROUPS_MAX} groups of one user; no right is given by a part of them"
+                f"the directory tells more than {GROUPS_MAX} groups of one user; the agent gives no right by a part of them"
             )
         if not fringe:
             break

@@ -16,7 +16,7 @@ from agent.errors import DirectoryError
 from failover.config.rights import LdapConfig, is_loopback
 
 CLASSES: Final = "(|(objectClass=groupOfNames)(objectClass=groupOfUniqueNames)(objectClass=posixGroup)(objectClass=group))"
-EMPTY_PASSWORD: Final = "an empty password is never tried: a server may take it for nobody, and say yes"
+EMPTY_PASSWORD: Final = "the agent never tries an empty password: a server may accept it without a check (RFC 4513)"
 
 
 class WrongPasswordError(DirectoryError):

@@ -205,7 +205,7 @@ class GuardedProgram(Struct):
         """
         self._check_alive("have it begin")
         if self.committed or not self.warm:
-            raise ProgramError("it does not wait to begin: it was started to run, and runs")
+            raise ProgramError("cannot begin it: the guard has started it to run at once, and it runs")
         assert self.task is not None and self.pump is not None, "what is warm was born so"
         _open(self.pump, self.log_directory, order.totals)
         self.note_logs()

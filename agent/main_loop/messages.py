@@ -189,5 +189,5 @@ def _unpacked(decoders: dict[str, Any], message: Order | Happened) -> Any:
         return decoders[message.kind].decode(message.body)
     except (KeyError, msgspec.MsgspecError) as error:
         raise AgentError(
-            f"main loop and worker process do not understand each other: {message.kind}: {error}; restart it"
+            f"main loop and worker process do not understand each other: {message.kind}: {error}; restart the agent"
         ) from error

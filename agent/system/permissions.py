@@ -1,4 +1,4 @@
-"""Identifies the client of a control connection: by what the kernel says, never by what the client says.
+"""Identifies the client of a control connection by what the kernel says, and decides its rights where there is no rights.toml.
 
 Sources: unix(7) (SO_PEERCRED), socket(7), asm-generic/socket.h (SO_PEERGROUPS).
 """
@@ -115,12 +115,12 @@ def inheritance_for(caller: Caller, user: str) -> Inheritance:
     """
     ours = os.geteuid()
     if ours != ROOT and caller.uid not in (ROOT, ours):
-        raise RefusedError(f"this agent has no root's rights: it runs programs of uid {ours} alone", "PermissionError")
+        raise RefusedError(f"this agent does not run as root: it runs programs of uid {ours} alone", "PermissionError")
     wanted = _as_user(caller, user) if user else caller.inheritance
     if ours == ROOT:
         return wanted
     if user and wanted.uid != ours:
-        raise RefusedError(f"this agent has no root's rights: it runs programs of uid {ours} alone", "PermissionError")
+        raise RefusedError(f"this agent does not run as root: it runs programs of uid {ours} alone", "PermissionError")
     return wanted.as_user(ours, os.getegid(), tuple(os.getgroups()))
 
 

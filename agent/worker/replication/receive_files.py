@@ -108,7 +108,8 @@ class Stock:
         if not self._limits.bring:
             return f"{self._robot} lacks {named(lacking)} and takes no files of programs: install them there, or set bring = true"
         if undigested := [file for file in lacking if not file.digest]:
-            return f"{self._robot} lacks {named(undigested)}, too large or closed to be brought: install that there"
+            told = named(undigested)
+            return f"{self._robot} lacks {told}, which failover cannot bring: too large, or not readable; install them there"
         size = sum({file.digest: file.size for file in elsewhere}.values())
         if size > self._limits.size_max:
             largest = sorted(elsewhere, key=lambda file: -file.size)

@@ -167,7 +167,7 @@ class Shipper:
                     f"{transfer.peer} took nothing for {patience_s:.0f} s in the middle of a {transfer.what}"
                 ) from None
         if transfer.refused:
-            raise LaneError(f"{transfer.peer} gave the {transfer.what} back: {transfer.refused}")
+            raise LaneError(f"{transfer.peer} refused the {transfer.what}: {transfer.refused}")
 
 
 class Pace:
@@ -341,7 +341,7 @@ class Receiver:
             transfer.credit = end + WINDOW
             self._link.say(peer, Credit(offer.transfer, transfer.credit))
         if digest.digest() != offer.digest:
-            raise LaneError(f"{peer} sent {offer.size} bytes that have not the promised digest")
+            raise LaneError(f"{peer} sent {offer.size} bytes whose digest is not the promised digest")
 
 
 def _of(offer: Offered) -> str | bytes:

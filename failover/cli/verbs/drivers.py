@@ -33,7 +33,7 @@ def names(arguments: argparse.Namespace) -> int:
     tree = whole_tree(here())
     found = [_told(place) for place in tree.under(arguments.prefix)]
     if arguments.prefix and not found:
-        raise NameUnknownError(f"nothing is registered under {arguments.prefix}")
+        raise NameUnknownError(f"no driver is registered under {arguments.prefix}")
     if arguments.json:
         render.as_json({"names": found})
     else:

@@ -17,7 +17,7 @@ from msgspec import Struct
 from failover.core.schedule.terms import Kind, Terms
 
 FULL: Final = 0.9
-"""A higher load is told: nothing is left for what is not scheduled."""
+"""A higher load is told: nothing is left for other programs."""
 TURNS_MAX: Final = 10_000
 """Of one response time: periods that differ by so much are no schedule of one processor."""
 _NS: Final = 1e9
@@ -57,7 +57,7 @@ class Load(Struct, frozen=True):
             told = "for ever" if response is None else f"{response / _NS:g} s"
             return f"{self.late[0]} may take {told} {where}, longer than its deadline; --force takes it nevertheless"
         if self.share > FULL:
-            return f"the tasks {where} need {self.share:.0%} of it: little is left for what is not scheduled"
+            return f"the tasks {where} need {self.share:.0%} of it: little is left for other programs"
         return ""
 
 

@@ -157,7 +157,7 @@ def checked_terms(terms: Terms, what: str, cpus_there: int = 0) -> tuple[Terms, 
             if terms.overrun is Overrun.SKIP:
                 raise ScheduleError(
                     f"{what}: its deadline, {terms.deadline_ns / _NS:g} s, is longer than its period, "
-                    f"{terms.period_ns / _NS:g} s, and what falls due meanwhile is skipped; "
+                    f"{terms.period_ns / _NS:g} s, and activations that fall due meanwhile are skipped; "
                     "take overrun = 'queue', or a shorter deadline"
                 )
             notes.append("its deadline is longer than its period: activations that fall due meanwhile wait")

@@ -219,7 +219,7 @@ def test_a_file_that_could_not_be_digested_must_be_there(store: Store, tmp_path:
         path.write_bytes(b"huge")
         two = Two(store, tmp_path)
         await two.bring(Need(str(path), 4, b""))
-        with pytest.raises(LaneError, match=f"lacks {ELSEWHERE} .*too large or closed"):
+        with pytest.raises(LaneError, match=f"lacks {ELSEWHERE} .*too large, or not readable"):
             await two.bring(Need(ELSEWHERE, 4, b""))
 
     run(body())

@@ -33,7 +33,7 @@ def test_names_are_shown_as_a_tree(here: Here, capsys: pytest.CaptureFixture[str
         (name,) = json.loads(out)["names"]
         assert (status, name["path"], name["reach"], name["robot"]) == (0, ENGINE, "live", "robot1")
         assert name["verbs"]["set"] == {"role": "command", "arguments": {"duty": {"type": "number", "minimum": -1, "maximum": 1}}}
-        assert said(capsys, "names", "Lab/robot7")[::2] == (1, "failover: nothing is registered under Lab/robot7\n")
+        assert said(capsys, "names", "Lab/robot7")[::2] == (1, "failover: no driver is registered under Lab/robot7\n")
 
 
 def test_call_carries_out_a_verb(here: Here, capsys: pytest.CaptureFixture[str]) -> None:
