@@ -1,4 +1,4 @@
-"""This robot's board as the team file declares it: made when the agent starts, or taken over as it was left.
+"""The files of this robot's board as the team file declares it: made when the agent starts, or taken over as they were left.
 
 The memory outlives the agent: programs go on with it, and an agent that starts again finds it. Only if the declarations or the
 kernel's boot are others it is made anew; programs that have the old one open are told so, and open the new one.

@@ -1,1 +1,1 @@
-"""The control socket: verbs, queries, the status, how much each user may hold."""
+"""The control socket: verbs, queries, the status, which rights a user has (`rights_gate`) and how much it may hold (`quotas`)."""

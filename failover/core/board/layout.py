@@ -2,7 +2,7 @@
 
 This file turns bytes into values and values into bytes. It checks every offset and size that a file tells against the size of
 what is mapped, so that a damaged or hostile file is an error in a sentence and never an access outside of the mapping. It opens
-nothing: `failover.board` maps the files; `banks.py` has the order of the stores of a put and the loads of a get.
+nothing: `failover.boards` maps the files; `banks.py` has the order of the stores of a put and the loads of a get.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The rule of rights: groups × verbs × paths → allow or deny, and the sentence why.
 
-The first rule that denies wins, else any rule that allows, else the answer is deny. Without a file of rules today's rights hold
-(`without_rules`).
+The first rule that denies wins, else any rule that allows, else the answer is deny. Without a file of rules `without_rules` tells
+a person what `agent.system.permissions` decides.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
 """The schedule of one robot's tasks: their terms, their instants, their order, their bytes; pure.
 
-Imported by programs' loops (`failover.task`), the mapped table (`failover.schedule`), the agent and the commands.
+Imported by the mapped table (`failover.boards.schedule_file`), tasks as programs run them (`failover.schedule`), the periods of
+`failover.kept_state`, the agent and the commands.
 """

@@ -1,7 +1,8 @@
 """The bytes of a schedule's table: header, rows, terms, courses, histograms. SCHEDULE.md beside this file is normative.
 
 This file turns bytes into values and values into bytes, and checks each value that it reads: a row that another program has
-spoilt is an error in a sentence for that task, and stops no other one. It opens nothing: `failover.schedule` maps the table.
+spoilt is an error in a sentence for that task, and stops no other one. It opens nothing: `failover.boards.schedule_file` maps the
+table.
 """
 
 from __future__ import annotations
