@@ -139,7 +139,7 @@ def command_line() -> argparse.ArgumentParser:
     """What can be typed."""
     import argparse
 
-    from failover.cli.arguments import Parser
+    from failover.cli.arguments.shared import Parser
 
     parser = Parser(
         prog="failover-agent",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import importlib
 import io
 import os
 import sys
@@ -47,8 +46,10 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def _obeyed(arguments: argparse.Namespace) -> int:
+    from failover.cli.parser import load
+
     try:
-        verb = verb_function(arguments.function)
+        verb: Callable[[argparse.Namespace], int] = load(arguments.function)
         gc.freeze()
         gc.enable()
         early_interrupt.loaded()
@@ -65,13 +66,6 @@ def _obeyed(arguments: argparse.Namespace) -> int:
         return FAILED
     except OSError as error:
         return tell(error, arguments, FAILED)
-
-
-def verb_function(name: str) -> Callable[[argparse.Namespace], int]:
-    """Load ``module:function``."""
-    module, _, function = name.partition(":")
-    found: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), function)
-    return found
 
 
 def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:

@@ -1,20 +1,20 @@
 """Parser of the command line: every verb with its help and its examples; `failover.cli.arguments` has each verb's arguments.
 
-A verb is a row of the table at the bottom. The row names the function that carries it out as ``module:function``; it is loaded
-when the verb is used, so that ``failover status`` does not pay for ``failover demo``.
+A verb is a row of the table at the bottom. The row names two functions as ``module:function``: one adds the verb's arguments, one
+carries it out. They are loaded when the verb is used, so that ``failover status`` does not pay for ``failover demo``.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from importlib import import_module
 from textwrap import dedent
-from typing import Final
+from typing import Any, Final
 
 from msgspec import Struct
 
 from failover import __version__
-from failover.cli import arguments
+from failover.cli.arguments.shared import EXIT_STATUSES, Parser
 
 DESCRIPTION: Final = """
 When a robot dies, its programs resume at another robot, from where they were a fraction of a second ago.
@@ -43,23 +43,23 @@ class Verb(Struct, frozen=True):
     Attributes:
         summary: one line, for the list of verbs.
         description: what it does, and examples; dedented before it is shown.
-        arguments: adds the verb's own arguments to its parser.
+        arguments: ``module:function``; takes the verb's parser, adds the verb's own arguments to it.
         function: ``module:function``; takes the parsed arguments, returns the exit status.
     """
 
     name: str
     summary: str
     description: str
-    arguments: Callable[[argparse.ArgumentParser], None]
+    arguments: str
     function: str
 
 
 def build(verb: str = "") -> argparse.ArgumentParser:
     """The whole parser; of one verb's words the part that can read them, which takes a tenth of the time."""
-    parser = arguments.Parser(
+    parser = Parser(
         prog="failover",
         description=DESCRIPTION.strip(),
-        epilog=f"{PLACES.strip()}\n\n{arguments.EXIT_STATUSES} failover run and restore --wait: the program's own.",
+        epilog=f"{PLACES.strip()}\n\n{EXIT_STATUSES} failover run and restore --wait: the program's own.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -70,13 +70,19 @@ def build(verb: str = "") -> argparse.ArgumentParser:
             one.name,
             help=one.summary,
             description=dedent(one.description).strip(),
-            epilog=arguments.EXIT_STATUSES,
+            epilog=EXIT_STATUSES,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
         room.set_defaults(function=one.function)
-        one.arguments(room)
+        load(one.arguments)(room)
     return parser
+
+
+def load(name: str) -> Any:
+    """The function that ``module:function`` names."""
+    module, _, function = name.partition(":")
+    return getattr(import_module(module), function)
 
 
 VERBS: Final = (
@@ -91,7 +97,7 @@ VERBS: Final = (
           failover demo
           failover demo --json | jq .programs[0].outage_ms
         """,
-        arguments.demo,
+        "failover.cli.arguments.one_shot:demo",
         "failover.cli.demo.play:demo",
     ),
     Verb(
@@ -125,7 +131,7 @@ VERBS: Final = (
         The agent detects a program that says what must survive (docs/decorator.md), also below a shell or a launcher. Until the
         program says so, the agent captures it from outside, like any other program.
         """,
-        arguments.run,
+        "failover.cli.arguments.components:run",
         "failover.cli.verbs.components:run",
     ),
     Verb(
@@ -138,7 +144,7 @@ VERBS: Final = (
 
           failover protect 4711 --name /lab/robot1/mapper
         """,
-        arguments.protect,
+        "failover.cli.arguments.components:protect",
         "failover.cli.verbs.components:protect",
     ),
     Verb(
@@ -150,7 +156,7 @@ VERBS: Final = (
 
           failover release /lab/robot1/mapper
         """,
-        arguments.named,
+        "failover.cli.arguments.components:named",
         "failover.cli.verbs.components:release",
     ),
     Verb(
@@ -163,7 +169,7 @@ VERBS: Final = (
           failover stop /lab/robot1/mapper
           failover stop /lab/robot1/mapper --signal INT
         """,
-        arguments.stop,
+        "failover.cli.arguments.components:stop",
         "failover.cli.verbs.components:stop",
     ),
     Verb(
@@ -179,7 +185,7 @@ VERBS: Final = (
           failover status --watch
           failover status --json | jq '.components[].lag_ms'
         """,
-        arguments.status,
+        "failover.cli.arguments.status:status",
         "failover.cli.verbs.status:status",
     ),
     Verb(
@@ -193,7 +199,7 @@ VERBS: Final = (
           failover logs /lab/robot1/mapper
           failover logs --follow --stream 2 /lab/robot1/mapper
         """,
-        arguments.logs,
+        "failover.cli.arguments.components:logs",
         "failover.cli.verbs.components:logs",
     ),
     Verb(
@@ -209,7 +215,7 @@ VERBS: Final = (
           failover why /lab/robot1/mapper --since 10min
           failover why --robot robot2 --brief
         """,
-        arguments.why,
+        "failover.cli.arguments.status:why",
         "failover.cli.verbs.why:why",
     ),
     Verb(
@@ -223,7 +229,7 @@ VERBS: Final = (
           failover handover /lab/robot1/mapper
           failover handover /lab/robot1/mapper --to robot2
         """,
-        arguments.handover,
+        "failover.cli.arguments.components:handover",
         "failover.cli.verbs.components:handover",
     ),
     Verb(
@@ -235,7 +241,7 @@ VERBS: Final = (
 
           failover failback /lab/robot1/mapper
         """,
-        arguments.named,
+        "failover.cli.arguments.components:named",
         "failover.cli.verbs.components:failback",
     ),
     Verb(
@@ -253,7 +259,7 @@ VERBS: Final = (
           failover promote /lab/robot1/mapper
           failover promote /lab/robot1/mapper --robot robot2 --yes
         """,
-        arguments.promote,
+        "failover.cli.arguments.components:promote",
         "failover.cli.verbs.components:promote",
     ),
     Verb(
@@ -265,7 +271,7 @@ VERBS: Final = (
 
           failover prefer /lab/robot1/mapper robot1
         """,
-        arguments.prefer,
+        "failover.cli.arguments.components:prefer",
         "failover.cli.verbs.components:prefer",
     ),
     Verb(
@@ -280,7 +286,7 @@ VERBS: Final = (
           failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
           failover team show
         """,
-        arguments.team,
+        "failover.cli.arguments.team:team",
         "failover.cli.verbs.team:show",
     ),
     Verb(
@@ -294,7 +300,7 @@ VERBS: Final = (
           failover rights list
           failover rights why user1 call University/Lab/Robotino/Engines/3/PWM
         """,
-        arguments.rights,
+        "failover.cli.arguments.rights:rights",
         "failover.cli.verbs.rights:show",
     ),
     Verb(
@@ -313,7 +319,7 @@ VERBS: Final = (
           failover board header > items.h
           failover board import rtdb.conf -I include
         """,
-        arguments.board,
+        "failover.cli.arguments.board:board",
         "failover.cli.verbs.board:show",
     ),
     Verb(
@@ -327,7 +333,7 @@ VERBS: Final = (
           failover ps
           failover ps --watch
         """,
-        arguments.ps,
+        "failover.cli.arguments.tasks:ps",
         "failover.cli.verbs.tasks:show",
     ),
     Verb(
@@ -344,7 +350,7 @@ VERBS: Final = (
           failover task run logger period_ms=1000 -- ./log-disk
           failover task histogram mapper
         """,
-        arguments.task,
+        "failover.cli.arguments.tasks:task",
         "failover.cli.verbs.tasks:show",
     ),
     Verb(
@@ -357,7 +363,7 @@ VERBS: Final = (
 
           failover trace -o robot.pftrace --for 10s
         """,
-        arguments.trace,
+        "failover.cli.arguments.tasks:trace",
         "failover.cli.verbs.task_files:write_trace",
     ),
     Verb(
@@ -370,7 +376,7 @@ VERBS: Final = (
           failover wait-activation
           while failover wait-activation -q; do df / >> disk.log; done
         """,
-        arguments.wait_activation,
+        "failover.cli.arguments.tasks:wait_activation",
         "failover.cli.verbs.task_programs:wait_activation",
     ),
     Verb(
@@ -384,7 +390,7 @@ VERBS: Final = (
           failover names University/Lab/Robotino
           failover names --json | jq .names[0].verbs
         """,
-        arguments.names,
+        "failover.cli.arguments.drivers:names",
         "failover.cli.verbs.drivers:names",
     ),
     Verb(
@@ -398,7 +404,7 @@ VERBS: Final = (
           failover call University/Lab/Robotino/Engines/3/PWM read
           failover call engine set 0.4 --timeout-s 0.5
         """,
-        arguments.call,
+        "failover.cli.arguments.drivers:call",
         "failover.cli.verbs.drivers:call",
     ),
     Verb(
@@ -411,7 +417,7 @@ VERBS: Final = (
           failover send engine '{"verb": "read"}'
           failover send engine '{"verb": "set", "body": {"duty": 0.4}, "id": "mine-1"}'
         """,
-        arguments.send,
+        "failover.cli.arguments.drivers:send",
         "failover.cli.verbs.drivers:send",
     ),
     Verb(
@@ -423,7 +429,7 @@ VERBS: Final = (
 
           failover path robot1/failover-4711-1-18f3a2b-1
         """,
-        arguments.path,
+        "failover.cli.arguments.drivers:path",
         "failover.cli.verbs.drivers:path",
     ),
     Verb(
@@ -438,7 +444,7 @@ VERBS: Final = (
           failover check 4711
           failover check --table
         """,
-        arguments.check,
+        "failover.cli.arguments.one_shot:check",
         "failover.cli.verbs.one_shot:check",
     ),
     Verb(
@@ -451,7 +457,7 @@ VERBS: Final = (
           failover capture 4711 -o mapper.snapshot
           failover capture 4711 -o before.snapshot --leave-running
         """,
-        arguments.capture,
+        "failover.cli.arguments.one_shot:capture",
         "failover.cli.verbs.one_shot:capture",
     ),
     Verb(
@@ -468,7 +474,7 @@ VERBS: Final = (
           failover restore mapper.snapshot
           failover restore --wait mapper.snapshot && echo it ended well
         """,
-        arguments.restore,
+        "failover.cli.arguments.one_shot:restore",
         "failover.cli.verbs.one_shot:restore",
     ),
     Verb(
@@ -480,7 +486,7 @@ VERBS: Final = (
           failover inspect mapper.snapshot
           failover inspect --json mapper.snapshot | jq .position
         """,
-        arguments.inspect,
+        "failover.cli.arguments.one_shot:inspect",
         "failover.cli.verbs.inspect_file:inspect",
     ),
     Verb(
@@ -491,7 +497,7 @@ VERBS: Final = (
 
           failover completion bash > ~/.local/share/bash-completion/completions/failover
         """,
-        arguments.completion,
+        "failover.cli.arguments.one_shot:completion",
         "failover.cli.completion:completion",
     ),
 )

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final
 
-from failover.cli.arguments import HOOKS
+from failover.cli.arguments.components import HOOKS
 from failover.cli.connection import connect
 from failover.cli.output import render, team_tree
 from failover.client.control import Control, Output, Result, Update

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from failover.cli import arguments
+from failover.cli.arguments.status import ago
 from failover.cli.verbs.why import paragraph, sighting, told_of_robots
 
 SILENT: dict[str, Any] = {
@@ -109,10 +109,10 @@ SPANS = (("90s", 90_000), ("10min", 600_000), ("2h", 7_200_000), ("3d", 259_200_
 
 @pytest.mark.parametrize(("text", "age_ms"), SPANS)
 def test_a_span_of_time_is_read_as_people_write_it(text: str, age_ms: int) -> None:
-    assert arguments.ago(text) == age_ms
+    assert ago(text) == age_ms
 
 
 @pytest.mark.parametrize("text", ["", "10", "min", "0s", "-5s", "1w", "5 s", "99999999999h", "1.5h"])
 def test_what_is_no_span_of_time_is_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="write 90s, 10min, 2h or 3d"):
-        arguments.ago(text)
+        ago(text)

@@ -1,0 +1,141 @@
+"""run, protect, release, stop, logs, handover, failback, promote, prefer: one component of a team."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from typing import Final
+
+from checkpoint.program import cpu_baseline
+from checkpoint.sentences import near
+from failover.cli.arguments.resources import (
+    REFUSES,
+    RESETS,
+    add_carry,
+    add_connections,
+    add_devices,
+    add_shared_files,
+    add_shared_memory,
+)
+from failover.cli.arguments.shared import add_agent, add_name, add_pid
+
+HOOKS: Final = {
+    "before_capture": "before the agent takes a whole snapshot of it, and before the last one of a handover",
+    "before_resume": "on a robot, before it resumes there",
+    "after_resume": "on a robot, after it resumed there; FAILOVER_* variables tell robot, epoch, generation and reason",
+}
+"""Occasions for a command that comes with a program, and when they are."""
+
+
+def run(room: argparse.ArgumentParser) -> None:
+    """Of ``failover run``."""
+    room.add_argument(
+        "--name", metavar="NAME", help="its name, a path such as /lab/robot1/mapper (default: made from the command)"
+    )
+    room.add_argument("--detach", action="store_true", help="print the name and return; see failover logs")
+    room.add_argument(
+        "--no-isolate", dest="isolate", action="store_false", help="keep it in this machine's PIDs and clocks (default: its own)"
+    )
+    room.add_argument(
+        "--engine",
+        choices=("auto", "ptrace", "cooperative"),
+        default="auto",
+        help="ptrace: the agent captures the program from outside; cooperative: the program itself says what "
+        "must survive (failover.resume, failover.component), and starts again from that (default: auto: the agent detects it)",
+    )
+    room.add_argument(
+        "--portable",
+        nargs="?",
+        choices=("no", *cpu_baseline.LEVELS),
+        const=cpu_baseline.DEFAULT,
+        default="",
+        metavar="LEVEL",
+        help="have libraries choose code that every processor of a level can run, so that it can resume at lesser processors: "
+        f"{', '.join(cpu_baseline.LEVELS)}, or no (default: as agent.toml says; without LEVEL: {cpu_baseline.DEFAULT})",
+    )
+    room.add_argument(
+        "--output",
+        choices=("immediate", "committed"),
+        default="immediate",
+        help="committed: show output only once another robot holds a checkpoint that contains it; then no takeover takes back or "
+        "repeats output that you saw (default: immediate: show it as the program writes it)",
+    )
+    for hook, when in HOOKS.items():
+        option = f"--{hook.replace('_', '-')}"
+        room.add_argument(option, metavar="CMD", type=shlex.split, default=[], help=f"run this, as you, {when}")
+    add_carry(room)
+    add_shared_files(room)
+    add_devices(room)
+    add_connections(room, f"{RESETS}; carry: a handover takes those of TCP along; {REFUSES} (default: as agent.toml says: reset)")
+    add_shared_memory(room, "as agent.toml says: refuse")
+    room.add_argument("--user", metavar="USER", help="run it as this user, by name or number (only root may; default: as you)")
+    room.add_argument("command", metavar="CMD", nargs="+", help="the program and its arguments, after --")
+    add_agent(room)
+
+
+def protect(room: argparse.ArgumentParser) -> None:
+    """Of ``failover protect``."""
+    add_pid(room)
+    room.add_argument("--name", metavar="NAME", help="its name (default: /TEAM/ROBOT/pid-PID)")
+    add_carry(room)
+    add_shared_files(room)
+    add_devices(room)
+    add_connections(room, f"{RESETS}; carry: a handover takes those of TCP along; {REFUSES} (default: as agent.toml says: reset)")
+    add_shared_memory(room, "as agent.toml says: refuse")
+    add_agent(room)
+
+
+def named(room: argparse.ArgumentParser) -> None:
+    """Of a verb about one component that takes no more."""
+    add_name(room)
+    add_agent(room)
+
+
+def stop(room: argparse.ArgumentParser) -> None:
+    """Of ``failover stop``."""
+    add_name(room)
+    room.add_argument("--signal", metavar="N", type=signal_number, default=15, help="number or name (default: TERM)")
+    add_agent(room)
+
+
+def logs(room: argparse.ArgumentParser) -> None:
+    """Of ``failover logs``."""
+    add_name(room)
+    room.add_argument("-f", "--follow", action="store_true", help="follow until the program ends, or Ctrl-C")
+    room.add_argument("--stream", type=int, choices=(1, 2), help="standard output (1) or standard error (2) alone")
+    add_agent(room)
+
+
+def handover(room: argparse.ArgumentParser) -> None:
+    """Of ``failover handover``."""
+    add_name(room)
+    room.add_argument("--to", metavar="ROBOT", help="the target robot (default: its standby)")
+    add_agent(room)
+
+
+def promote(room: argparse.ArgumentParser) -> None:
+    """Of ``failover promote``."""
+    add_name(room)
+    room.add_argument(
+        "--robot", metavar="ROBOT", help="the robot that shall run it (default: the one with the newest checkpoint)"
+    )
+    room.add_argument("-y", "--yes", action="store_true", help="do not ask for confirmation, at any risk")
+    add_agent(room)
+
+
+def prefer(room: argparse.ArgumentParser) -> None:
+    """Of ``failover prefer``."""
+    add_name(room)
+    room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
+    add_agent(room)
+
+
+def signal_number(text: str) -> int:
+    """A signal's number, from a number or a name with or without SIG."""
+    import signal
+
+    try:
+        return signal.Signals(int(text)) if text.isdecimal() else signal.Signals["SIG" + text.upper().removeprefix("SIG")]
+    except (ValueError, KeyError):
+        meant = near(text.upper(), (one.name.removeprefix("SIG") for one in signal.Signals))
+        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM{meant}") from None

@@ -1,0 +1,32 @@
+"""status and why: how the team is, and how it came to that."""
+
+from __future__ import annotations
+
+import argparse
+
+from failover.cli.arguments.shared import add_agent, positive
+from failover.config.quantities import span_ms
+
+
+def status(room: argparse.ArgumentParser) -> None:
+    """Of ``failover status``."""
+    room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
+    room.add_argument("--every-ms", metavar="MS", type=positive, default=500, help="with --watch (default: 500)")
+    add_agent(room)
+
+
+def why(room: argparse.ArgumentParser) -> None:
+    """Of ``failover why``."""
+    room.add_argument("name", metavar="NAME", nargs="?", help="only this component, and how its robots saw each other")
+    room.add_argument("--robot", metavar="ROBOT", help="only the entries of that robot")
+    room.add_argument("--since", metavar="AGO", type=ago, help="only younger entries: 90s, 10min, 2h, 3d")
+    room.add_argument("-b", "--brief", action="store_true", help="one line each, without the facts below it")
+    add_agent(room)
+
+
+def ago(text: str) -> int:
+    """A span of time such as 90s or 10min, in milliseconds."""
+    try:
+        return span_ms(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
