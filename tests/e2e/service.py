@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final
 
 from failover.client.control import Control, Output, Result
-from tests.e2e import robots
+from tests.e2e import machines, robots
 from tests.e2e.machines import CHECKOUT, Machine
 
 SERVICE: Final = "failover-agent.service"
@@ -28,6 +31,37 @@ def make_team(machine: Machine, **addresses: str) -> None:
     machine.run("failover", "team", "create", "lab")
     for robot, address in addresses.items():
         machine.run("failover", "team", "enrol", robot, address)
+
+
+@contextmanager
+def robot_with_users(directory: Path, **uids: int) -> Iterator[Machine]:
+    """A booted robot, alone in its team, with users who are members of the agent's group. The service is not started yet.
+
+    Args:
+        directory: for its root and its boot log.
+        uids: each user's number, by name.
+    """
+    with machines.booted(directory, "robot1") as machine:
+        install(machine)
+        make_team(machine, robot1="127.0.0.1")
+        accounts = "".join(f"u {name} {uid} - /tmp\nm {name} failover\n" for name, uid in uids.items())
+        (machine.root / "etc/users.conf").write_text(accounts)
+        machine.run("systemd-sysusers", "/etc/users.conf")
+        machine.run("sed", "-i", 's/^#group = .*/group = "failover"/', "/etc/failover/agent.toml")
+        yield machine
+        print(machine.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
+
+
+def as_user(machine: Machine, user: str, *command: str) -> tuple[int, str]:
+    """Run a user's command there; its exit status, and all that it said.
+
+    Args:
+        user: a name, with the groups of its account; or a number, without any.
+    """
+    groups = "--clear-groups" if user.isdecimal() else "--init-groups"
+    become = [] if user == "root" else ["setpriv", f"--reuid={user}", f"--regid={user}", groups]
+    ran = machine.run(*become, *command, check=False)
+    return ran.returncode, ran.stdout + ran.stderr
 
 
 def control(machine: Machine) -> Control:

@@ -15,7 +15,7 @@ from tests.agent.directory.slapd import ORDINARY, SECRET, SERVICE, Slapd
 from tests.e2e import machines, robots
 from tests.e2e import service as services
 from tests.e2e.machines import Machine
-from tests.e2e.service import install, make_team, started, status
+from tests.e2e.service import as_user, robot_with_users, started, status
 
 pytestmark = [
     pytest.mark.root,
@@ -23,7 +23,6 @@ pytestmark = [
     pytest.mark.skipif(bool(machines.why_not() or slapd.why_not()), reason=machines.why_not() or slapd.why_not() or "-"),
 ]
 
-USERS = "u driver 7001 - /tmp\nu operator 7002 - /tmp\nm driver failover\nm operator failover\n"
 PWM = "University/Lab/Robotino/Engines/3/PWM"
 RULES = """
 [rights]
@@ -52,14 +51,8 @@ paths = ["**"]
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A robot with two users."""
-    with machines.booted(tmp_path_factory.mktemp("machines"), "robot1") as booted:
-        install(booted)
-        make_team(booted, robot1="127.0.0.1")
-        (booted.root / "etc/users.conf").write_text(USERS)
-        booted.run("systemd-sysusers", "/etc/users.conf")
-        booted.run("sed", "-i", 's/^#group = .*/group = "failover"/', "/etc/failover/agent.toml")
+    with robot_with_users(tmp_path_factory.mktemp("machines"), driver=7001, operator=7002) as booted:
         yield booted
-        print(booted.run("journalctl", "--unit", services.SERVICE, "--no-pager", "--lines=100", check=False).stdout)
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +67,6 @@ def server(machine: Machine) -> Iterator[Slapd]:
         (folder / "team/rights.toml").write_text(RULES.format(port=found.port_tls, account=SERVICE))
         machine.run("systemctl", "start", services.SERVICE)
         yield found
-
-
-def as_user(machine: Machine, user: str, *command: str) -> tuple[int, str]:
-    """A user's command; its exit status, and all that it said."""
-    become = [] if user == "root" else ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"]
-    ran = machine.run(*become, *command, check=False)
-    return ran.returncode, ran.stdout + ran.stderr
 
 
 def directory_units(machine: Machine) -> list[str]:

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.e2e import machines, robots
+from tests.e2e import machines, robots, service
 from tests.e2e.machines import Machine
-from tests.e2e.service import SERVICE, component, install, make_team
+from tests.e2e.service import SERVICE, component
 
 pytestmark = [
     pytest.mark.root,
@@ -20,12 +20,6 @@ pytestmark = [
     pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-"),
 ]
 
-USERS = """
-u alice 7001 "-" /tmp
-u bob 7002 "-" /tmp
-m alice failover
-m bob failover
-"""
 STRANGER = 7003
 """No member of the group."""
 
@@ -62,27 +56,17 @@ while True:
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A robot with two people on it."""
-    with machines.booted(tmp_path_factory.mktemp("machines"), "robot1") as booted:
-        install(booted)
-        make_team(booted, robot1="127.0.0.1")
-        (booted.root / "etc/users.conf").write_text(USERS)
-        booted.run("systemd-sysusers", "/etc/users.conf")
-        booted.run("sed", "-i", 's/^#group = .*/group = "failover"/', "/etc/failover/agent.toml")
+    with service.robot_with_users(tmp_path_factory.mktemp("machines"), alice=7001, bob=7002) as booted:
         for name, program in {"portrait": PORTRAIT, "writer": WRITER}.items():
             (booted.root / f"etc/{name}.py").write_text(program)
         booted.run("install", "-d", "-m755", "-oalice", "/var/alice")  # not sticky: there the kernel itself refuses to follow
         booted.run("systemctl", "start", SERVICE)
         yield booted
-        print(booted.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
 
 
 def as_user(machine: Machine, user: str, script: str) -> tuple[int, str]:
-    """Have somebody's shell run a script; its exit status, and all that was said."""
-    become = [] if user == "root" else ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"]
-    if user.isdecimal():
-        become = [*become[:-1], "--clear-groups"]
-    ran = machine.run(*become, "bash", "-c", script, check=False)
-    return ran.returncode, ran.stdout + ran.stderr
+    """Have a user's shell run a script; its exit status, and all that was said."""
+    return service.as_user(machine, user, "bash", "-c", script)
 
 
 @pytest.fixture(scope="module")
