@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import os
 import signal
 import struct
 import threading
+from collections import Counter
 from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
@@ -78,6 +80,23 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeSch
                 super()._reschedule(node)
 
     return OneStage(config, log)
+
+
+# --- Where the time goes ---------------------------------------------------------------------------------------------
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """With ``--durations``, how many seconds each worker spent in which folder: a run lasts as long as its last worker."""
+    if config.getoption("durations") is None:
+        return
+    spent: dict[str, Counter[str]] = {}
+    for report in itertools.chain.from_iterable(terminalreporter.stats.values()):
+        if isinstance(report, pytest.TestReport):
+            folder = "/".join(report.nodeid.split("::")[0].split("/")[:-1][:2]) or "."
+            spent.setdefault(getattr(report, "worker_id", "here"), Counter())[folder] += report.duration
+    for worker, folders in sorted(spent.items()):
+        told = ", ".join(f"{folder} {seconds:.0f} s" for folder, seconds in folders.most_common())
+        terminalreporter.write_line(f"{worker}: {sum(folders.values()):.0f} s: {told}")
 
 
 # --- The limit of a test ---------------------------------------------------------------------------------------------
