@@ -17,6 +17,7 @@ from checkpoint.snapshot.canonical_state import Header
 
 BASE_SUFFIX = ".base"
 DELTA_SUFFIX = ".delta"
+SUFFIXES = (BASE_SUFFIX, DELTA_SUFFIX)
 
 FOLDER_PREFIX = "@"
 """Begins the name of a component's folder, so that no component is called "..", "lock" or "aside"."""

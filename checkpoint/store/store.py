@@ -11,16 +11,13 @@ for the second alone: a takeover never waits for a snapshot that is being writte
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
-import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -31,22 +28,20 @@ from checkpoint.snapshot import format
 from checkpoint.snapshot.canonical_state import header_of
 from checkpoint.snapshot.required_files import needs
 from checkpoint.snapshot.validity import place
-from checkpoint.store import chain
-from checkpoint.store.atomic_files import TEMPORARY_PREFIX, WholeFiles, disk_trouble
-from checkpoint.store.base_on_disk import stored_chain
+from checkpoint.store import inventory
+from checkpoint.store.atomic_files import WholeFiles, disk_trouble
+from checkpoint.store.chain_files import ChainFiles, entry_of
 from checkpoint.store.content_store import Contents
-from checkpoint.store.disk import Disk, DiskFile, lock_exclusively
-from checkpoint.store.fold_rules import fold_is_due, held_at_once, newest_output
-from checkpoint.store.folding import Folding
-from checkpoint.store.index import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, Entry, Shelf, file_name, folder_name, order_of_name
+from checkpoint.store.disk import Disk, lock_exclusively
+from checkpoint.store.fold_rules import fold_is_due, held_at_once
+from checkpoint.store.index import SUFFIXES, Entry, Shelf, file_name, folder_name, order_of_name
+from checkpoint.store.inventory import why_not_ours
 from checkpoint.store.retention import HISTORY_FOLDER, History, Retention
 from checkpoint.store.verify import Proofs
 from checkpoint.store.xor_cache import CACHE_SIZE
 from checkpoint.store.xor_cache_budget import PageBudget
 
 log = logging.getLogger("failover.store")
-
-SUFFIXES = (BASE_SUFFIX, DELTA_SUFFIX)
 
 ASIDE_FOLDER = "aside"
 """Holds what is kept for inspection only."""
@@ -60,8 +55,6 @@ NOTICES_KEPT = 100
 """Notices about files that were found damaged or left over."""
 
 NOTHING_OLD = Retention()
-
-A = TypeVar("A")
 
 
 class Kept(Struct, frozen=True):
@@ -91,6 +84,7 @@ class Store:
         self.contents = Contents(root, self._files)
         """Files that programs brought along."""
         self._named: dict[Path, frozenset[bytes]] = {}
+        self._chains = ChainFiles(root, self._files, self._set_out_of_use)
         self._history = History(root, self._files, retention)
         self._lock_descriptor = lock
         self._lock = threading.RLock()
@@ -177,33 +171,11 @@ class Store:
             StoreError: there is none, or the position that was asked for is damaged.
         """
         while True:
-            folded = self._try_fold(component, self.chain_of(component, position))
+            folded = self._chains.load(component, self.chain_of(component, position))
             if folded is not None:
                 return folded
             if position is not None:
                 raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
-
-    def _try_fold(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
-        """The folded chain, or None when a file of it had to be set out of use."""
-        snapshots = self._all_decoded(component, entries)
-        if snapshots is None:
-            return None
-        try:
-            return chain.fold(snapshots)
-        except ChainError as error:
-            self._set_out_of_use(component, entries[-1], str(error))
-            return None
-
-    def _all_decoded(self, component: str, entries: tuple[Entry, ...]) -> list[Snapshot] | None:
-        """All of these files, or None when one of them had to be set out of use."""
-        snapshots = []
-        for entry in entries:
-            try:
-                snapshots.append(format.decode(entry.path))
-            except FormatError as error:
-                self._set_out_of_use(component, entry, str(error))
-                return None
-        return snapshots
 
     def kept(self, component: str) -> Kept | None:
         """The stored snapshots of a component; None if there are none."""
@@ -246,7 +218,7 @@ class Store:
             final = self._root / folder_name(snapshot.component) / file_name(header_of(snapshot))
             if all(entry.path != final for entry in shelf.entries):
                 size = self._files.write(final, lambda file: file.copy_from(source), source)
-                self._add(snapshot.component, _entry_of(final, snapshot, size))
+                self._add(snapshot.component, entry_of(final, snapshot, size))
             if proved is not None:
                 self._proofs.keep(snapshot.component, proved)
             else:  # a snapshot made here is not proved: pages remembered while it came from elsewhere are of no use
@@ -335,14 +307,14 @@ class Store:
 
         Raises:
             StoreError: the position cannot be loaded, or the disk does not take the base.
-            FormatError: see `_write_fold`.
+            FormatError: see `ChainFiles.write_base`.
         """
         is_there = False
         while not is_there:
             entries = held_at_once(self.chain_of(component, position))
             reached = entries[-1].position
             is_there = reached == position
-            written = self._write_fold(component, entries)
+            written = self._chains.write_base(component, entries)
             if written is None:
                 raise StoreError(f"position {place(position)} of {component} cannot be restored: {self.notices[-1]}")
             with self._change_of(component):
@@ -350,48 +322,6 @@ class Store:
                     self._files.remove(written.path)
                     return
                 self._add(component, written)
-
-    def _write_fold(self, component: str, entries: tuple[Entry, ...]) -> Entry | None:
-        """Write a chain as one base, or answer None when a file of it had to be set out of use.
-
-        Raises:
-            FormatError: what it amounts to cannot be written; its files are not to blame, and stay.
-        """
-        deltas = self._all_decoded(component, entries[1:])
-        is_tree = self._read(component, entries, lambda: format.is_of_several_processes(entries[0].path))
-        if deltas is None or is_tree is None:
-            return None
-        if deltas and not is_tree and not any(delta.is_tree for delta in deltas):
-            return self._write_straight(component, entries, deltas)
-        whole = self._read(component, entries, lambda: chain.fold([format.decode(entries[0].path), *deltas]))
-        if whole is None:
-            return None
-        folded = replace(whole, output=newest_output(whole.output))
-        return self._write_base(folded, lambda file: format.encode(folded, file))
-
-    def _write_straight(self, component: str, entries: tuple[Entry, ...], deltas: list[Snapshot]) -> Entry | None:
-        """The same of one process, frame by frame."""
-        with contextlib.ExitStack() as open_files:
-            stored = self._read(component, entries, lambda: open_files.enter_context(stored_chain(entries[0].path, deltas)))
-            if stored is None:
-                return None
-            folded = replace(stored.outline, output=newest_output(stored.outline.output))
-            folding = Folding(stored, folded)
-            return self._read(component, entries, lambda: self._write_base(folded, folding.write))
-
-    def _read(self, component: str, entries: tuple[Entry, ...], act: Callable[[], A]) -> A | None:
-        """The answer of an act that reads a chain's base, or None when a file had to be set out of use."""
-        try:
-            return act()
-        except FormatError as error:
-            self._set_out_of_use(component, entries[0], str(error))
-        except ChainError as error:
-            self._set_out_of_use(component, entries[-1], str(error))
-        return None
-
-    def _write_base(self, folded: Snapshot, write: Callable[[DiskFile], int]) -> Entry:
-        final = self._root / folder_name(folded.component) / file_name(header_of(folded))
-        return _entry_of(final, folded, self._files.write(final, write))
 
     def set_aside(self, component: str, generations: Iterable[int]) -> Path | None:
         """Take generations out of the chain; their newest state is kept as one file for inspection.
@@ -502,36 +432,10 @@ class Store:
     def read_folders(self) -> None:
         """Find out what is there: remove leftovers, verify every file, keep what is intact."""
         with disk_trouble(f"read the store {self._root}"):
-            for folder in sorted(self._root.iterdir()):
-                if folder.is_dir():
-                    self._read_folder(folder)
+            for component, entry in inventory.intact_files(self._root, self._files, self._notice):
+                self._add(component, entry)
             self._history.read()
         self.contents.mend()
-
-    def _read_folder(self, folder: Path) -> None:
-        for path in sorted(folder.iterdir()):
-            if path.name.startswith(TEMPORARY_PREFIX):
-                self._files.remove(path)
-                self._notice(f"{path} had not arrived whole and was removed")
-            elif folder.name.startswith(FOLDER_PREFIX) and path.suffix in SUFFIXES:
-                self._read_file(path)
-
-    def _read_file(self, path: Path) -> None:
-        if why := why_not_ours(path.lstat()):
-            self._notice(f"{path}: {why}; it is not used")
-            return
-        try:
-            header = format.verify(path)
-        except FormatError as error:
-            self._files.set_out_of_use(path)
-            self._notice(f"{error}; it is not used")
-            return
-        if (path.parent.name, path.name) != (folder_name(header.component), file_name(header)):
-            self._notice(f"{path} holds {place(header.position)} of {header.component}, which is not its name; it is not used")
-            return
-        stored = path.stat()
-        entry = Entry(path, header.position, header.parent, header.epoch, stored.st_size, stored.st_mtime)
-        self._shelves[header.component] = self._shelf(header.component).with_entry(entry)
 
 
 def open_store(
@@ -568,19 +472,3 @@ def open_store(
         store.close()
         raise
     return store
-
-
-def why_not_ours(about: os.stat_result) -> str:
-    """Why a file or folder of a store may be another user's word; "" if it is ours or root's alone.
-
-    A restore gives a program the rights that its snapshot says.
-    """
-    if about.st_uid not in (os.geteuid(), 0):
-        return f"it belongs to uid {about.st_uid}"
-    if stat.S_ISLNK(about.st_mode):
-        return "it is a symbolic link"
-    return f"others may write to it (mode {stat.S_IMODE(about.st_mode):o})" if about.st_mode & 0o022 else ""
-
-
-def _entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
-    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())

@@ -1,0 +1,110 @@
+"""The files of a chain read together: as one state in memory (`chain`), or written as the file of one base (`folding`).
+
+A file that turns out to be damaged is set out of use. The answer is None then; another chain may lead to an older position.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from msgspec.structs import replace
+
+from checkpoint.errors import ChainError, FormatError
+from checkpoint.model import Snapshot
+from checkpoint.snapshot import format
+from checkpoint.snapshot.canonical_state import header_of
+from checkpoint.store import chain
+from checkpoint.store.atomic_files import WholeFiles
+from checkpoint.store.base_on_disk import stored_chain
+from checkpoint.store.disk import DiskFile
+from checkpoint.store.fold_rules import newest_output
+from checkpoint.store.folding import Folding
+from checkpoint.store.index import Entry, file_name, folder_name
+
+A = TypeVar("A")
+
+
+class ChainFiles:
+    """Reads chains of the store at ``root``. Methods may be called from any thread.
+
+    Args:
+        set_out_of_use: called with (component, file, why) for a file that is damaged.
+    """
+
+    def __init__(self, root: Path, files: WholeFiles, set_out_of_use: Callable[[str, Entry, str], None]) -> None:
+        self._root = root
+        self._files = files
+        self._set_out_of_use = set_out_of_use
+
+    def load(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
+        """The state that a chain leads to, or None when a file of it had to be set out of use."""
+        snapshots = self._all_decoded(component, entries)
+        if snapshots is None:
+            return None
+        try:
+            return chain.fold(snapshots)
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+            return None
+
+    def write_base(self, component: str, entries: tuple[Entry, ...]) -> Entry | None:
+        """Write a chain as one base, or answer None when a file of it had to be set out of use.
+
+        Raises:
+            FormatError: what it amounts to cannot be written; its files are not to blame, and stay.
+        """
+        deltas = self._all_decoded(component, entries[1:])
+        is_tree = self._read(component, entries, lambda: format.is_of_several_processes(entries[0].path))
+        if deltas is None or is_tree is None:
+            return None
+        if deltas and not is_tree and not any(delta.is_tree for delta in deltas):
+            return self._write_straight(component, entries, deltas)
+        whole = self._read(component, entries, lambda: chain.fold([format.decode(entries[0].path), *deltas]))
+        if whole is None:
+            return None
+        folded = replace(whole, output=newest_output(whole.output))
+        return self._write(folded, lambda file: format.encode(folded, file))
+
+    def _all_decoded(self, component: str, entries: tuple[Entry, ...]) -> list[Snapshot] | None:
+        """All of these files, or None when one of them had to be set out of use."""
+        snapshots = []
+        for entry in entries:
+            try:
+                snapshots.append(format.decode(entry.path))
+            except FormatError as error:
+                self._set_out_of_use(component, entry, str(error))
+                return None
+        return snapshots
+
+    def _write_straight(self, component: str, entries: tuple[Entry, ...], deltas: list[Snapshot]) -> Entry | None:
+        """The same of one process, frame by frame."""
+        with contextlib.ExitStack() as open_files:
+            stored = self._read(component, entries, lambda: open_files.enter_context(stored_chain(entries[0].path, deltas)))
+            if stored is None:
+                return None
+            folded = replace(stored.outline, output=newest_output(stored.outline.output))
+            folding = Folding(stored, folded)
+            return self._read(component, entries, lambda: self._write(folded, folding.write))
+
+    def _read(self, component: str, entries: tuple[Entry, ...], act: Callable[[], A]) -> A | None:
+        """The answer of an act that reads a chain's base, or None when a file had to be set out of use."""
+        try:
+            return act()
+        except FormatError as error:
+            self._set_out_of_use(component, entries[0], str(error))
+        except ChainError as error:
+            self._set_out_of_use(component, entries[-1], str(error))
+        return None
+
+    def _write(self, folded: Snapshot, write: Callable[[DiskFile], int]) -> Entry:
+        final = self._root / folder_name(folded.component) / file_name(header_of(folded))
+        return entry_of(final, folded, self._files.write(final, write))
+
+
+def entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
+    """A file that has just been written."""
+    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())
