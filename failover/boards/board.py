@@ -177,7 +177,7 @@ class Board:
     def add(self, declaration: Declaration) -> Item:
         """Declare an item while the board is in use; one that is declared alike already stays.
 
-        The handle takes and gives tables and numbers; `item` gives one for values of a class.
+        The handle takes and gives values of the class that the declaration has as its type; as `item` where it has none.
 
         Raises:
             BoardError: it is declared otherwise already, or there is no room.
@@ -197,7 +197,7 @@ class Board:
                         f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, "
                         f"period {there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
                     )
-            return self.item(declaration.name)
+            return self.item(declaration.name, declaration.shape)
 
     def remove(self, name: str) -> None:
         """Take an item off the board; its name is free then.
