@@ -21,6 +21,7 @@ from failover.boards.fence import FENCE
 from failover.boards.item import Item, ItemWriter, Source, values_for
 from failover.boards.mapping import MappedFile
 from failover.core.board import ages, layout
+from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
 from failover.core.board.banks import Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
@@ -129,6 +130,7 @@ class Board:
         self.skew_ns = 0
         self._is_closed = False
         self._items: weakref.WeakSet[Item] = weakref.WeakSet()
+        self._added: dict[str, Declaration] = {}
         self._writers: dict[str, ItemWriter] = {}
         self._sources: dict[str, Source] = {}
         self._holder = _Holder()
@@ -177,7 +179,8 @@ class Board:
     def add(self, declaration: Declaration) -> Item:
         """Declare an item while the board is in use; one that is declared alike already stays.
 
-        The handle takes and gives values of the class that the declaration has as its type; as `item` where it has none.
+        The handle takes and gives values of the class that the declaration has as its type; as `item` where it has none. When
+        the board is made anew, or this program resumes on another robot, its items are added there again.
 
         Raises:
             BoardError: it is declared otherwise already, or there is no room.
@@ -189,6 +192,12 @@ class Board:
                 raise BoardError(f"cannot add item {declaration.name!r}: {file.path} may only be read by uid {os.geteuid()}")
             with file.changing():
                 wanted = wanted_of(declaration, file.next_id(), layout.ADDED)
+                size = len(told(wanted))
+                if file is opened.own and size > DECLARATION_SIZE_MAX:
+                    raise BoardError(
+                        f"cannot add item {declaration.name!r}: to tell its type to other robots takes {size} bytes, over the "
+                        f"limit of {DECLARATION_SIZE_MAX}; declare it in team.toml, split it, or say shared=False"
+                    )
                 there = self._where(opened, declaration.name)
                 if there is None:
                     file.add(wanted)
@@ -197,6 +206,7 @@ class Board:
                         f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, "
                         f"period {there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
                     )
+            self._added[declaration.name] = declaration
             return self.item(declaration.name, declaration.shape)
 
     def remove(self, name: str) -> None:
@@ -209,6 +219,7 @@ class Board:
             file, record = self.found(name, self.ensured().robot)
             if not file.is_writable:
                 raise BoardError(f"cannot remove item {name!r}: {file.path} may only be read by uid {os.geteuid()}")
+            self._added.pop(name, None)
             with file.changing():
                 file.remove(record)
 
@@ -348,6 +359,9 @@ class Board:
                 self._forget()
                 self.skew_ns = boottime.skew_ns()
                 opened = self._holder.opened = _Opened(self._place or directory.find(), self._name)
+                for declaration in list(self._added.values()):
+                    with contextlib.suppress(BoardError):  # the next use of the item says why
+                        self.add(declaration)
             return opened
 
     def _forget(self) -> None:
