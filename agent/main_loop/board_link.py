@@ -15,6 +15,7 @@ from msgspec import Struct
 
 from agent.main_loop.announcements import Announcements
 from agent.main_loop.own_items import OwnItems, number_in
+from agent.main_loop.primaries import LEFT_OUT, Primaries
 from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
@@ -63,7 +64,9 @@ class BoardLink:
         wakes: readable when an urgent item was put.
     """
 
-    def __init__(self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int) -> None:
+    def __init__(
+        self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int, primaries: Primaries | None = None
+    ) -> None:
         self._file = own
         self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
         self.turns = Turns()
@@ -74,6 +77,7 @@ class BoardLink:
         self.wakes = UrgentItems(own, self._own)
         self._peers = {name: _Peer(items) for name, items in peers.items()}
         self._announcements = Announcements(own.header.rank, peers)
+        self._primaries = primaries
 
     @classmethod
     def open(cls, place: Path, round_ns: int) -> BoardLink:
@@ -85,7 +89,8 @@ class BoardLink:
         own = MappedFile.open(place / directory.OWN_NAME, writable=True)
         prefix = directory.PEER_PREFIX
         peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
-        return cls(own, peers, round_ns)
+        agents = Primaries.open(place) if (place / directory.AGENT_NAME).exists() else None
+        return cls(own, peers, round_ns, agents)
 
     # --- Out ---
 
@@ -177,16 +182,24 @@ class BoardLink:
                 peer.state = state
                 peer.items.tell_state(state)
 
+    def tell_primaries(self, primaries: Mapping[str, tuple[str, int]], now_ns: int) -> None:
+        """Tell programs which robot runs which component: component → robot, epoch."""
+        if self._primaries is not None:
+            self._primaries.tell(primaries, now_ns - self._skew_ns)
+
     def close(self) -> None:
         """Give the locks back; the files stay for the agent that comes after."""
         self.wakes.close()
+        if self._primaries is not None:
+            self._primaries.close()
         for file in (self._file, *[peer.items.file for peer in self._peers.values()]):
             file.close()
 
     def left_out(self) -> Counter[str]:
         """Values that were not taken, by reason, and those that waited."""
         counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped) + self._announcements.refused()
-        return counts + Counter({WAITED: sum(self.turns.waited.values())})
+        left_out = self._primaries.left_out if self._primaries is not None else 0
+        return counts + Counter({WAITED: sum(self.turns.waited.values()), LEFT_OUT: left_out})
 
 
 def way_bound_us(way_ns: int | None) -> int:

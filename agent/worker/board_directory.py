@@ -24,12 +24,16 @@ from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.board import layout
 from failover.core.board.announcements import first_number
+from failover.core.board.item_types import ITEM_SIZE_MAX
 from failover.core.board.items import ITEMS_MAX, Board, Item
 from failover.errors import BoardError, ScheduleError
 
 DIRECTORY_MODE: Final = 0o755
 PROGRAMS_MODE: Final = 0o660
 PEERS_MODE: Final = 0o640
+
+PRIMARIES: Final = Item("primaries", "msgpack", size=ITEM_SIZE_MAX, shared=False)
+"""The one item of the agent's own file: which robot runs which component (`failover.boards.component_item`)."""
 
 log = logging.getLogger("failover.lanes")
 
@@ -66,6 +70,7 @@ def provide(settings: Settings) -> Path | None:
     kept = _kept(Path(settings.config.state_directory), board, me)
     files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me), [one for one in kept if not one.shared])
     files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me), [one for one in kept if one.shared])
+    files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES})
     files.have_schedule(me)
     _point(link, place)
     _leave(Path(settings.config.runtime_directory) / SCHEDULE_PLACE)

@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -17,12 +17,13 @@ from msgspec import Struct
 
 from checkpoint.sentences import near
 from failover.boards import boottime, directory
+from failover.boards.component_item import Primary, decode
 from failover.boards.fence import FENCE
 from failover.boards.item import Item, ItemWriter, Source, values_for
 from failover.boards.mapping import MappedFile
 from failover.core.board import ages, layout
 from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
-from failover.core.board.banks import Reading, get_carefully
+from failover.core.board.banks import Place, Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
 from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
@@ -54,6 +55,7 @@ class _Opened:
         self.pid = os.getpid()
         self.files = [self.own]
         self.peers: dict[str, MappedFile] = {}
+        self._agents: MappedFile | None = None
         try:
             self._open_others()
         except BaseException:
@@ -83,6 +85,22 @@ class _Opened:
                 known = ", ".join((self.robot, *self.peer_names()))
                 raise BoardError(f"there is no robot {robot!r} on the board {self.directory}; it has {known}") from None
         return file
+
+    def agents(self) -> MappedFile:
+        """The file in which the agent tells what it knows of the team.
+
+        Raises:
+            BoardError: there is none: no agent has made this board.
+        """
+        if self._agents is None or self._agents.is_gone:
+            try:
+                self._agents = MappedFile.open(self.directory / directory.AGENT_NAME, writable=False)
+            except FileNotFoundError:
+                raise BoardError(
+                    f"no agent has made the board {self.directory}: it alone knows which robot runs a component; "
+                    "read the item of a robot by its name"
+                ) from None
+        return self._agents
 
     def peer_names(self) -> list[str]:
         """The other robots."""
@@ -133,6 +151,7 @@ class Board:
         self._added: dict[str, Declaration] = {}
         self._writers: dict[str, ItemWriter] = {}
         self._sources: dict[str, Source] = {}
+        self._primaries: tuple[MappedFile, Place, int, Mapping[str, Primary]] | None = None
         self._holder = _Holder()
         self._finalizer = weakref.finalize(self, self._holder.leave)
         self.ensured()
@@ -251,6 +270,27 @@ class Board:
     def living(self) -> list[str]:
         """This robot, and those that are running."""
         return [robot for robot, state in self.robots().items() if state.state == layout.STATES[layout.RUN]]
+
+    def primary(self, component: str) -> Primary:
+        """Which robot runs a component, as this robot's agent sees it.
+
+        Raises:
+            BoardError: it knows none of that name, and names the nearest; or no agent has made this board.
+        """
+        with self.guard:
+            file = self.ensured().agents()
+            place = (
+                file.place(file.records()[0]) if self._primaries is None or self._primaries[0] is not file else self._primaries[1]
+            )
+            number = place.words[place.newest]
+            if self._primaries is None or self._primaries[0] is not file or self._primaries[2] != number:
+                table = decode(get_carefully(place, FENCE).value) if number else {}
+                self._primaries = (file, place, number, table)
+            table = self._primaries[3]
+        if component not in table:
+            cure = near(component, list(table)) or "; failover status shows the components of the team"
+            raise BoardError(f"the agent of {self.robot} knows no robot that runs {component!r}{cure}")
+        return table[component]
 
     def snapshot(self) -> dict[str, dict[str, Reading]]:
         """Robot → item → reading, of all that was ever put; each value whole, all ages at one instant."""

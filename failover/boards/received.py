@@ -2,8 +2,9 @@
 
 One thread of one process uses it. Nothing here waits, and no frame can do harm: what does not fit is counted and dropped.
 
-Puts have numbers of this file's own, one after the other. The writer's numbers only tell a new put from a repeated one. They skip
-puts that no frame carried; one that is greater by a multiple of the banks would go into the bank that readers read.
+Puts have numbers of this file's own, one after the other, beginning with the writer's epoch. The writer's numbers tell a new put
+from a repeated one. They skip puts that no frame carried; one that is greater by a multiple of the banks would go into the bank
+that readers read.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
-from failover.core.board.banks import put_carefully
+from failover.core.board.banks import EPOCH_SHIFT, first_of_epoch, put_carefully
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import ADDED, Record, Wanted
 from failover.core.frames.frame import Portion
@@ -190,7 +191,8 @@ def _taker(file: MappedFile, record: Record) -> Take:
     words, newest, least, limit, base = place.words, place.newest, place.least, place.limit, record.at // 8
     frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
     lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
-    period, following, last_number, last_round = record.period, words[newest] + 1, 0, -1
+    period, banks, last_number, last_round = record.period, record.banks, 0, -1
+    following = words[newest] + 1
 
     def take(number: int, value: bytes, stamp_ns: int, error_us: int, round_: int) -> bool | None:
         nonlocal following, last_number, last_round
@@ -205,6 +207,8 @@ def _taker(file: MappedFile, record: Record) -> Take:
         if number <= last_number:
             return False
         last_number = number
+        if number >> EPOCH_SHIFT > following >> EPOCH_SHIFT:
+            following = first_of_epoch(following - 1, number >> EPOCH_SHIFT, banks)
         put_carefully(place, following, value, stamp_ns, error_us, FENCE)
         following += 1
         return True

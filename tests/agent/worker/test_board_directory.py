@@ -81,9 +81,10 @@ def test_the_declared_items_lie_in_the_files_of_their_robots(folder: Path) -> No
     place = board_directory.provide(loaded(folder, BALL))
     assert place is not None
     modes = {path.name: oct(path.stat().st_mode & 0o777) for path in place.iterdir()}
-    assert modes == {"own": "0o660", "private": "0o660", "schedule": "0o660", "peer-robot2": "0o640"}
+    of_agent = {"agent": "0o640", "peer-robot2": "0o640"}
+    assert modes == {"own": "0o660", "private": "0o660", "schedule": "0o660", **of_agent}
     names = {path.name: [record.name for record in MappedFile.open(path).records()] for path in boards_of(place)}
-    assert names == {"own": ["ball"], "private": ["notes"], "peer-robot2": ["ball"]}
+    assert names == {"own": ["ball"], "private": ["notes"], "peer-robot2": ["ball"], "agent": ["primaries"]}
     with failover.board() as board:
         assert (board.robot, board.directory) == ("robot1", place)
         board.item("ball").put({"x": 1.0, "y": 2.0})
@@ -134,7 +135,7 @@ def test_a_robot_that_left_the_team_leaves_the_board(folder: Path) -> None:
     members = {"robot1": settings.team.robots["robot1"], "robot3": settings.team.robots["robot2"]}
     team.write(directory, Team(settings.team.team, members, settings.team.board))
     board_directory.provide(loaded(folder))
-    assert {path.name for path in place.iterdir()} == {"own", "private", "schedule", "peer-robot3"}
+    assert {path.name for path in place.iterdir()} == {"agent", "own", "private", "schedule", "peer-robot3"}
 
 
 def test_a_file_that_is_damaged_is_made_anew(folder: Path) -> None:
