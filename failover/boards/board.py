@@ -21,6 +21,7 @@ from failover.boards.component_item import Primary, decode
 from failover.boards.fence import FENCE
 from failover.boards.item import Item, ItemWriter, Source, values_for
 from failover.boards.mapping import MappedFile
+from failover.boards.watch import Watch
 from failover.core.board import ages, layout
 from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
 from failover.core.board.banks import Place, Reading, get_carefully
@@ -241,6 +242,14 @@ class Board:
             self._added.pop(name, None)
             with file.changing():
                 file.remove(record)
+
+    def watch(self, *items: Item | tuple[Item, str]) -> Watch:
+        """Wait for any of several items: a handle alone means this robot's, ``(handle, "robot2")`` another robot's.
+
+        Raises:
+            BoardError: there are none, or more than 128.
+        """
+        return Watch(tuple(one if isinstance(one, tuple) else (one, None) for one in items))
 
     # --- The whole ---
 
