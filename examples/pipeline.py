@@ -46,8 +46,7 @@ def odometry() -> None:
     if resumed := failover.resumed():
         print(f"goes on after step {pose.step}, {resumed.age_s:.2f} s old", file=sys.stderr, flush=True)
     board = failover.board()
-    board.add(failover.Item("pose", Pose))
-    out = board.item("pose", Pose)
+    out = board.add(failover.Item("pose", Pose))
     with failover.scheduled("odometry", period=PERIOD_S, overrun="catch_up") as task:  # a step that is late counts, too
         for tick in task:
             pose.step, pose.due_ns = pose.step + 1, tick.due_ns
@@ -63,8 +62,7 @@ def mapper() -> None:
     if resumed := failover.resumed():
         print(f"goes on after map {seen.number}, {resumed.age_s:.2f} s old", file=sys.stderr, flush=True)
     board = failover.board()
-    board.add(failover.Item("pose", Pose))
-    poses = board.item("pose", Pose)
+    poses = board.add(failover.Item("pose", Pose))
     poses.wait(after=0)  # for the first pose, if there is none yet
     with failover.scheduled("mapper", period=0.05, deadline=0.04, after="odometry") as task:
         for tick in task:

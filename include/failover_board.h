@@ -1321,6 +1321,8 @@ static inline int fb_take_item_(fb_item *item, fb_place_ *place)
     memcpy(place->record + FB_PID_, &pid, 4);
     newest = fb_load_(place->newest);
     place->number = newest > begin ? newest : begin;
+    if (newest != 0 && (place->number + 1) % place->count == newest % place->count)
+        place->number++; /* the first put must not go into the bank that is read meanwhile */
     place->has_lock = true;
     return 0;
 }

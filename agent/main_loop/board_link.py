@@ -13,13 +13,16 @@ from typing import Final
 
 from msgspec import Struct
 
+from agent.main_loop.announcements import Announcements
 from agent.main_loop.own_items import OwnItems, number_in
+from agent.main_loop.primaries import LEFT_OUT, Primaries
 from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.boards.received import ReceivedItems
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
+from failover.core.board.announcements import RESERVED
 from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
@@ -61,7 +64,9 @@ class BoardLink:
         wakes: readable when an urgent item was put.
     """
 
-    def __init__(self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int) -> None:
+    def __init__(
+        self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int, primaries: Primaries | None = None
+    ) -> None:
         self._file = own
         self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
         self.turns = Turns()
@@ -71,6 +76,8 @@ class BoardLink:
         self._buckets: dict[int, Bucket] = {}
         self.wakes = UrgentItems(own, self._own)
         self._peers = {name: _Peer(items) for name, items in peers.items()}
+        self._announcements = Announcements(own.header.rank, peers)
+        self._primaries = primaries
 
     @classmethod
     def open(cls, place: Path, round_ns: int) -> BoardLink:
@@ -82,17 +89,20 @@ class BoardLink:
         own = MappedFile.open(place / directory.OWN_NAME, writable=True)
         prefix = directory.PEER_PREFIX
         peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
-        return cls(own, peers, round_ns)
+        agents = Primaries.open(place) if (place / directory.AGENT_NAME).exists() else None
+        return cls(own, peers, round_ns, agents)
 
     # --- Out ---
 
     def due(self, round_: int, now_ns: int) -> list[Portion]:
-        """What goes into the frame of this round, with its age at ``now_ns``."""
+        """What goes into the frame of this round, with its age at ``now_ns``; first what is told of items that were added."""
         try:
             if self._own.look(now_ns):
                 self.turns.hold(Sent(one.id, one.period, one.phase) for one in self._own.records.values())
+                self._announcements.hold(self._own.records.values())
+            told = self._announcements.due(round_)
             numbers = self.turns.due(round_)
-            return self._portions(numbers, self._own.newest(), now_ns) if numbers else []
+            return told + self._portions(numbers, self._own.newest(), now_ns) if numbers else told
         except (BoardError, OSError):
             self.dropped[UNREADABLE] += 1
             return []
@@ -110,7 +120,7 @@ class BoardLink:
 
     def placed(self, portions: Sequence[Portion], count: int) -> None:
         """The first ``count`` of what was due found room in the frame."""
-        self.turns.left(portion.number for portion in portions[count:])
+        self.turns.left(portion.number for portion in portions[count:] if portion.number < RESERVED)
         self.went(portions[:count])
 
     def went(self, portions: Sequence[Portion]) -> None:
@@ -140,10 +150,14 @@ class BoardLink:
         if part.boot != peer.boot:
             peer.boot = part.boot
             peer.items.begin_life()
+            self._announcements.begin_life(part.sender)
         came_ns -= self._skew_ns
         self._note_frame(peer, heard.way_ns, came_ns)
-        if heard.items:
-            peer.items.take(heard.items, came_ns, way_bound_us(heard.way_ns), part.round)
+        items = heard.items
+        if items and items[0].number >= RESERVED:
+            items = self._announcements.take(part.sender, items)
+        if items:
+            peer.items.take(items, came_ns, way_bound_us(heard.way_ns), part.round)
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
         """Tell when it came; from time to time the bounds that follow from the longest ways."""
@@ -168,16 +182,24 @@ class BoardLink:
                 peer.state = state
                 peer.items.tell_state(state)
 
+    def tell_primaries(self, primaries: Mapping[str, tuple[str, int]], now_ns: int) -> None:
+        """Tell programs which robot runs which component: component → robot, epoch."""
+        if self._primaries is not None:
+            self._primaries.tell(primaries, now_ns - self._skew_ns)
+
     def close(self) -> None:
         """Give the locks back; the files stay for the agent that comes after."""
         self.wakes.close()
+        if self._primaries is not None:
+            self._primaries.close()
         for file in (self._file, *[peer.items.file for peer in self._peers.values()]):
             file.close()
 
     def left_out(self) -> Counter[str]:
         """Values that were not taken, by reason, and those that waited."""
-        counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped)
-        return counts + Counter({WAITED: sum(self.turns.waited.values())})
+        counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped) + self._announcements.refused()
+        left_out = self._primaries.left_out if self._primaries is not None else 0
+        return counts + Counter({WAITED: sum(self.turns.waited.values()), LEFT_OUT: left_out})
 
 
 def way_bound_us(way_ns: int | None) -> int:

@@ -445,6 +445,7 @@ class MainLoop:
             return
         self._round, self._round_ns = self._round + 1, now_ns
         self._board.tell_states(now_ns, self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000)
+        self._board.tell_primaries(self._node.primaries() if self._node is not None else {}, now_ns)
         items = self._board.due(self._round, now_ns)
         self._board.placed(items, self._send_frame(beat, items, now_ns))
 

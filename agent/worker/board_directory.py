@@ -7,25 +7,35 @@ kernel's boot are others it is made anew; programs that have the old one open ar
 from __future__ import annotations
 
 import contextlib
+import functools
 import grp
+import logging
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from agent.config import Settings
 from agent.errors import AgentError
+from agent.worker import kept_items
 from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.board import layout
-from failover.core.board.items import Item
+from failover.core.board.announcements import first_number
+from failover.core.board.item_types import ITEM_SIZE_MAX
+from failover.core.board.items import ITEMS_MAX, Board, Item
 from failover.errors import BoardError, ScheduleError
 
 DIRECTORY_MODE: Final = 0o755
 PROGRAMS_MODE: Final = 0o660
 PEERS_MODE: Final = 0o640
+
+PRIMARIES: Final = Item("primaries", "msgpack", size=ITEM_SIZE_MAX, shared=False)
+"""The one item of the agent's own file: which robot runs which component (`failover.boards.component_item`)."""
+
+log = logging.getLogger("failover.lanes")
 
 
 def place_of(settings: Settings) -> Path:
@@ -57,8 +67,10 @@ def provide(settings: Settings) -> Path | None:
     for path in place.glob(f"{directory.PEER_PREFIX}*"):
         if path.name.removeprefix(directory.PEER_PREFIX) not in set(robots) - {me}:
             directory.dismiss(path)
-    files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me))
-    files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me))
+    kept = _kept(Path(settings.config.state_directory), board, me)
+    files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me), [one for one in kept if not one.shared])
+    files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me), [one for one in kept if one.shared])
+    files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES})
     files.have_schedule(me)
     _point(link, place)
     _leave(Path(settings.config.runtime_directory) / SCHEDULE_PLACE)
@@ -72,6 +84,16 @@ def _leave(former: Path) -> None:
         former.rmdir()
 
 
+def _kept(state: Path, board: Board, robot: str) -> list[Item]:
+    """What programs have added with keep = true, without what is declared now."""
+    declared = {item.name for item in (*board.shared_by(robot).values(), *board.private_of(robot).values())}
+    kept = kept_items.read(state)
+    for item in kept:
+        if item.name in declared:
+            log.warning("item %s is declared in team.toml now: what a program had added under this name is not kept", item.name)
+    return [item for item in kept if item.name not in declared]
+
+
 class _Files:
     """The files of one board."""
 
@@ -81,8 +103,8 @@ class _Files:
         self._group = group
         self._ranks = ranks
 
-    def have(self, name: str, area: int, robot: str, items: Mapping[int, Item]) -> None:
-        """Keep a file that fits; make it otherwise."""
+    def have(self, name: str, area: int, robot: str, items: Mapping[int, Item], kept: Sequence[Item] = ()) -> None:
+        """Keep a file that fits; make it otherwise, with the items that were ``kept`` as far as they have room."""
         path = self._place / name
         mode = PEERS_MODE if area == layout.PEER else PROGRAMS_MODE
         if self._fits(path, area, robot):
@@ -90,17 +112,25 @@ class _Files:
             path.chmod(mode)
             return
         directory.dismiss(path)
-        directory.make_file(
+        make = functools.partial(
+            directory.make_file,
             path,
             area,
             robot,
-            items=items,
             rank=self._ranks[robot],
             state=layout.NOT if area == layout.PEER else layout.RUN,
             digest=self._digest,
             mode=mode,
             group=self._group,
         )
+        first = first_number(self._ranks[robot])
+        try:
+            make(items={**items, **dict(enumerate(kept, first))})
+        except BoardError as error:
+            if not kept:
+                raise
+            log.warning("items that programs had added with keep = true are not added again: %s", error)
+            make(items=items)
 
     def have_schedule(self, robot: str) -> None:
         """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""
@@ -119,10 +149,13 @@ class _Files:
     def _fits(self, path: Path, area: int, robot: str) -> bool:
         try:
             file = MappedFile.open(path, writable=True)
+            live = len(file.records())
         except (BoardError, FileNotFoundError):
             return False
         header = file.header
         file.close()
+        if area == layout.PEER and header.count - live > ITEMS_MAX // 2:
+            return False  # no room is left for what that robot adds
         found = (header.flags, header.roster_digest, header.boot_id, header.robot, header.rank)
         return found == (area, self._digest, boottime.boot_id(), robot, self._ranks[robot])
 

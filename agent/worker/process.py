@@ -103,6 +103,7 @@ class Worker(Switchboard):
         """Open the store, find what outlived the last agent."""
         for directory in (self.places.sockets, self.places.logs):
             make_directory(directory)
+        self._board_place: Path | None = None
         await self._provide_board()
         await self._declare_tasks()
         store = self._store = await self._open_store()
@@ -124,6 +125,10 @@ class Worker(Switchboard):
         self._task(self._tidy_contents())
         self._task(self._give_back())
         self._task(self._give_signs())
+        if self._board_place is not None:
+            from agent.worker.kept_items import Keeper  # here: a team without a board does not load it
+
+            self._task(Keeper(self._board_place, Path(self.settings.config.state_directory)).watch())
         if self.settings.me.role == "robot":
             self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
@@ -146,6 +151,7 @@ class Worker(Switchboard):
             log.warning("no board: %s", error)
             self._own_troubles.append(f"programs here have no board of the team: {error}")
         else:
+            self._board_place = place
             if place is not None:
                 log.info("the board is %s", place)
             else:

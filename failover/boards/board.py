@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -17,11 +17,14 @@ from msgspec import Struct
 
 from checkpoint.sentences import near
 from failover.boards import boottime, directory
+from failover.boards.component_item import Primary, decode
 from failover.boards.fence import FENCE
 from failover.boards.item import Item, ItemWriter, Source, values_for
 from failover.boards.mapping import MappedFile
+from failover.boards.watch import Watch
 from failover.core.board import ages, layout
-from failover.core.board.banks import Reading, get_carefully
+from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
+from failover.core.board.banks import Place, Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
 from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
@@ -53,6 +56,7 @@ class _Opened:
         self.pid = os.getpid()
         self.files = [self.own]
         self.peers: dict[str, MappedFile] = {}
+        self._agents: MappedFile | None = None
         try:
             self._open_others()
         except BaseException:
@@ -82,6 +86,22 @@ class _Opened:
                 known = ", ".join((self.robot, *self.peer_names()))
                 raise BoardError(f"there is no robot {robot!r} on the board {self.directory}; it has {known}") from None
         return file
+
+    def agents(self) -> MappedFile:
+        """The file in which the agent tells what it knows of the team.
+
+        Raises:
+            BoardError: there is none: no agent has made this board.
+        """
+        if self._agents is None or self._agents.is_gone:
+            try:
+                self._agents = MappedFile.open(self.directory / directory.AGENT_NAME, writable=False)
+            except FileNotFoundError:
+                raise BoardError(
+                    f"no agent has made the board {self.directory}: it alone knows which robot runs a component; "
+                    "read the item of a robot by its name"
+                ) from None
+        return self._agents
 
     def peer_names(self) -> list[str]:
         """The other robots."""
@@ -129,8 +149,10 @@ class Board:
         self.skew_ns = 0
         self._is_closed = False
         self._items: weakref.WeakSet[Item] = weakref.WeakSet()
+        self._added: dict[str, Declaration] = {}
         self._writers: dict[str, ItemWriter] = {}
         self._sources: dict[str, Source] = {}
+        self._primaries: tuple[MappedFile, Place, int, Mapping[str, Primary]] | None = None
         self._holder = _Holder()
         self._finalizer = weakref.finalize(self, self._holder.leave)
         self.ensured()
@@ -177,7 +199,8 @@ class Board:
     def add(self, declaration: Declaration) -> Item:
         """Declare an item while the board is in use; one that is declared alike already stays.
 
-        The handle takes and gives tables and numbers; `item` gives one for values of a class.
+        The handle takes and gives values of the class that the declaration has as its type; as `item` where it has none. When
+        the board is made anew, or this program resumes on another robot, its items are added there again.
 
         Raises:
             BoardError: it is declared otherwise already, or there is no room.
@@ -189,6 +212,12 @@ class Board:
                 raise BoardError(f"cannot add item {declaration.name!r}: {file.path} may only be read by uid {os.geteuid()}")
             with file.changing():
                 wanted = wanted_of(declaration, file.next_id(), layout.ADDED)
+                size = len(told(wanted))
+                if file is opened.own and size > DECLARATION_SIZE_MAX:
+                    raise BoardError(
+                        f"cannot add item {declaration.name!r}: to tell its type to other robots takes {size} bytes, over the "
+                        f"limit of {DECLARATION_SIZE_MAX}; declare it in team.toml, split it, or say shared=False"
+                    )
                 there = self._where(opened, declaration.name)
                 if there is None:
                     file.add(wanted)
@@ -197,7 +226,8 @@ class Board:
                         f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, "
                         f"period {there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
                     )
-            return self.item(declaration.name)
+            self._added[declaration.name] = declaration
+            return self.item(declaration.name, declaration.shape)
 
     def remove(self, name: str) -> None:
         """Take an item off the board; its name is free then.
@@ -209,8 +239,17 @@ class Board:
             file, record = self.found(name, self.ensured().robot)
             if not file.is_writable:
                 raise BoardError(f"cannot remove item {name!r}: {file.path} may only be read by uid {os.geteuid()}")
+            self._added.pop(name, None)
             with file.changing():
                 file.remove(record)
+
+    def watch(self, *items: Item | tuple[Item, str]) -> Watch:
+        """Wait for any of several items: a handle alone means this robot's, ``(handle, "robot2")`` another robot's.
+
+        Raises:
+            BoardError: there are none, or more than 128.
+        """
+        return Watch(tuple(one if isinstance(one, tuple) else (one, None) for one in items))
 
     # --- The whole ---
 
@@ -240,6 +279,27 @@ class Board:
     def living(self) -> list[str]:
         """This robot, and those that are running."""
         return [robot for robot, state in self.robots().items() if state.state == layout.STATES[layout.RUN]]
+
+    def primary(self, component: str) -> Primary:
+        """Which robot runs a component, as this robot's agent sees it.
+
+        Raises:
+            BoardError: it knows none of that name, and names the nearest; or no agent has made this board.
+        """
+        with self.guard:
+            file = self.ensured().agents()
+            place = (
+                file.place(file.records()[0]) if self._primaries is None or self._primaries[0] is not file else self._primaries[1]
+            )
+            number = place.words[place.newest]
+            if self._primaries is None or self._primaries[0] is not file or self._primaries[2] != number:
+                table = decode(get_carefully(place, FENCE).value) if number else {}
+                self._primaries = (file, place, number, table)
+            table = self._primaries[3]
+        if component not in table:
+            cure = near(component, list(table)) or "; failover status shows the components of the team"
+            raise BoardError(f"the agent of {self.robot} knows no robot that runs {component!r}{cure}")
+        return table[component]
 
     def snapshot(self) -> dict[str, dict[str, Reading]]:
         """Robot → item → reading, of all that was ever put; each value whole, all ages at one instant."""
@@ -348,6 +408,9 @@ class Board:
                 self._forget()
                 self.skew_ns = boottime.skew_ns()
                 opened = self._holder.opened = _Opened(self._place or directory.find(), self._name)
+                for declaration in list(self._added.values()):
+                    with contextlib.suppress(BoardError):  # the next use of the item says why
+                        self.add(declaration)
             return opened
 
     def _forget(self) -> None:

@@ -32,6 +32,7 @@ SHARED_MEMORY: Final = Path("/dev/shm")
 
 OWN_NAME: Final = "own"
 PRIVATE_NAME: Final = "private"
+AGENT_NAME: Final = "agent"
 PEER_PREFIX: Final = "peer-"
 
 TURNS: Final = 1000
@@ -98,7 +99,7 @@ def make_file(
 
     Args:
         flags: which area it is, and whether it is made without an agent.
-        items: number → declaration.
+        items: number → declaration; from `ITEMS_MAX` on they were added at run time.
         digest: of the team's declarations.
         group: whose it is to be; -1: this process's.
         hold: return an opening that is user 0 already and has the table lock.
@@ -119,7 +120,8 @@ def make_file(
         os.pwrite(made, header, 0)
         for number, item in (items or {}).items():
             fields = layout.read_header(os.pread(made, layout.names_at(capacity), 0))
-            addition = layout.addition(fields, layout.wanted_of(item, number))
+            added = layout.ADDED if number >= ITEMS_MAX else 0
+            addition = layout.addition(fields, layout.wanted_of(item, number, added))
             os.ftruncate(made, addition.size)
             for offset, piece in addition.pieces:
                 os.pwrite(made, piece, offset)

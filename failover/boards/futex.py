@@ -8,7 +8,8 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
@@ -17,16 +18,32 @@ from failover.errors import BoardError
 NUMBERS: Final = {"x86_64": 202, "aarch64": 98, "riscv64": 98}
 """Machine → number of the call futex. Source: asm/unistd.h."""
 
+WAITV: Final = 449
+"""Of futex_waitv, on every machine. Source: asm-generic/unistd.h, since Linux 5.16."""
+POLL_S: Final = 0.01
+
 _WAIT: Final = 0
 _WAKE: Final = 1
 _WAIT_BITSET: Final = 9
 _ANY: Final = 0xFFFFFFFF
 _ALL: Final = 2**31 - 1
+_SIZE_32: Final = 2
 _NS_PER_S: Final = 1_000_000_000
 
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+class _Waiter(ctypes.Structure):
+    """struct futex_waitv."""
+
+    _fields_ = (
+        ("value", ctypes.c_uint64),
+        ("address", ctypes.c_uint64),
+        ("flags", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+    )
 
 
 class _Buffer(ctypes.Structure):
@@ -65,6 +82,26 @@ def wait_until(address: int, value: int, instant_ns: int) -> None:
         wrong = ctypes.get_errno()
         if wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
             raise BoardError(f"cannot wait in the schedule: {os.strerror(wrong)}")
+
+
+def wait_any(places: Sequence[tuple[int, int]], timeout_s: float) -> None:
+    """As `wait`, on several words at once: (address, value) of each, at most 128. May wake early.
+
+    A kernel before 5.16 cannot: then it sleeps on the first word for a hundredth of a second.
+
+    Source: futex_waitv, Documentation/userspace-api/futex2.rst.
+    """
+    if len(places) == 1:
+        wait(*places[0], timeout_s)
+        return
+    waiters = (_Waiter * len(places))(*(_Waiter(value, address, _SIZE_32, 0) for address, value in places))
+    limit = _Timespec(*divmod(time.monotonic_ns() + max(int(timeout_s * _NS_PER_S), 0), _NS_PER_S))
+    if _call()(WAITV, ctypes.byref(waiters), len(places), 0, ctypes.byref(limit), time.CLOCK_MONOTONIC) == -1:
+        wrong = ctypes.get_errno()
+        if wrong in (errno.ENOSYS, errno.EPERM):
+            wait(*places[0], min(timeout_s, POLL_S))
+        elif wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
+            raise BoardError(f"cannot wait for the board: {os.strerror(wrong)}")
 
 
 def wake(address: int) -> None:

@@ -20,10 +20,11 @@ from types import FrameType
 from typing import Any, Final, Protocol
 
 from failover.boards import boottime, futex
+from failover.boards.component_item import ComponentItem, Primary
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import ages, layout
-from failover.core.board.banks import EPOCH_SHIFT, UNKNOWN, Found, Get, Put, Reading, Remember, Writer, get_carefully
+from failover.core.board.banks import UNKNOWN, Found, Get, Put, Reading, Remember, Writer, first_of_epoch, get_carefully
 from failover.core.board.banks import reader as reader_of
 from failover.core.board.banks import writer as writer_of
 from failover.core.board.item_types import OPAQUE, Opaque, canonical, parse, size_of
@@ -60,6 +61,7 @@ class OpenBoard(Protocol):
     def has(self, name: str, robot: str) -> bool: ...
     def is_good(self, source: Source) -> bool: ...
     def living(self) -> list[str]: ...
+    def primary(self, component: str) -> Primary: ...
     def own_source(self, name: str) -> Source: ...
     def whose(self, file: MappedFile, record: Record) -> str: ...
     def writer(self, name: str) -> ItemWriter: ...
@@ -192,7 +194,7 @@ class ItemWriter:
             raise BoardError(f"item {self.name!r} of {file.path} may only be read by uid {os.geteuid()}")
         if not file.take_writer(record, os.getpid()):
             raise WriterTakenError(self._board.whose(file, record))
-        number = max(place.words[place.newest], epoch() << EPOCH_SHIFT)
+        number = first_of_epoch(place.words[place.newest], epoch(), record.banks) - 1
         always = file.path.name.startswith("own+")
         woken = partial(_wake, file, record)
         return writer_of(place, number, boottime.CLOCK, self._board.skew_ns, self.put_slowly, woken, always, FENCE)
@@ -397,6 +399,27 @@ class Item:
         if not readings:
             raise NeverWrittenError(f"item {self.name!r}: no robot that is running has put it")
         return min(readings, key=lambda reading: reading.age_ns)
+
+    def of(self, component: str) -> ComponentItem:
+        """This item at the robot that is the primary of a component: to read, it follows a takeover.
+
+        Args:
+            component: its path, "/lab/robot1/mapper".
+        """
+        board = self._board
+        return ComponentItem(self, component, board.primary, lambda: boottime.now_ns(board.skew_ns))
+
+    def is_at(self, robot: str) -> bool:
+        """Whether a robot has this item."""
+        return self._board.has(self.name, robot)
+
+    def rest(self, robot: str, timeout_s: float) -> None:
+        """Sleep until a robot puts this item, and not longer than this; it may wake early.
+
+        Raises:
+            BoardError: the robot or the item is not there.
+        """
+        self._sleep(robot, self._number(robot), timeout_s)
 
     def wait(self, robot: str | None = None, after: int | None = None, timeout: float | None = None) -> Reading:
         """Sleep until there is another put than ``after``; then as `get`.

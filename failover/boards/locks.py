@@ -44,16 +44,18 @@ def is_taken(descriptor: int, byte: int) -> bool:
 
 
 @contextmanager
-def table(descriptor: int, what: str, error: type[FailoverError] = BoardError) -> Iterator[None]:
+def table(
+    descriptor: int, what: str, error: type[FailoverError] = BoardError, patience_s: float = TABLE_WAIT_S
+) -> Iterator[None]:
     """Hold the table lock of a file.
 
     Raises:
-        BoardError, or ``error``: another process has held it for `TABLE_WAIT_S`.
+        BoardError, or ``error``: another process has held it for so long.
     """
-    end = time.monotonic() + TABLE_WAIT_S
+    end = time.monotonic() + patience_s
     while not take(descriptor, TABLE_LOCK):
-        if time.monotonic() > end:
-            raise error(f"{what}: another process has held the lock of the table for {TABLE_WAIT_S:g} s; is it stopped?")
+        if time.monotonic() >= end:
+            raise error(f"{what}: another process has held the lock of the table for {patience_s:g} s; is it stopped?")
         time.sleep(PAUSE_S)
     try:
         yield

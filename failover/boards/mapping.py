@@ -83,19 +83,37 @@ class MappedFile(SharedFile):
         """Two bytes."""
         self.halves[offset // 2] = word
 
-    def add(self, wanted: Wanted) -> None:
+    def add(self, wanted: Wanted) -> Record:
         """Append an item, inside of `changing`.
+
+        Its memory is there then. A program that touches a page for which there is none is ended by the kernel (SIGBUS).
 
         Raises:
             BoardError: there is no room.
         """
+        header = self.read_header()
         try:
-            addition = layout.addition(self.read_header(), wanted)
+            addition = layout.addition(header, wanted)
         except BoardError as error:
             raise BoardError(f"{self.path}: {error}") from None
-        os.ftruncate(self.descriptor, addition.size)
-        for offset, piece in addition.pieces:
-            os.pwrite(self.descriptor, piece, offset)
+        try:
+            os.posix_fallocate(self.descriptor, header.file_size, addition.size - header.file_size)
+            for offset, piece in addition.pieces:
+                os.pwrite(self.descriptor, piece, offset)
+        except OSError as error:
+            raise BoardError(f"cannot add item {wanted.name!r} to {self.path}: {error.strerror}; free /dev/shm") from error
+        return addition.record
+
+    def grow(self, size: int) -> None:
+        """Make the file so long, if it is shorter: what is added later lies in the mapping already. Its use takes the memory.
+
+        Raises:
+            BoardError: it cannot be mapped.
+        """
+        if os.fstat(self.descriptor).st_size < size:
+            os.ftruncate(self.descriptor, size)
+        if len(self.area) < size:
+            self._map_again()
 
     def remove(self, record: Record) -> None:
         """Make a hole of an item, inside of `changing`."""

@@ -2,8 +2,9 @@
 
 One thread of one process uses it. Nothing here waits, and no frame can do harm: what does not fit is counted and dropped.
 
-Puts have numbers of this file's own, one after the other. The writer's numbers only tell a new put from a repeated one. They skip
-puts that no frame carried; one that is greater by a multiple of the banks would go into the bank that readers read.
+Puts have numbers of this file's own, one after the other, beginning with the writer's epoch. The writer's numbers tell a new put
+from a repeated one. They skip puts that no frame carried; one that is greater by a multiple of the banks would go into the bank
+that readers read.
 """
 
 from __future__ import annotations
@@ -18,12 +19,18 @@ from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
-from failover.core.board.banks import put_carefully
-from failover.core.board.layout import Record
+from failover.core.board.banks import EPOCH_SHIFT, first_of_epoch, put_carefully
+from failover.core.board.items import BLOCK_SIZE_MAX
+from failover.core.board.layout import ADDED, Record, Wanted
 from failover.core.frames.frame import Portion
+from failover.errors import BoardError
 
 UNKNOWN: Final = "items with numbers that are not known here"
 MISFIT: Final = "values of another size than declared"
+NO_ROOM: Final = "items added by other robots for which there is no room here"
+
+GROWTH: Final = 64 << 10
+"""A file becomes longer by so much, or by half of its size: what was mapped before stays mapped, so it is to be done seldom."""
 
 _GENERATION: Final = layout.GENERATION_AT // 8
 _CHANGED: Final = layout.CHANGED_AT // 8
@@ -44,6 +51,8 @@ class ReceivedItems:
         self.file = file
         self.dropped: Counter[str] = Counter()
         self._items: dict[int, Take] = {}
+        self._records: dict[int, Record] = {}
+        self._first_area = file.area  # `_wake` has an address in it
         self._wake = futex.waker(file.address(layout.CHANGED_AT))
         self._generation = -1
 
@@ -54,7 +63,9 @@ class ReceivedItems:
         Raises:
             BoardError, FileNotFoundError: it is none, or is not there.
         """
-        return cls(MappedFile.open(path, writable=True))
+        file = MappedFile.open(path, writable=True)
+        file.mend()  # an agent was killed while it changed the table
+        return cls(file)
 
     def begin_life(self) -> None:
         """The robot's agent began anew, and perhaps its board with it: its puts are counted from any number."""
@@ -81,8 +92,7 @@ class ReceivedItems:
             How many were put. The others are not known here, do not fit, or are not newer than what is there.
         """
         if self.file.words[_GENERATION] != self._generation:
-            self._generation = self.file.generation
-            self._items = {record.id: _taker(self.file, record) for record in self.file.records()}
+            self._look()
         known, puts = self._items.get, 0
         for item in items:
             take = known(item.number)
@@ -102,14 +112,78 @@ class ReceivedItems:
             self._wake()  # once for all of them: programs that read this file cannot say that they wait, nor for what
         return puts
 
+    def _look(self) -> None:
+        self._generation = self.file.generation
+        self._records = {record.id: record for record in self.file.records()}
+        self._items = {number: _taker(self.file, record) for number, record in self._records.items()}
+
+    # --- Items that the robot adds and removes ---
+
+    def added(self) -> list[Record]:
+        """The items here that the robot has added."""
+        if self.file.words[_GENERATION] != self._generation:
+            self._look()
+        return [record for record in self._records.values() if record.flags & ADDED]
+
+    def change(self, removed: Iterable[int], added: Iterable[Wanted]) -> None:
+        """Remove items by their numbers, then add others; what is there as it is wanted stays.
+
+        What has no room, or a name that is declared already, is counted.
+
+        Raises:
+            BoardError: another process holds the table; nothing was changed.
+        """
+        known = {record.id: record for record in self.added()}
+        fresh = [wanted for wanted in added if not _is(known.get(wanted.id), wanted)]
+        gone = [known[number] for number in {*removed, *(wanted.id for wanted in fresh)} if number in known]
+        if not fresh and not gone:
+            return
+        with self.file.changing(patience_s=0):
+            for record in gone:
+                self._remove(record)
+            for wanted in fresh:
+                self._add(wanted)
+        self._generation = self.file.generation
+
+    def _remove(self, record: Record) -> None:
+        self.file.remove(record)
+        del self._records[record.id]
+        self._items.pop(record.id, None)
+
+    def _add(self, wanted: Wanted) -> None:
+        there = next((record for record in self._records.values() if record.name == wanted.name), None)
+        if there is not None and there.flags & ADDED:
+            self._remove(there)  # its name was given anew, and what told of its removal was lost
+            there = None
+        if there is not None:
+            self.dropped[NO_ROOM] += 1
+            return
+        try:
+            record = self.file.add(wanted)
+            end = record.offset + record.banks * record.stride
+            if end > len(self.file.area):
+                self.file.grow(min(max(end, len(self.file.area) * 3 // 2, len(self.file.area) + GROWTH), BLOCK_SIZE_MAX))
+        except BoardError:
+            self.dropped[NO_ROOM] += 1
+            return
+        self._records[record.id] = record
+        self._items[record.id] = _taker(self.file, record)
+
     def bound(self, compute: Callable[[int], int]) -> None:
         """Tell how old each item may be while all works, used where none is declared.
 
         Args:
             compute: the bound in ns of an item with this period, by `failover.core.board.ages.bound_ns`.
         """
-        for record in self.file.records():
+        if self.file.words[_GENERATION] != self._generation:
+            self._look()
+        for record in self._records.values():
             self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = compute(record.period)
+
+
+def _is(record: Record | None, wanted: Wanted) -> bool:
+    """Whether a record is exactly as it is wanted."""
+    return record is not None and all(getattr(record, name) == getattr(wanted, name) for name in Wanted.__struct_fields__)
 
 
 def _taker(file: MappedFile, record: Record) -> Take:
@@ -117,7 +191,8 @@ def _taker(file: MappedFile, record: Record) -> Take:
     words, newest, least, limit, base = place.words, place.newest, place.least, place.limit, record.at // 8
     frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
     lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
-    period, following, last_number, last_round = record.period, words[newest] + 1, 0, -1
+    period, banks, last_number, last_round = record.period, record.banks, 0, -1
+    following = words[newest] + 1
 
     def take(number: int, value: bytes, stamp_ns: int, error_us: int, round_: int) -> bool | None:
         nonlocal following, last_number, last_round
@@ -132,6 +207,8 @@ def _taker(file: MappedFile, record: Record) -> Take:
         if number <= last_number:
             return False
         last_number = number
+        if number >> EPOCH_SHIFT > following >> EPOCH_SHIFT:
+            following = first_of_epoch(following - 1, number >> EPOCH_SHIFT, banks)
         put_carefully(place, following, value, stamp_ns, error_us, FENCE)
         following += 1
         return True

@@ -125,9 +125,13 @@ class SharedFile:
     # --- Changes of the table ---
 
     @contextmanager
-    def changing(self) -> Iterator[None]:
-        """The generation is odd for the body, and the table lock is held; the caller keeps other threads out."""
-        with locks.table(self.descriptor, f"cannot change {self.path}", self.ERROR):
+    def changing(self, patience_s: float = locks.TABLE_WAIT_S) -> Iterator[None]:
+        """The generation is odd for the body, and the table lock is held; the caller keeps other threads out.
+
+        Args:
+            patience_s: for another process that holds the lock.
+        """
+        with locks.table(self.descriptor, f"cannot change {self.path}", self.ERROR, patience_s):
             generation = self.read_header().generation
             generation += generation % 2  # an odd one: the process that changed the table has died
             self.words[GENERATION] = generation + 1

@@ -158,6 +158,10 @@ class Node:
         """The team as this robot sees it."""
         return view.status(self._components, self._turn(max(now_ns, self._now_ns)), self._boot, self._testimony)
 
+    def primaries(self) -> dict[str, tuple[str, int]]:
+        """Component → its primary, as far as this robot knows, and the epoch."""
+        return {name: (one.primary, one.epoch) for name, one in self._components.items() if one.primary and one.epoch}
+
     def _turn(self, now_ns: int) -> Turn:
         return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns, self._load)
 

@@ -120,6 +120,15 @@ class Reading(Struct, frozen=True, gc=False):
     stale: bool
 
 
+def first_of_epoch(newest: int, epoch: int, banks: int) -> int:
+    """The number of the first put under an epoch: above all of earlier ones, and not in the bank of the newest put.
+
+    That bank is read while the first put is under way, and holds the value if its writer is killed.
+    """
+    number = max(newest, epoch << EPOCH_SHIFT) + 1
+    return number + (newest != 0 and number % banks == newest % banks)
+
+
 def place_of(record: Record, words: Words, area: Area, halves: Words) -> Place:
     """An item's place in a mapped file."""
     banks = tuple(record.offset + index * record.stride for index in range(record.banks))

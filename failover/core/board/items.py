@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Any, Final
 
 import msgspec
@@ -53,13 +54,13 @@ BANK_ALIGNMENT: Final = 64
 """A bank is its header, then the value, on cache lines of its own. Source: BOARD.md."""
 
 
-class Item(Struct, frozen=True):
+class Item(Struct, frozen=True, dict=True):
     """One item as it is declared: `Item("ball", {"x": "f4"})`, `Item("goal", size=64)`, `Item("plan", "json", size=99)`.
 
     Attributes:
         name: without blanks and "/".
         type: what its values are: a text or a table of `failover.core.board.item_types`, a class or a numpy dtype of
-            `failover.core.board.item_values`; kept as the type itself. Without one: bytes.
+            `failover.core.board.item_values`; kept as the type itself, a class besides as `shape`. Without one: bytes.
         size: bytes of a value; for contents without a layout the most bytes, which must be said.
         shared: whether it travels to the other robots: True, False, or the robots (patterns) from which it does.
         period: rounds between two transmissions, from 1. phase: the first of them, below the period.
@@ -95,6 +96,8 @@ class Item(Struct, frozen=True):
         _check_kinds(self)
         check_name(self.name)
         kind = _typed(self.type, self.size)
+        if not isinstance(self.type, str | Mapping | Type | None):
+            self.__dict__["shape"] = self.type
         msgspec.structs.force_setattr(self, "type", kind)
         msgspec.structs.force_setattr(self, "size", size_of(kind))
         for key in ("shared", "robots"):
@@ -103,6 +106,11 @@ class Item(Struct, frozen=True):
                 msgspec.structs.force_setattr(self, key, tuple(said))
         _check_numbers(self)
         _check_words(self)
+
+    @property
+    def shape(self) -> Any:
+        """The class or numpy dtype that was given as its type, of which a program's values are; None for a text or a table."""
+        return self.__dict__.get("shape")
 
     @property
     def layout(self) -> Type:

@@ -238,7 +238,7 @@ def test_a_file_that_a_program_makes_shorter_ends_no_agent(pair: tuple[Robot, Ro
     """A mapping would: the kernel ends a process that touches a page which is gone."""
     first, _ = pair
     first.program.item("ball").put({"x": 1.0, "y": 0.0})
-    assert len(first.link.due(0, clock.now_ns())) == 1
+    assert len(first.link.due(1, clock.now_ns())) == 1
     first.program.item("ball").put({"x": 2.0, "y": 0.0})  # is not read yet
     own = place_of("robot1") / "own"
     os.truncate(own, size)

@@ -12,7 +12,8 @@ import pytest
 
 import failover
 from agent import config as configuration
-from agent.worker import board_directory, schedule_place
+from agent.worker import board_directory, kept_items, schedule_place
+from agent.worker.kept_items import Keeper
 from failover.boards import SCHEDULE_PLACE
 from failover.boards.mapping import MappedFile
 from failover.boards.schedule_file import ScheduleFile
@@ -80,9 +81,10 @@ def test_the_declared_items_lie_in_the_files_of_their_robots(folder: Path) -> No
     place = board_directory.provide(loaded(folder, BALL))
     assert place is not None
     modes = {path.name: oct(path.stat().st_mode & 0o777) for path in place.iterdir()}
-    assert modes == {"own": "0o660", "private": "0o660", "schedule": "0o660", "peer-robot2": "0o640"}
+    of_agent = {"agent": "0o640", "peer-robot2": "0o640"}
+    assert modes == {"own": "0o660", "private": "0o660", "schedule": "0o660", **of_agent}
     names = {path.name: [record.name for record in MappedFile.open(path).records()] for path in boards_of(place)}
-    assert names == {"own": ["ball"], "private": ["notes"], "peer-robot2": ["ball"]}
+    assert names == {"own": ["ball"], "private": ["notes"], "peer-robot2": ["ball"], "agent": ["primaries"]}
     with failover.board() as board:
         assert (board.robot, board.directory) == ("robot1", place)
         board.item("ball").put({"x": 1.0, "y": 2.0})
@@ -133,7 +135,7 @@ def test_a_robot_that_left_the_team_leaves_the_board(folder: Path) -> None:
     members = {"robot1": settings.team.robots["robot1"], "robot3": settings.team.robots["robot2"]}
     team.write(directory, Team(settings.team.team, members, settings.team.board))
     board_directory.provide(loaded(folder))
-    assert {path.name for path in place.iterdir()} == {"own", "private", "schedule", "peer-robot3"}
+    assert {path.name for path in place.iterdir()} == {"agent", "own", "private", "schedule", "peer-robot3"}
 
 
 def test_a_file_that_is_damaged_is_made_anew(folder: Path) -> None:
@@ -218,3 +220,76 @@ def test_members_of_the_group_use_it_and_others_do_not(folder: Path) -> None:
 
     assert tried([group.gr_gid]) == 0
     assert tried([]) == 1
+
+
+def reboot(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel has another boot id, and its shared memory is empty."""
+    shutil.rmtree(place)
+    monkeypatch.setattr("failover.boards.boottime.boot_id", lambda: uuid.uuid4().bytes)
+
+
+def test_items_added_with_keep_are_there_after_a_reboot_and_others_are_not(
+    folder: Path, found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = loaded(folder, BALL)
+    place = board_directory.provide(settings)
+    assert place is not None
+    keeper = Keeper(place, folder / "state")
+    with failover.board() as board:
+        board.add(Item("goal", {"x": "f4"}, period=3, bound_ms=2.5, keep=True)).put({"x": 1.0})
+        board.add(Item("passing", size=8))
+        board.add(Item("diary", size=9000, shared=False, keep=True, banks=3))
+        keeper.look()
+        before = {record.name: record for record in MappedFile.open(place / "own").records()}["goal"]
+    assert kept_items.read(folder / "state") == (
+        Item("goal", {"x": "f4"}, period=3, bound_ms=2.5, keep=True),
+        Item("diary", size=9000, shared=False, keep=True, banks=3),
+    )
+    reboot(place, monkeypatch)
+    board_directory.provide(settings)
+    with failover.board() as board:
+        assert board.names() == ["ball", "goal", "notes", "diary"]
+        with pytest.raises(failover.NeverWrittenError):
+            board.item("goal").get()
+        after = {record.name: record for record in MappedFile.open(place / "own").records()}["goal"]
+        assert (after.id, after.flags, after.text) == (before.id, before.flags, before.text)
+        Keeper(place, folder / "state").look()
+        board.remove("goal")
+        Keeper(place, folder / "state").look()
+    assert [item.name for item in kept_items.read(folder / "state")] == ["diary"]
+    reboot(place, monkeypatch)
+    board_directory.provide(loaded(folder, BALL.replace("notes", "diary")))
+    with failover.board() as board:
+        assert board.names() == ["ball", "diary"]
+        assert board.item("diary").source().record.size == 100
+
+
+def test_a_list_of_kept_items_that_cannot_be_read_or_has_no_room_does_not_keep_the_board_away(folder: Path, found: None) -> None:
+    settings = loaded(folder, BALL)
+    for text in ("[board", "board = 1", "[board.items.x]\ntype = 'f9'\n", "[board.items.x]\nsizes = 1\n"):
+        (folder / "state" / kept_items.FILE_NAME).write_text(text)
+        assert kept_items.read(folder / "state") == ()
+    large = tuple(Item(f"large{number}", size=60_000, shared=False, banks=8, keep=True) for number in range(34))
+    kept_items.write(folder / "state", large)
+    board_directory.provide(settings)
+    with failover.board() as board:
+        assert len(board.names()) == 2 + len(large)
+    place = board_directory.place_of(settings)
+    shutil.rmtree(place)
+    board_directory.provide(loaded(folder, BALL.replace("size = 100", "size = 60000\nbanks = 8")))
+    with failover.board() as board:
+        assert board.names() == ["ball", "notes"]
+
+
+def test_a_peers_file_that_is_full_of_removed_items_is_made_anew(folder: Path) -> None:
+    settings = loaded(folder, BALL)
+    place = board_directory.provide(settings)
+    assert place is not None
+    file = MappedFile.open(place / "peer-robot2", writable=True)
+    with file.changing():
+        for number in range(600):
+            file.remove(file.add(layout.Wanted(9000 + number, f"x{number}", 8)))
+    file.close()
+    board_directory.provide(settings)
+    assert file.is_gone
+    assert [record.name for record in MappedFile.open(place / "peer-robot2").records()] == ["ball"]

@@ -258,3 +258,11 @@ def test_a_size_beyond_the_item_is_damage_and_nothing_is_copied_behind_it() -> N
         plain_get(memory)
     with pytest.raises(OvertakenError):  # the fast form leaves it to the plain one
         fast_get(memory)
+
+
+def test_the_first_put_of_an_epoch_is_above_all_and_leaves_the_bank_that_is_read() -> None:
+    shift = banks.EPOCH_SHIFT
+    for count, epoch, newest in itertools.product((2, 3, 8), (0, 1, 5), (0, 1, 2, 7, (5 << shift) + 9)):
+        number = banks.first_of_epoch(newest, epoch, count)
+        assert max(newest, epoch << shift) < number <= max(newest, epoch << shift) + 2
+        assert newest == 0 or number % count != newest % count
