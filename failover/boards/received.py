@@ -18,7 +18,7 @@ from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
-from failover.core.board.banks import put_carefully
+from failover.core.board.banks import storing
 from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 
@@ -28,8 +28,8 @@ MISFIT: Final = "values of another size than declared"
 _GENERATION: Final = layout.GENERATION_AT // 8
 _CHANGED: Final = layout.CHANGED_AT // 8
 
-Take = Callable[[int, bytes, int, int, int], bool | None]
-"""``(number, value, stamp_ns, error_us, round)`` → whether it was put; None: it does not fit."""
+Take = Callable[[Portion, int, int, int], bool | None]
+"""``(item, came_ns, error_us, round)`` → whether it was put; None: it does not fit."""
 
 
 class ReceivedItems:
@@ -44,6 +44,7 @@ class ReceivedItems:
         self.file = file
         self.dropped: Counter[str] = Counter()
         self._items: dict[int, Take] = {}
+        self._records: dict[int, Record] = {}
         self._wake = futex.waker(file.address(layout.CHANGED_AT))
         self._generation = -1
 
@@ -81,18 +82,14 @@ class ReceivedItems:
             How many were put. The others are not known here, do not fit, or are not newer than what is there.
         """
         if self.file.words[_GENERATION] != self._generation:
-            self._generation = self.file.generation
-            self._items = {record.id: _taker(self.file, record) for record in self.file.records()}
+            self._look()
         known, puts = self._items.get, 0
         for item in items:
             take = known(item.number)
             if take is None:
                 self.dropped[UNKNOWN] += 1
                 continue
-            age_us = item.age_us
-            stamp_ns = came_ns - age_us * NS_PER_US
-            error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
-            is_put = take(item.put, item.value, stamp_ns if stamp_ns > 0 else 0, error, round_)
+            is_put = take(item, came_ns, error_us, round_)
             if is_put:
                 puts += 1
             elif is_put is None:
@@ -102,27 +99,39 @@ class ReceivedItems:
             self._wake()  # once for all of them: programs that read this file cannot say that they wait, nor for what
         return puts
 
+    def _look(self) -> None:
+        self._generation = self.file.generation
+        self._records = {record.id: record for record in self.file.records()}
+        self._items = {number: _taker(self.file, record) for number, record in self._records.items()}
+
     def bound(self, compute: Callable[[int], int]) -> None:
         """Tell how old each item may be while all works, used where none is declared.
 
         Args:
             compute: the bound in ns of an item with this period, by `failover.core.board.ages.bound_ns`.
         """
-        for record in self.file.records():
-            self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = compute(record.period)
+        if self.file.words[_GENERATION] != self._generation:
+            self._look()
+        bounds: dict[int, int] = {}
+        for record in self._records.values():
+            if record.period not in bounds:
+                bounds[record.period] = compute(record.period)
+            self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = bounds[record.period]
 
 
 def _taker(file: MappedFile, record: Record) -> Take:
     place = file.place(record)
-    words, newest, least, limit, base = place.words, place.newest, place.least, place.limit, record.at // 8
+    words, least, limit, base, put = place.words, place.least, place.limit, record.at // 8, storing(place, FENCE)
     frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
     lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
-    period, following, last_number, last_round = record.period, words[newest] + 1, 0, -1
+    period, following, last_number, last_round, count = record.period, words[place.newest] + 1, 0, -1, words[frames]
 
-    def take(number: int, value: bytes, stamp_ns: int, error_us: int, round_: int) -> bool | None:
-        nonlocal following, last_number, last_round
-        words[frames] += 1
-        words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error_us
+    def take(item: Portion, came_ns: int, error_us: int, round_: int) -> bool | None:
+        nonlocal following, last_number, last_round, count
+        words[frames] = count = count + 1
+        age_us, number, value = item.age_us, item.put, item.value
+        error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
+        words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error
         if 0 <= last_round < round_ - period:
             words[lost] += (round_ - last_round) // period - 1
         last_round = round_
@@ -132,7 +141,8 @@ def _taker(file: MappedFile, record: Record) -> Take:
         if number <= last_number:
             return False
         last_number = number
-        put_carefully(place, following, value, stamp_ns, error_us, FENCE)
+        stamp_ns = came_ns - age_us * NS_PER_US
+        put(following, value, stamp_ns if stamp_ns > 0 else 0, error)
         following += 1
         return True
 
