@@ -450,10 +450,13 @@ class MainLoop:
     def _send_urgent(self) -> None:
         """Items that cannot wait for their round, without a beat."""
         self._urgent_ns = None
+        if self._board is None:
+            return
         now_ns = clock.now_ns()
-        items = self._board.urgent(now_ns) if self._board is not None else []
-        if self._board is not None and items:
+        items = self._board.urgent(now_ns)
+        if items:
             self._board.went(items[: self._send_frame(None, items, now_ns)])
+        self._board.seen_to()
 
     def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:
         """One frame, to everybody over every link; how many of the items are in it."""
