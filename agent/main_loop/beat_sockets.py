@@ -51,6 +51,9 @@ SO_TIMESTAMPNS: Final = 35
 _ARRIVAL: Final = struct.Struct("@ll")
 """Source: socket(7), SO_TIMESTAMP; asm-generic/socket.h; a struct timespec."""
 
+TOLD_MAX: Final = 256
+"""Pairs of interface and address of this robot whose names are remembered as the kernel tells them."""
+
 
 class BeatLane:
     """This robot's beat sockets and everybody's beat addresses."""
@@ -65,7 +68,9 @@ class BeatLane:
         self._waiting = select.epoll()
         for fileno in self._sockets:
             self._waiting.register(fileno, select.EPOLLIN)
+        self._only = [(fileno, select.EPOLLIN) for fileno in self._sockets] if len(self._sockets) == 1 else []
         self._names: dict[int, str] = {}
+        self._told: dict[bytes, str] = {}
         self._ways = {name: _ways(tuple(self._sockets.values()), robot) for name, robot in peers.items()}
         self.unsent = 0
 
@@ -81,35 +86,52 @@ class BeatLane:
             except OSError:
                 self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
 
-    def receive(self) -> Iterator[tuple[bytes, str, int, tuple[str, int]]]:
+    def receive(self) -> Iterator[tuple[bytes, str, int, tuple[str, int, *tuple[int, ...]]]]:
         """The datagrams that wait, at most `TURN_LIMIT`: each with its interface ("": not told), when it came, and whence.
 
         Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another. The
         instant is by this machine's calendar, in nanoseconds since 1970; 0: not told.
         """
         taken = 0
-        while taken < TURN_LIMIT:  # asked before each: to be told that none waits is cheaper than a call that fails
-            ready = self._waiting.poll(0)
-            if not ready:
-                return
+        ready = self._only or self._waiting.poll(0)  # this is asked where one waits: of one socket it is clear where
+        while ready and taken < TURN_LIMIT:
             for fileno, _ in ready:
                 taken += 1
                 try:
                     frame, ancillary, _, sender = self._sockets[fileno].recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
                 except OSError:
-                    continue  # an ICMP error of an earlier datagram; the next call has the next datagram
-                yield frame, self._interface(ancillary), _arrival_ns(ancillary), sender[:2]
+                    continue  # none, or an ICMP error of an earlier datagram; the next call has the next datagram
+                yield frame, *self._circumstances(ancillary), sender
+            ready = self._waiting.poll(0)  # to be told that none waits is cheaper than a call that fails
 
     def dropped(self) -> int:
         """Datagrams that the kernel dropped since these sockets were bound: no beats, or beats without room."""
         return sum(map(_drops, self._sockets.values()))
 
-    def _interface(self, ancillary: Iterable[tuple[int, int, bytes]]) -> str:
-        index = interface_index(ancillary)
+    def _circumstances(self, ancillary: Iterable[tuple[int, int, bytes]]) -> tuple[str, int]:
+        """The interface, and the instant by the calendar."""
+        link, wall_ns = "", 0
+        for one in ancillary:
+            level, kind, content = one
+            if kind == SO_TIMESTAMPNS and level == socket.SOL_SOCKET:
+                seconds, ns = _ARRIVAL.unpack_from(content)
+                wall_ns = seconds * 1_000_000_000 + ns
+            elif content in self._told:
+                link = self._told[content]
+            else:
+                link = self._interface(one)
+        return link, wall_ns
+
+    def _interface(self, told: tuple[int, int, bytes]) -> str:
+        """The name of the interface that the kernel tells; remembered by what it says, and by the interface's number."""
+        index = interface_index((told,))
         if index and index not in self._names:
             with contextlib.suppress(OSError):  # it has gone already
                 self._names[index] = socket.if_indextoname(index)
-        return self._names.get(index, "")
+        name = self._names.get(index, "")
+        if name and len(self._told) < TOLD_MAX:
+            self._told[told[2]] = name
+        return name
 
     def close(self) -> None:
         """Close the sockets."""
@@ -169,14 +191,6 @@ def _drops(link: socket.socket) -> int:
     except OSError:
         return 0
     return counts[_DROPS] if len(counts) > _DROPS else 0
-
-
-def _arrival_ns(ancillary: Iterable[tuple[int, int, bytes]]) -> int:
-    for level, kind, content in ancillary:
-        if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
-            seconds, ns = _ARRIVAL.unpack_from(content)
-            return int(seconds) * 1_000_000_000 + int(ns)
-    return 0
 
 
 def _ways(links: Sequence[socket.socket], peer: Robot) -> tuple[tuple[socket.socket, tuple[str, int]], ...]:

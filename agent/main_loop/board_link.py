@@ -7,7 +7,7 @@ anything into `own`; every size is checked before it is believed, and nothing of
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +24,7 @@ from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
 from failover.core.board.announcements import RESERVED
 from failover.core.board.due import Bucket, Sent, Turns
+from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
 from failover.errors import BoardError, OvertakenError
@@ -73,6 +74,7 @@ class BoardLink:
         self.dropped: Counter[str] = Counter()
         self._own = OwnItems(own)
         self._gone: dict[int, int] = {}
+        self._looked: dict[int, int] = {}
         self._buckets: dict[int, Bucket] = {}
         self.wakes = UrgentItems(own, self._own)
         self._peers = {name: _Peer(items) for name, items in peers.items()}
@@ -100,23 +102,31 @@ class BoardLink:
             if self._own.look(now_ns):
                 self.turns.hold(Sent(one.id, one.period, one.phase) for one in self._own.records.values())
                 self._announcements.hold(self._own.records.values())
+                self.wakes.look_again()
             told = self._announcements.due(round_)
-            numbers = self.turns.due(round_)
-            return told + self._portions(numbers, self._own.newest(), now_ns) if numbers else told
+            due = self.turns.due(round_)
+            if not due:
+                return told
+            table, records = self._own.newest(), self._own.records
+            return told + self._portions([(records[one], number_in(table, records[one])) for one in due], now_ns)
         except (BoardError, OSError):
             self.dropped[UNREADABLE] += 1
             return []
 
     def urgent(self, now_ns: int) -> list[Portion]:
         """Urgent items that were put since they last went, as often as `Bucket` allows it."""
+        urgent = self._own.urgent
         try:
-            table = self._own.newest()
-        except (BoardError, OSError):
+            self._looked = numbers = self._own.numbers(urgent)
+        except OSError:
             self.dropped[UNREADABLE] += 1
             return []
-        put = [one.id for one in self._own.urgent if number_in(table, one) > self._gone.get(one.id, 0)]
-        allowed = [number for number in put if self._buckets.setdefault(number, Bucket()).take(now_ns)]
-        return self._portions(allowed, table, now_ns)
+        put = [(one, numbers[one.id]) for one in urgent if numbers[one.id] > self._gone.get(one.id, 0)]
+        return self._portions([one for one in put if self._buckets.setdefault(one[0].id, Bucket()).take(now_ns)], now_ns)
+
+    def seen_to(self) -> None:
+        """What `urgent` gave is on its way: the thread that waits for puts may go on."""
+        self.wakes.seen_to(self._looked)
 
     def placed(self, portions: Sequence[Portion], count: int) -> None:
         """The first ``count`` of what was due found room in the frame."""
@@ -127,16 +137,17 @@ class BoardLink:
         """These are on their way: what is urgent of them need not go again."""
         self._gone.update((portion.number, portion.put) for portion in portions)
 
-    def _portions(self, numbers: Sequence[int], table: bytes, now_ns: int) -> list[Portion]:
-        found = []
-        for number in numbers:
+    def _portions(self, newest: Iterable[tuple[Record, int]], now_ns: int) -> list[Portion]:
+        """Of items with the numbers of their newest puts."""
+        found, left_ns, get = [], now_ns - self._skew_ns, self._own.get
+        for record, number in newest:
             try:
-                bank = self._own.get(self._own.records[number], table)
+                bank = get(record, number)
             except (OvertakenError, BoardError, OSError):
                 self.dropped[UNREADABLE] += 1
                 continue
             if bank is not None:
-                found.append(Portion(number, sent_age_us(bank.stamp_ns, now_ns - self._skew_ns), bank.number, bank.value))
+                found.append(Portion(record.id, sent_age_us(bank.stamp_ns, left_ns), bank.number, bank.value))
         return found
 
     # --- In ---
@@ -152,12 +163,12 @@ class BoardLink:
             peer.items.begin_life()
             self._announcements.begin_life(part.sender)
         came_ns -= self._skew_ns
-        self._note_frame(peer, heard.way_ns, came_ns)
         items = heard.items
         if items and items[0].number >= RESERVED:
             items = self._announcements.take(part.sender, items)
         if items:
             peer.items.take(items, came_ns, way_bound_us(heard.way_ns), part.round)
+        self._note_frame(peer, heard.way_ns, came_ns)
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
         """Tell when it came; from time to time the bounds that follow from the longest ways."""

@@ -39,7 +39,7 @@ from agent.main_loop.messages import (
     ToMainLoop,
     ToWorker,
 )
-from agent.main_loop.outbox import Due, Outbox
+from agent.main_loop.outbox import NOTHING, Due, Outbox
 from agent.main_loop.unauthenticated_beats import UnreadBeats
 from agent.main_loop.vote_record_writer import VoteRecordWriter
 from agent.main_loop.worker_process import WorkerProcess
@@ -297,7 +297,9 @@ class MainLoop:
         if self._node is not None:
             now_ns = clock.now_ns()
             ready = self._node.step(event, now_ns)
-            self._obey(self._outbox.take(ready, now_ns))
+            due = self._outbox.take(ready, now_ns)
+            if due is not NOTHING:
+                self._obey(due)
             if ready.told:
                 self._event_log.note(ready.told)
 
@@ -306,14 +308,14 @@ class MainLoop:
         taken = refused = 0
         for frame, link, wall_ns, sender in self._beats.receive():
             taken += 1
-            came_ns = arrived_ns(wall_ns)
+            now_ns, came_ns = clock.now_and_arrival_ns(wall_ns)
             opened = self._frames.open(frame, came_ns)
             if not isinstance(opened, Refused):
-                self._copies.heard(opened.part, link)
                 if self._board is not None:
-                    self._board.take(opened, came_ns)
-                self._take_part(opened.part, link, self._came_ns(wall_ns))
-            elif not self._copies.admit(opened, link, clock.now_ns()):
+                    self._board.take(opened, came_ns)  # first: programs wait for it
+                self._copies.heard(opened.part, link)
+                self._take_part(opened.part, link, now_ns, self._counts_from_ns(now_ns, came_ns))
+            elif not self._copies.admit(opened, link, now_ns):
                 self._refused[str(opened.reason)] += 1
                 refused += 1
                 if sign := self._unread.of_beat(opened, sender, clock.now_ns()):
@@ -321,20 +323,17 @@ class MainLoop:
         if taken >= TURN_LIMIT and refused > taken // 2:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
 
-    def _take_part(self, part: Part, link: str, came_ns: int) -> None:
+    def _take_part(self, part: Part, link: str, now_ns: int, came_ns: int) -> None:
         self._count_part(part)
         beat = part.beat
         if beat is not None:
-            self._count_beat(beat, came_ns or clock.now_ns())
+            self._count_beat(beat, came_ns or now_ns)
             self._mind_earlier_lives(beat)
             self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 
-    def _came_ns(self, wall_ns: int) -> int:
+    def _counts_from_ns(self, now_ns: int, came_ns: int) -> int:
         """When a beat came that waited because this main loop rests: its sender was not late. 0: now, or a stall of ours."""
-        if not self._rests or not wall_ns:
-            return 0
-        came_ns, now_ns = clock.of_wall_ns(wall_ns), clock.now_ns()
-        return came_ns if 0 <= now_ns - came_ns <= self._rest_ns + self._outbox.beat_ns else 0
+        return came_ns if self._rests and now_ns - came_ns <= self._rest_ns + self._outbox.beat_ns else 0
 
     def _mind_earlier_lives(self, beat: Beat) -> None:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""
@@ -452,10 +451,13 @@ class MainLoop:
     def _send_urgent(self) -> None:
         """Items that cannot wait for their round, without a beat."""
         self._urgent_ns = None
+        if self._board is None:
+            return
         now_ns = clock.now_ns()
-        items = self._board.urgent(now_ns) if self._board is not None else []
-        if self._board is not None and items:
+        items = self._board.urgent(now_ns)
+        if items:
             self._board.went(items[: self._send_frame(None, items, now_ns)])
+        self._board.seen_to()
 
     def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:
         """One frame, to everybody over every link; how many of the items are in it."""
@@ -513,13 +515,6 @@ class MainLoop:
         self._poll.close()
         signal.set_wakeup_fd(-1)
         log.info("robot %s ends; its components live on", self._me)
-
-
-def arrived_ns(wall_ns: int) -> int:
-    """When a datagram came that the kernel stamped with this instant of the calendar (0: it did not); now, if in doubt."""
-    now_ns = clock.now_ns()
-    came_ns = clock.of_wall_ns(wall_ns) if wall_ns else now_ns
-    return came_ns if 0 <= now_ns - came_ns <= NANOSECONDS_A_SECOND else now_ns
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:

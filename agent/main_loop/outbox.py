@@ -10,6 +10,7 @@ counts on that lease running out.
 from __future__ import annotations
 
 from collections import deque
+from typing import Final
 
 import msgspec
 from msgspec import Struct, field
@@ -29,6 +30,10 @@ class Due(Struct, frozen=True):
     persist: tuple[int, VoteRecord] | None = None
     beats: tuple[Beat, ...] = ()
     acts: tuple[Act, ...] = ()
+
+
+NOTHING: Final = Due()
+"""What most heartbeats of others make due."""
 
 
 class Outbox(Struct):
@@ -57,7 +62,10 @@ class Outbox(Struct):
         return self._kept < self._ordered
 
     def take(self, ready: Ready, now_ns: int) -> Due:
-        """Take in new obligations; return those that may leave now."""
+        """Take in new obligations; return those that may leave now: `NOTHING` if there are none."""
+        if ready.persist is None and not ready.send and not ready.act and not self._acts and self._kept >= self._ordered:
+            self._withheld = None
+            return NOTHING
         persist = None
         if ready.persist is not None:
             self._ordered += 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterable
 from typing import Final
 
 from failover.boards.mapping import MappedFile
@@ -61,6 +62,10 @@ class OwnItems:
         self.urgent = tuple(record for record in found if record.flags & URGENT)
         return True
 
+    def numbers(self, records: Iterable[Record]) -> dict[int, int]:
+        """Numbers of the newest puts of some items, by the items' numbers; 0: none."""
+        return {record.id: self._word(record.at + layout.NEWEST_FIELD) for record in records}
+
     def newest(self) -> bytes:
         """The table as it is now: for `number_in`.
 
@@ -72,16 +77,15 @@ class OwnItems:
             raise BoardError(f"{self._file.path}: the file was made shorter")
         return table
 
-    def get(self, record: Record, table: bytes) -> Found | None:
+    def get(self, record: Record, number: int) -> Found | None:
         """The newest put of an item, whole; None before the first. A put that was read before is not read again.
 
         Args:
-            table: from `newest`, a moment ago.
+            number: of its newest put, a moment ago.
 
         Raises:
             OvertakenError, BoardError: see `failover.core.board.banks.get_carefully`.
         """
-        number = number_in(table, record)
         known = self._known.get(record.id)
         if known is not None and known.number == number:
             return known

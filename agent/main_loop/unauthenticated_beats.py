@@ -48,7 +48,7 @@ class UnreadBeats:
         self._alone = {host: name for (host, _), name in self._members.items() if hosts[host] == 1}
         self._next_ns: dict[str, int] = {}
 
-    def of_beat(self, refused: Refused, sender: tuple[str, int], now_ns: int) -> Unread | None:
+    def of_beat(self, refused: Refused, sender: tuple[str, int, *tuple[int, ...]], now_ns: int) -> Unread | None:
         """What a beat from that address, which was not believed, tells the rules; None for nothing, or nothing new."""
         why = OF_A_MEMBER.get(refused.reason)
         if why is None:

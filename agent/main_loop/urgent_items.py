@@ -9,15 +9,19 @@ from __future__ import annotations
 import logging
 import os
 import threading
+from collections.abc import Mapping
 from typing import Final
 
-from agent.main_loop.own_items import OwnItems, number_in
+from agent.main_loop.own_items import OwnItems
 from failover.boards import futex
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.errors import BoardError
 
 LOOK_S: Final = 0.1
+IDLE_LOOK_S: Final = 1.0
+"""Where there is no urgent item: the loop says when there is one."""
+
 WAITS_FOR_ANY: Final = b"\x01"
 ANY_FIELD: Final = layout.WAITERS_FIELD + 1
 
@@ -31,6 +35,9 @@ class UrgentItems:
         self._file, self._items = file, items
         self._event = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._ends = threading.Event()
+        self._looked: Mapping[int, int] = {}
+        self._away = threading.Lock()
+        self._away.acquire()
         self._thread = threading.Thread(target=self._run, name="urgent items", daemon=True)
         self._thread.start()
 
@@ -38,40 +45,50 @@ class UrgentItems:
         """For epoll."""
         return self._event
 
+    def look_again(self) -> None:
+        """There are other items than before."""
+        futex.wake(self._file.address(layout.CHANGED_AT))
+
     def heed(self) -> None:
         """What was signalled is being seen to."""
         os.eventfd_read(self._event)
+
+    def seen_to(self, numbers: Mapping[int, int]) -> None:
+        """The loop has looked at the items, whose newest puts had these numbers, and what it sends is on its way."""
+        self._looked = numbers
+        if self._away.locked():
+            self._away.release()
 
     def close(self) -> None:
         """End the thread. A second call does nothing."""
         if self._ends.is_set():
             return
         self._ends.set()
+        self.seen_to({})
         futex.wake(self._file.address(layout.CHANGED_AT))
         self._thread.join()
         os.close(self._event)
 
     def _run(self) -> None:
-        seen: dict[int, int] = {}
         try:
             while not self._ends.is_set():
-                self._wait(seen)
+                self._wait()
         except (BoardError, OSError) as error:
             log.warning("urgent items go with the rounds only: %s", error)
 
-    def _wait(self, seen: dict[int, int]) -> None:
+    def _wait(self) -> None:
         urgent, descriptor = self._items.urgent, self._file.descriptor
-        changed = self._changed()
+        changed = int.from_bytes(os.pread(descriptor, 4, layout.CHANGED_AT), "little")
         for record in urgent:
             os.pwrite(descriptor, WAITS_FOR_ANY, record.at + ANY_FIELD)
-        table = self._items.newest() if urgent else b""
-        newest = {record.id: number_in(table, record) for record in urgent}
-        if any(seen.get(number, 0) != put for number, put in newest.items()):  # put before it was told that we wait
-            seen.update(newest)
-            os.eventfd_write(self._event, 1)
-        futex.wait(self._file.address(layout.CHANGED_AT), changed, LOOK_S)
-        if self._changed() != changed:  # the loop is to know first, and this thread what it was afterwards
-            os.eventfd_write(self._event, 1)
+        newest = self._items.numbers(urgent)
+        if any(self._looked.get(number, 0) != put for number, put in newest.items()):  # put before it was told that we wait
+            self._looked = newest
+            self._tell()
+        elif futex.wait(self._file.address(layout.CHANGED_AT), changed, LOOK_S if urgent else IDLE_LOOK_S) and urgent:
+            self._tell()
 
-    def _changed(self) -> int:
-        return int.from_bytes(os.pread(self._file.descriptor, 4, layout.CHANGED_AT), "little")
+    def _tell(self) -> None:
+        """Wake the loop and leave the interpreter to it: what is done here takes it from what is to leave."""
+        os.eventfd_write(self._event, 1)
+        self._away.acquire(timeout=LOOK_S)

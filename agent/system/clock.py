@@ -17,6 +17,9 @@ from agent.system import syscalls
 
 BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
+WAITED_NS_MAX: Final = 1_000_000_000
+"""A datagram that seems to have waited for longer tells more of a calendar that was set than of its arrival."""
+
 MAIN_LOOP_PRIORITY: Final = 60
 """SCHED_FIFO priority of the main loop: above the interrupt threads of a PREEMPT_RT kernel (50), below its watchdogs (99)."""
 
@@ -47,13 +50,18 @@ def wall_ns(instant_ns: int) -> int:
     return time.time_ns() - (now_ns() - instant_ns)
 
 
-def of_wall_ns(wall_ns: int) -> int:
-    """An instant of this machine's calendar by our clock; only for one so young that the calendar cannot have been set since.
+def now_and_arrival_ns(wall_ns: int) -> tuple[int, int]:
+    """Now; and when a datagram came that the kernel stamped with this instant of the calendar (0: it did not).
 
-    It is never told too early, and by at most as much too late as passes between two readings of a clock.
+    Where it seems to have waited longer than `WAITED_NS_MAX`, or not to have come yet, the calendar was set: then it came now. It
+    is never told too early, and by at most as much too late as passes between two readings of a clock.
     """
+    if not wall_ns:
+        now = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        return now, now
     ago_ns = time.time_ns() - wall_ns
-    return now_ns() - ago_ns
+    now = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    return now, now - ago_ns if 0 <= ago_ns <= WAITED_NS_MAX else now
 
 
 def kernel_boot() -> str:

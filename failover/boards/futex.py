@@ -62,14 +62,20 @@ def address_of(mapping: Any) -> int:
     return int(address)
 
 
-def wait(address: int, value: int, timeout_s: float) -> None:
-    """Sleep until woken, as long as the 32 bits at ``address`` are ``value``; not longer than ``timeout_s``. May wake early."""
+def wait(address: int, value: int, timeout_s: float) -> bool:
+    """Sleep until woken, as long as the 32 bits at ``address`` are ``value``; not longer than ``timeout_s``. May wake early.
+
+    Returns:
+        Whether they were another value, or this thread was woken. False: the time is over, or a signal came.
+    """
     nanoseconds = max(int(timeout_s * _NS_PER_S), 0)
     limit = _Timespec(*divmod(nanoseconds, _NS_PER_S))
-    if _call()(_number(), ctypes.c_void_p(address), _WAIT, ctypes.c_uint32(value), ctypes.byref(limit), None, 0) == -1:
-        wrong = ctypes.get_errno()
-        if wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
-            raise BoardError(f"cannot wait for the board: {os.strerror(wrong)}")
+    if _call()(_number(), ctypes.c_void_p(address), _WAIT, ctypes.c_uint32(value), ctypes.byref(limit), None, 0) == 0:
+        return True
+    wrong = ctypes.get_errno()
+    if wrong not in (errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
+        raise BoardError(f"cannot wait for the board: {os.strerror(wrong)}")
+    return wrong == errno.EAGAIN
 
 
 def wait_until(address: int, value: int, instant_ns: int) -> None:

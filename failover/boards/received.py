@@ -19,7 +19,7 @@ from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
-from failover.core.board.banks import EPOCH_SHIFT, first_of_epoch, put_carefully
+from failover.core.board.banks import EPOCH_SHIFT, first_of_epoch, storing
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import ADDED, Record, Wanted
 from failover.core.frames.frame import Portion
@@ -35,8 +35,8 @@ GROWTH: Final = 64 << 10
 _GENERATION: Final = layout.GENERATION_AT // 8
 _CHANGED: Final = layout.CHANGED_AT // 8
 
-Take = Callable[[int, bytes, int, int, int], bool | None]
-"""``(number, value, stamp_ns, error_us, round)`` → whether it was put; None: it does not fit."""
+Take = Callable[[Portion, int, int, int], bool | None]
+"""``(item, came_ns, error_us, round)`` → whether it was put; None: it does not fit."""
 
 
 class ReceivedItems:
@@ -99,10 +99,7 @@ class ReceivedItems:
             if take is None:
                 self.dropped[UNKNOWN] += 1
                 continue
-            age_us = item.age_us
-            stamp_ns = came_ns - age_us * NS_PER_US
-            error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
-            is_put = take(item.put, item.value, stamp_ns if stamp_ns > 0 else 0, error, round_)
+            is_put = take(item, came_ns, error_us, round_)
             if is_put:
                 puts += 1
             elif is_put is None:
@@ -177,8 +174,11 @@ class ReceivedItems:
         """
         if self.file.words[_GENERATION] != self._generation:
             self._look()
+        bounds: dict[int, int] = {}
         for record in self._records.values():
-            self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = compute(record.period)
+            if record.period not in bounds:
+                bounds[record.period] = compute(record.period)
+            self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = bounds[record.period]
 
 
 def _is(record: Record | None, wanted: Wanted) -> bool:
@@ -188,16 +188,18 @@ def _is(record: Record | None, wanted: Wanted) -> bool:
 
 def _taker(file: MappedFile, record: Record) -> Take:
     place = file.place(record)
-    words, newest, least, limit, base = place.words, place.newest, place.least, place.limit, record.at // 8
+    words, least, limit, base, put = place.words, place.least, place.limit, record.at // 8, storing(place, FENCE)
     frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
     lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
     period, banks, last_number, last_round = record.period, record.banks, 0, -1
-    following = words[newest] + 1
+    following, count = words[place.newest] + 1, words[frames]
 
-    def take(number: int, value: bytes, stamp_ns: int, error_us: int, round_: int) -> bool | None:
-        nonlocal following, last_number, last_round
-        words[frames] += 1
-        words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error_us
+    def take(item: Portion, came_ns: int, error_us: int, round_: int) -> bool | None:
+        nonlocal following, last_number, last_round, count
+        words[frames] = count = count + 1
+        age_us, number, value = item.age_us, item.put, item.value
+        error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
+        words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error
         if 0 <= last_round < round_ - period:
             words[lost] += (round_ - last_round) // period - 1
         last_round = round_
@@ -209,7 +211,8 @@ def _taker(file: MappedFile, record: Record) -> Take:
         last_number = number
         if number >> EPOCH_SHIFT > following >> EPOCH_SHIFT:
             following = first_of_epoch(following - 1, number >> EPOCH_SHIFT, banks)
-        put_carefully(place, following, value, stamp_ns, error_us, FENCE)
+        stamp_ns = came_ns - age_us * NS_PER_US
+        put(following, value, stamp_ns if stamp_ns > 0 else 0, error)
         following += 1
         return True
 

@@ -116,7 +116,7 @@ class Peer(Struct):
         self._echoes(beat, own)
         if beat.counter > self.counter:
             self.counter, self.settled, self.total, self.load = beat.counter, beat.settled, beat.total, beat.load
-        return tuple(entry for entry in beat.entries if self._news(entry, beat.counter))
+        return tuple([entry for entry in beat.entries if self._news(entry, beat.counter)]) if beat.entries else ()
 
     def timed(self, late_ns: int) -> None:
         """A beat came so much later than a period after the one before; a lateness seldom seen again is forgotten."""
@@ -128,8 +128,9 @@ class Peer(Struct):
             self.links[link] = max(self.links.get(link, at_ns), at_ns)
 
     def _echoes(self, beat: Beat, own: tuple[str, int]) -> None:
+        me, boot = own
         for echo in beat.echoes:
-            if (echo.robot, echo.boot) == own:
+            if echo.robot == me and echo.boot == boot:
                 self.echoed = max(self.echoed, echo.counter)
                 self.heard_us = max(self.heard_us, abs(echo.counter))
 
@@ -183,7 +184,10 @@ class Membership:
 
     def _left_ns(self, counter: int) -> int:
         """When our beat of that number left, or the one before it; 0 if that is forgotten."""
-        return next((at for number, at in reversed(self._asked) if number <= counter), 0)
+        for number, at in reversed(self._asked):
+            if number <= counter:
+                return at
+        return 0
 
     def asked(self, counter: int, now_ns: int) -> None:
         """Remember when our own beat left."""
@@ -227,7 +231,16 @@ class Membership:
 
     def next_death_ns(self, now_ns: int) -> int | None:
         """When the next living peer counts as dead if it stays silent; None if no peer lives."""
-        return min((peer.loyal_until_ns for peer in self.peers.values() if peer.loyal_until_ns > now_ns), default=None)
+        first_ns: int | None = None
+        for peer in self.peers.values():
+            until_ns = peer.loyal_until_ns
+            if until_ns > now_ns and (first_ns is None or until_ns < first_ns):
+                first_ns = until_ns
+        return first_ns
+
+    def all_dead(self, now_ns: int) -> list[str]:
+        """Every peer that is dead."""
+        return [peer.robot for peer in self.peers.values() if peer.loyal_until_ns <= now_ns]
 
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""

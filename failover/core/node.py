@@ -137,13 +137,17 @@ class Node:
         self._outlivers.discard(beat.sender)
         if life and beat.sender in self._team.peers:
             self._outlivers.add(beat.sender)
+        if not self._outlivers:
+            return 0
         others = [peer for peer in self._team.living(self._now_ns) if peer.robot not in self._outlivers]
         return life if len(self._outlivers) > sum(peer.heard_us > 0 for peer in others) else 0
 
     def _life_told(self, beat: Beat) -> int:
-        ours = (self._boot, self._speaker.counter)
-        lives = (echo.boot for echo in beat.echoes if echo.robot == self._config.robot and (echo.boot, abs(echo.counter)) > ours)
-        return next((life for life in lives if life < LIVES_MAX), 0)
+        me, ours = self._config.robot, (self._boot, self._speaker.counter)
+        for echo in beat.echoes:
+            if echo.robot == me and (echo.boot, abs(echo.counter)) > ours and echo.boot < LIVES_MAX:
+                return echo.boot
+        return 0
 
     def rests(self, now_ns: int) -> bool:
         """Nothing runs or waits anywhere, as far as we know, and no member is missing: what peers say may wait a little."""

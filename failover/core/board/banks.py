@@ -15,6 +15,7 @@ Nothing here knows where the words are: ``words[i]`` is the file's i-th word of 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, Protocol
 
 import xxhash
@@ -168,6 +169,32 @@ def put_carefully(place: Place, number: int, value: bytes, stamp_ns: int, error_
     if fence is not None:
         fence()
     words[place.newest] = number
+
+
+def storing(place: Place, fence: Fence | None = None) -> Callable[[int, bytes, int, int], None]:
+    """`put_carefully` into one place, ``(number, value, stamp_ns, error_us)``: without a fence, with every constant at hand."""
+    if fence is not None:
+        return partial(_put_with, fence, place)
+    words, area, banks, newest = place.words, place.area, _bank_words(place), place.newest
+    count = len(banks)
+    for head, *_ in banks:
+        words[head + SUM_WORD] = 0  # none is needed: once and for all
+
+    def put(number: int, value: bytes, stamp_ns: int, error_us: int) -> None:
+        head, stamped, sized, begin = banks[number % count]
+        size = len(value)
+        words[head] = 0
+        words[stamped] = stamp_ns
+        words[sized] = error_us << 32 | size
+        area[begin : begin + size] = value
+        words[head] = number
+        words[newest] = number
+
+    return put
+
+
+def _put_with(fence: Fence, place: Place, number: int, value: bytes, stamp_ns: int, error_us: int) -> None:
+    put_carefully(place, number, value, stamp_ns, error_us, fence)
 
 
 def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRIES) -> Found:

@@ -71,6 +71,7 @@ SEAL_SIZE: Final = NUMBER_SIZE + CODE_SIZE
 
 DIGEST_SIZE: Final = 32
 _PERSON: Final = b"failover-frame-1"
+_EMPTY: Final = blake2b(digest_size=DIGEST_SIZE, person=_PERSON)
 _NO_SEAL: Final = bytes(SEAL_SIZE)
 _FIRST: Final = range(1)
 
@@ -105,7 +106,7 @@ class Reason(enum.StrEnum):
     EARLIER_LIFE = "from an earlier life of its sender"
 
 
-class Refused(Struct, frozen=True):
+class Refused(Struct, frozen=True, gc=False):
     """A datagram that was not believed.
 
     Attributes:
@@ -118,7 +119,7 @@ class Refused(Struct, frozen=True):
     counter: int = 0
 
 
-class Portion(Struct, frozen=True, array_like=True):
+class Portion(Struct, frozen=True, array_like=True, gc=False):
     """One item's value in a frame, or a part of it.
 
     Attributes:
@@ -143,7 +144,7 @@ class Portion(Struct, frozen=True, array_like=True):
         return 0 < len(self.value) <= self.total - self.offset
 
 
-class Body(Struct, frozen=True, array_like=True):
+class Body(Struct, frozen=True, array_like=True, gc=False):
     """What a part says. ``slots`` and ``beat`` are in the first part of a frame, or absent.
 
     Attributes:
@@ -156,7 +157,7 @@ class Body(Struct, frozen=True, array_like=True):
     left_us: Annotated[int, Meta(ge=0)] = 0
 
 
-class Part(Struct, frozen=True):
+class Part(Struct, frozen=True, gc=False):
     """An authenticated part of a frame.
 
     Attributes:
@@ -313,7 +314,10 @@ def name_tag(robot: str) -> int:
 
 
 def _digest(header: bytes, body: bytes) -> bytes:
-    return blake2b(header + body, digest_size=DIGEST_SIZE, person=_PERSON).digest()
+    digest = _EMPTY.copy()
+    digest.update(header)
+    digest.update(body)
+    return digest.digest()
 
 
 @functools.lru_cache(4 * PEERS_MAX)

@@ -43,7 +43,7 @@ class Sealed(Struct, frozen=True):
     datagrams: list[bytes]
 
 
-class Heard(Struct, frozen=True):
+class Heard(Struct, frozen=True, gc=False):
     """A part that was believed.
 
     Attributes:
@@ -177,7 +177,10 @@ class FrameLane:
         return Heard(part, self._whole(part), way_ns)
 
     def _whole(self, part: Part) -> Sequence[Portion]:
-        if not any(item.total for item in part.items):
+        for item in part.items:
+            if item.total:
+                break
+        else:
             return part.items
         whole = [self.assembly.take(part.sender, item) for item in part.items]
         return [item for item in whole if item is not None]
@@ -192,8 +195,9 @@ class FrameLane:
         if not peer.has_heard and part.beat is not None:
             peer.has_heard = any(echo.robot == self._me and echo.boot == self._boot for echo in part.beat.echoes)
         if part.slots is not None and peer.has_heard:
+            ours = self._rank
             for rank, counter, hold_us in part.slots.echo:
-                if rank == self._rank and counter in self._left and hold_us >= 0:
+                if rank == ours and counter in self._left and hold_us >= 0:
                     peer.offset.echoed(self._left[counter], left_ns, hold_us * US, came_ns)
         return peer.offset.most_ns(left_ns, came_ns)
 

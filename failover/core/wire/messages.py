@@ -16,7 +16,7 @@ VERSION = 2
 """Of the replication link; a peer of another version is refused by name."""
 
 
-class Echo(msgspec.Struct, frozen=True, array_like=True):
+class Echo(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """The newest beat that the sender has heard of one robot: what lets that robot count its lease from the asking.
 
     Attributes:
@@ -28,7 +28,7 @@ class Echo(msgspec.Struct, frozen=True, array_like=True):
     counter: int
 
 
-class Entry(msgspec.Struct, frozen=True, array_like=True):
+class Entry(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One component as the sender of the beat holds it.
 
     Attributes:
@@ -95,7 +95,7 @@ BEGUN = 2048
 """A checkpoint of it was given away in this epoch or an earlier one: a robot that has none does not start it afresh."""
 
 
-class Beat(msgspec.Struct, frozen=True, array_like=True):
+class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """ "I live", and all that follows from it.
 
     Attributes:

@@ -7,16 +7,18 @@ import select
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from agent.main_loop import urgent_items
 from agent.main_loop.board_link import UNREADABLE, BoardLink
 from agent.main_loop.own_items import LOOK_NS
 from agent.system import clock
-from failover.boards import directory
+from failover.boards import directory, futex
 from failover.boards.board import Board
 from failover.boards.directory import OWN_NAME, PEER_PREFIX, PRIVATE_NAME, make_file
 from failover.boards.received import MISFIT, UNKNOWN
@@ -275,6 +277,7 @@ def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_of
         assert first.link.urgent(now_ns) == []
         second.hears(made[0].datagrams)
         assert second.program.item("alarm", bytes).get("robot1").value == b"%d" % number
+        first.link.seen_to()
     now_ns = clock.now_ns()
     sent = 0
     for _ in range(50):
@@ -283,3 +286,43 @@ def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_of
         first.link.went(portions)
         sent += len(portions)
     assert sent <= URGENT_PER_S
+
+
+def test_a_put_wakes_the_loop_once_and_one_that_came_while_it_sent_wakes_it_again(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sleeps: list[int] = []
+    wait = futex.wait
+
+    def waited(address: int, value: int, timeout_s: float) -> bool:
+        sleeps.append(value)
+        return wait(address, value, timeout_s)
+
+    monkeypatch.setattr(urgent_items, "LOOK_S", 60)  # nothing is told because time has passed
+    monkeypatch.setattr(urgent_items.futex, "wait", waited)
+    first, _ = pair
+    item = first.program.item("alarm", bytes)
+    first.link.due(0, clock.now_ns())  # the table is read
+    with closing(select.epoll()) as loop:
+        loop.register(first.link.wakes.fileno(), select.EPOLLIN)
+
+        def tells() -> bool:
+            if not loop.poll(60):
+                return False
+            first.link.wakes.heed()
+            first.link.urgent(clock.now_ns())
+            return True
+
+        for number in range(20):
+            item.put(b"%d" % number)
+            assert tells()
+            if number % 2:
+                item.put(b"again")
+                first.link.seen_to()
+                assert tells(), "no other look would find this put"
+            before = len(sleeps)
+            first.link.seen_to()
+            end = time.monotonic() + 60
+            while len(sleeps) == before and not loop.poll(0.001):
+                assert time.monotonic() < end
+            assert not loop.poll(0), "the loop has looked at this put already"

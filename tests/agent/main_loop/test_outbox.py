@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agent.main_loop.outbox import Due, Outbox
+from agent.main_loop.outbox import NOTHING, Due, Outbox
 from checkpoint.model import Position
 from failover.core.acts import Acknowledge, Act, Ready, SetLease
 from failover.core.types import Record, VoteRecord
@@ -30,6 +30,23 @@ def outbox() -> Outbox:
 
 def test_without_a_vote_record_everything_leaves_at_once() -> None:
     assert outbox().take(Ready(send=(beat(2),), act=(act(1),)), BEAT_NS) == Due(None, (beat(2),), (act(1),))
+
+
+def test_what_makes_nothing_due_is_told_as_nothing_and_only_then() -> None:
+    box = outbox()
+    assert box.take(Ready(), 1) is NOTHING
+    box.take(Ready(NEW, act=(act(1),)), 2)
+    assert box.take(Ready(), 3) is not NOTHING, "a vote record is on its way"
+    assert box.kept(1, NEW, 4).acts == (act(1),)
+    assert box.take(Ready(), 5) is NOTHING
+    assert box.take(Ready(act=(act(2),)), 6).acts == (act(2),)
+
+
+def test_a_step_that_makes_nothing_due_keeps_the_beat_that_waits_for_the_disk() -> None:
+    box = outbox()
+    assert box.take(Ready(NEW, send=(beat(2),)), 1).beats == ()
+    assert box.take(Ready(), 2).beats == ()
+    assert box.kept(1, NEW, 3).beats == (beat(2),)
 
 
 def test_acts_wait_for_the_vote_record_they_depend_on_and_keep_their_order() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from failover.core.board import banks
-from failover.core.board.banks import Found, Place, Reading, get_carefully, put_carefully, reader, writer
+from failover.core.board.banks import Found, Place, Reading, get_carefully, put_carefully, reader, storing, writer
 from failover.errors import BoardError, NeverWrittenError, OvertakenError
 
 PUTS = 3
@@ -120,6 +120,14 @@ def fast_puts(memory: Memory) -> None:
         made.put(value_of(number))
 
 
+def received_puts(memory: Memory) -> None:
+    made = storing(place_in(memory))
+    for bank in range(2):
+        assert memory.stores.pop(0) == (FIRST_BANK + bank * BANK_WORDS + banks.SUM_WORD, 0)  # once and for all
+    for number in range(1, PUTS + 1):
+        made(number, value_of(number), number * 100, 0)
+
+
 def plain_get(memory: Memory) -> tuple[bytes, int, int]:
     found: Found = get_carefully(place_in(memory), retries=2)
     return found.value, found.stamp_ns, found.number
@@ -173,7 +181,7 @@ def is_whole(outcome: tuple[bytes, int, int] | type[BoardError]) -> bool:
     return value == value_of(number) and stamp_ns == number * 100 and 1 <= number <= PUTS
 
 
-PUT_FORMS = pytest.mark.parametrize("puts", [plain_puts, fast_puts])
+PUT_FORMS = pytest.mark.parametrize("puts", [plain_puts, fast_puts, received_puts])
 GET_FORMS = pytest.mark.parametrize("get", [plain_get, fast_get])
 ORDERS = [list(order) for order in itertools.permutations(range(VALUE_WORDS))]
 
