@@ -194,7 +194,7 @@ class ScheduledTask:
         if self._task.course is not self._course:
             self._write_course(opened)
         self._publish(opened)
-        if layout.has_successors(opened.file.table, self._row):
+        if layout.is_awaited(opened.file.table, self._row):
             futex.wake(opened.base + layout.row_at(self._row) + SETTLED_FIELD)
 
     def trigger(self) -> None:
