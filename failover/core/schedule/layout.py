@@ -83,7 +83,9 @@ TERMS_FIELDS: Final = (256, 512)
 LIVE_FIELD: Final = 768
 SETTLED_FIELD: Final = LIVE_FIELD + 8
 DUE_FIELD: Final = LIVE_FIELD + 32
+STARTED_FIELD: Final = LIVE_FIELD + 24
 ENDED_FIELD: Final = LIVE_FIELD + 48
+LIMIT_FIELD: Final = LIVE_FIELD + 56
 MODES_FIELD: Final = 1024
 LATENESS_FIELD: Final = 1536
 DURATION_FIELD: Final = 1792
@@ -394,6 +396,27 @@ def write_live(view: View, index: int, live: Live) -> None:
     view.ints[(at + LIVE_FIELD) // 4 + 1] = live.pid
     view.words[first] = live.settled
     view.ints[(at + LIVE_FIELD) // 4] = live.state
+
+
+class Begin:
+    """Writes that an activation begins: what others must know of it. All else is written at its end, by `write_live`."""
+
+    __slots__ = ("_ints", "_limit", "_started", "_state", "_words")
+
+    def __init__(self, view: View, index: int) -> None:
+        at = row_at(index)
+        self._ints, self._words = view.ints, view.words
+        self._state, self._started, self._limit = (at + LIVE_FIELD) // 4, (at + STARTED_FIELD) // 8, (at + LIMIT_FIELD) // 8
+
+    def write(self, started: int, began_ns: int, limit_ns: int) -> None:
+        """The state last.
+
+        Args:
+            started: activations that began, with this one.
+        """
+        words, first = self._words, self._started
+        words[first], words[first + 2], words[self._limit] = started, began_ns, limit_ns
+        self._ints[self._state] = State.RUNNING
 
 
 def write_course(view: View, index: int, course: Course) -> None:
