@@ -136,6 +136,7 @@ class ScheduledTask:
         self._program = program
         self._holder = _Holder()
         self._is_closed = False
+        self._published = State.IDLE
         self._finalizer = weakref.finalize(self, self._holder.leave)
         self._open()
         _TASKS.add(self)
@@ -365,7 +366,6 @@ class ScheduledTask:
         self._serial = (layout.row_at(row) + SERIAL_FIELD) // 4
         self._write_begin = layout.Begin(file.table, row).write
         self._late_ns = 0
-        self._published = State.IDLE
         self._adopted, terms = layout.read_terms(file.table, row)
         self._remember(file.table, terms)
         self._begin_task(opened, terms)
