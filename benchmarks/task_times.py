@@ -42,7 +42,7 @@ def task_times(quick: bool, directory_: Path) -> Findings:
         subprocess.run([compiler, "-O2", f"-I{HERE.parent / 'include'}", "-pthread", "-o", str(made), str(source)], check=True)
         programs["C"] = [str(made)]
     classes = {"normal priority": ()}
-    if _may_be_fifo():
+    if may_be_fifo():
         classes[f"SCHED_FIFO {PRIORITY}"] = ("chrt", "-f", str(PRIORITY))  # type: ignore[assignment]
     else:
         absent.append(Absent("SCHED_FIFO", "this user, or this control group, may not have it"))
@@ -69,7 +69,8 @@ def task_times(quick: bool, directory_: Path) -> Findings:
     )
 
 
-def _may_be_fifo() -> bool:
+def may_be_fifo() -> bool:
+    """Whether this user may have SCHED_FIFO here."""
     return (
         shutil.which("chrt") is not None
         and subprocess.run(["chrt", "-f", str(PRIORITY), "true"], capture_output=True, check=False).returncode == 0
