@@ -294,9 +294,8 @@ class PtraceSession:
                 return frozen
             except MovedError as moved:
                 let_go(moved)  # its frames hold what was copied
-                is_last = (
-                    time.monotonic() > (deadline or began + MOVED_S) and not may_stay
-                )  # one that took it for a single process is never the last
+                is_late = time.monotonic() > (deadline or began + MOVED_S)
+                is_last = is_late and not may_stay  # one that took it for a single process is never the last
                 self._is_single, may_stay = self._is_single and not may_stay, False
                 if is_last:
                     raise
@@ -376,7 +375,7 @@ class PtraceSession:
     # While it stands still
 
     def _frozen_look(self, copied: RunningCopy | None, *, base: bool, order: CaptureOrder) -> Frozen:
-        """Everything that needs the program to stand still."""
+        """Everything that needs the program to stand still; the gate is told when it is over."""
         try:
             return self._looked_at(copied, base=base, hold=order.hold)
         finally:
