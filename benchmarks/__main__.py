@@ -46,6 +46,7 @@ from benchmarks import (
     outage,
     overload,
     results,
+    slack,
     soak,
     task,
     task_times,
@@ -123,6 +124,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "task": task.task,
     "board": board.board,
     "board_in_c": board_in_c.board_in_c,
+    "slack": slack.slack,
     "task_times": task_times.task_times,
     "driver_call": driver_call.driver_call,
 }

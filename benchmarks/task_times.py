@@ -24,6 +24,9 @@ ROUNDS: Final = 3
 """The loops take turns, so that load beside them hits all alike."""
 PRIORITY: Final = 50
 BARE: Final = "clock_nanosleep in a bare loop"
+EARLY_S: Final = 0.0002
+EARLY: Final = f"{OURS}, early={EARLY_S}"
+"""Of Python alone: C has little to do after it has woken."""
 
 
 def task_times(quick: bool, directory_: Path) -> Findings:
@@ -39,7 +42,7 @@ def task_times(quick: bool, directory_: Path) -> Findings:
         subprocess.run([compiler, "-O2", f"-I{HERE.parent / 'include'}", "-pthread", "-o", str(made), str(source)], check=True)
         programs["C"] = [str(made)]
     classes = {"normal priority": ()}
-    if _may_be_fifo():
+    if may_be_fifo():
         classes[f"SCHED_FIFO {PRIORITY}"] = ("chrt", "-f", str(PRIORITY))  # type: ignore[assignment]
     else:
         absent.append(Absent("SCHED_FIFO", "this user, or this control group, may not have it"))
@@ -48,8 +51,9 @@ def task_times(quick: bool, directory_: Path) -> Findings:
     for turn in range(1 if quick else ROUNDS):
         for language, command in programs.items():
             for priority, before in classes.items():
-                for who, name in ((OURS, f"task{turn}"), (BARE, "-")):
-                    found = _measured([*before, *command, name, str(PERIOD_NS), str(count)], place)
+                early = ((EARLY, f"early{turn}", str(EARLY_S)),) if language == "Python" else ()
+                for who, name, *more in ((OURS, f"task{turn}"), (BARE, "-"), *early):
+                    found = _measured([*before, *command, name, str(PERIOD_NS), str(count), *more], place)
                     late.setdefault((f"{language}, {priority}", who, language), []).extend(found)
     figures = [
         Figure(case, f"p{share * 100:g}", "µs", (percentile(values, share) / 1000,), who)
@@ -65,7 +69,8 @@ def task_times(quick: bool, directory_: Path) -> Findings:
     )
 
 
-def _may_be_fifo() -> bool:
+def may_be_fifo() -> bool:
+    """Whether this user may have SCHED_FIFO here."""
     return (
         shutil.which("chrt") is not None
         and subprocess.run(["chrt", "-f", str(PRIORITY), "true"], capture_output=True, check=False).returncode == 0

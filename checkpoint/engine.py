@@ -196,10 +196,27 @@ def contradiction(carry: Iterable[str], shared: tuple[str, ...]) -> str:
     return ""
 
 
+class Gate(Protocol):
+    """Tells when a program may stand still. Of one component; calls come from the thread that captures it."""
+
+    def opens(self, pids: tuple[int, ...]) -> bool:
+        """Wait until it may: True. False: not yet; copy the pages that were written meanwhile, and ask again.
+
+        Args:
+            pids: of all its processes.
+        """
+        ...
+
+    def closes(self, *, stood_still: bool) -> None:
+        """It runs again, or nothing has come of it."""
+        ...
+
+
 class CaptureOrder(Struct, frozen=True):
     """An order for the next snapshot.
 
     Attributes:
+        gate: to be asked before the program stands still; None: it may at any time.
         base: make a base, also after an acknowledgement. A delta needs False here and an acknowledged position.
         generation, sequence: of the position that it gets.
         robot: name of the robot, "" for a one-shot capture.
@@ -212,6 +229,7 @@ class CaptureOrder(Struct, frozen=True):
     epoch: int = 0
     robot: str = ""
     hold: bool = False
+    gate: Gate | None = None
 
 
 class RestoreOptions(Struct, frozen=True):

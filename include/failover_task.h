@@ -103,6 +103,7 @@ enum {
     FT_ADOPTED_ = 876,
     FT_COURSE_NUMBER_ = 880,
     FT_COURSES_ = 888,
+    FT_LISTENERS_ = 936,
     FT_LATENESS_ = 1536,
     FT_DURATION_ = 1792,
     FT_DECLARED_ = 1,
@@ -814,7 +815,7 @@ static inline int ft_end(ft_task *task)
         ft_adopt_(task, &task->ordered, now);
     ft_count_(at + FT_DURATION_, now - task->started_ns);
     ft_publish_(task);
-    if (ft_load_(at + FT_SUCCESSORS_) != 0)
+    if (ft_load_(at + FT_SUCCESSORS_) != 0 || ft_load_(at + FT_LISTENERS_) != 0)
         fb_wake_(at + FT_SETTLED_);
     return 0;
 }

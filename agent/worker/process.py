@@ -28,6 +28,7 @@ from agent.worker.components.context import Surroundings
 from agent.worker.components.hooks import Hooks
 from agent.worker.components.paths import Places, guard_sockets
 from agent.worker.components.process_pool import ProcessPool
+from agent.worker.components.resume_order import ResumeOrder
 from agent.worker.components.run_records import Records
 from agent.worker.components.snapshots import newest_of
 from agent.worker.components.statistics import Memory
@@ -111,7 +112,10 @@ class Worker(Switchboard):
         hooks, here = Hooks(self._starter), self.settings.component
         self._deposit = Deposit(store, self.places, self.tell, self._accepted, runs=self.settings.me.role == "robot", here=here)
         settled = self._deposit.settled
-        self._around = Surroundings(self.places, store, records, self.tell, self._silence_ns, settled, here, hooks, self._alive)
+        order = ResumeOrder({name: task.after for name, task in self.settings.config.tasks.items()})
+        self._around = Surroundings(
+            self.places, store, records, self.tell, self._silence_ns, settled, here, hooks, self._alive, order
+        )
         self._sources = Sources(store, self._from_program)
         self._bringing = Bringing(self._shipper, self._replication_link.say, self._sources.open, self._note_bringing)
         self._dispatch = Dispatch(

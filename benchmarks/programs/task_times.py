@@ -1,4 +1,4 @@
-"""How late an activation begins: TASK PERIOD_NS COUNT, or "-" for a bare clock_nanosleep. One line an activation: ns."""
+"""How late an activation begins: TASK PERIOD_NS COUNT [EARLY_S], or "-" for a bare clock_nanosleep. A line an activation: ns."""
 
 import ctypes
 import sys
@@ -28,10 +28,10 @@ def bare(period_ns: int, count: int) -> list[int]:
     return late
 
 
-def scheduled(name: str, period_ns: int, count: int) -> list[int]:
+def scheduled(name: str, period_ns: int, count: int, early: float) -> list[int]:
     """Activations of a task."""
     late = []
-    with failover.scheduled(name, period=period_ns / 1e9) as task:
+    with failover.scheduled(name, period=period_ns / 1e9, early=early) as task:
         for tick in task:
             late.append(time.monotonic_ns() - tick.due_ns)
             if len(late) == count:
@@ -39,11 +39,11 @@ def scheduled(name: str, period_ns: int, count: int) -> list[int]:
     raise AssertionError
 
 
-def main(name: str, period_ns: int, count: int) -> None:
+def main(name: str, period_ns: int, count: int, early: float = 0) -> None:
     """Print the lateness of each."""
-    for late_ns in bare(period_ns, count) if name == "-" else scheduled(name, period_ns, count):
+    for late_ns in bare(period_ns, count) if name == "-" else scheduled(name, period_ns, count, early):
         print(late_ns)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), *map(float, sys.argv[4:]))

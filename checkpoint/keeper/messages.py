@@ -233,6 +233,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     Attributes:
         hold: leave the program standing still afterwards, until `Release`: an end now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
+        lag_ns: how long it may wait for a moment between two activations of the program's tasks; 0: it does not wait.
     """
 
     base: bool
@@ -241,6 +242,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     epoch: int = 0
     hold: bool = False
     xor_cache: int = 0
+    lag_ns: int = 0
 
 
 class Acknowledge(msgspec.Struct, frozen=True, tag=True):
@@ -391,6 +393,27 @@ class Protected(msgspec.Struct, frozen=True, tag=True):
     notes: tuple[str, ...] = ()
 
 
+class Slack(msgspec.Struct, frozen=True):
+    """How a capture met the activations of the program's tasks. Instants: CLOCK_MONOTONIC of the initial time namespace.
+
+    Attributes:
+        task: of those, the one that was due first; ``period_ns``: its period, 0: it has none.
+        began_ns, ended_ns: when it was to stand still, and when it ran again.
+        waited_ns: for that.
+        slack_ns: the longest time between two activations that was seen; ``freeze_ns``: how long the freeze was expected to take.
+        is_squeezed: it was made although that does not fit.
+    """
+
+    task: str
+    period_ns: int
+    began_ns: int
+    ended_ns: int
+    waited_ns: int
+    slack_ns: int
+    freeze_ns: int
+    is_squeezed: bool
+
+
 class Captured(msgspec.Struct, frozen=True, tag=True):
     """A snapshot was taken.
 
@@ -400,6 +423,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
         known_bytes: of those whose last content was remembered.
         frozen_bytes: of those that were copied while the program stood still.
         remembered_bytes: of all pages that the keeper remembers; ``wanted_bytes``: with room for all, 0: not known yet.
+        slack: None: the program runs no task of the schedule, or the capture was not to wait.
         totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
         commit: its number, of a cooperative snapshot; ``age_ns``: how old it was by then.
     """
@@ -417,6 +441,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     frozen_bytes: int = 0
     remembered_bytes: int = 0
     wanted_bytes: int = 0
+    slack: Slack | None = None
 
 
 class Unchanged(msgspec.Struct, frozen=True, tag=True):

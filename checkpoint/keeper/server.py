@@ -1,5 +1,8 @@
 """The keeper, the tracer's own process: ``python -m checkpoint keeper FD``, or ``keeper PATH``, where it listens.
 
+A third word names a module whose function ``gate`` tells when a program may stand still (`WaitingGate`); it is loaded when a
+capture is to ask it.
+
 One thread serves one channel; `checkpoint.keeper.messages` defines the requests and answers. The keeper follows at most one
 process. When its peer has gone, it releases that process, which runs on, and ends. A restore that was not resumed by then ends
 with it.
@@ -19,7 +22,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
@@ -59,7 +62,7 @@ from checkpoint.store.xor_cache import Sender
 if TYPE_CHECKING:
     from checkpoint.engines.cooperative.engine import GuardedTask
 
-USAGE: Final = "usage: python -m checkpoint keeper FD|PATH\n"
+USAGE: Final = "usage: python -m checkpoint keeper FD|PATH [MODULE]\n"
 CALL_S: Final = 30.0
 """How long one that listens waits for its peer."""
 
@@ -92,10 +95,29 @@ class _Encoded(msgspec.Struct, frozen=True):
     descriptors: Descriptors = ()
 
 
-class Keeper:
-    """Obeys one peer, one request at a time."""
+class WaitingGate(engine.Gate, Protocol):
+    """A gate that a program's captures ask one after the other."""
 
-    def __init__(self, link: Channel[Request], tracer: Engine) -> None:
+    def begin(self, lag_ns: int) -> None:
+        """A capture begins, which may wait for so long."""
+        ...
+
+    @property
+    def outcome(self) -> messages.Slack | None:
+        """How it went; None: the program runs no tasks."""
+        ...
+
+
+class Keeper:
+    """Obeys one peer, one request at a time.
+
+    Args:
+        gates: name of the module that tells when a program may stand still; "": it may at any time.
+    """
+
+    def __init__(self, link: Channel[Request], tracer: Engine, gates: str = "") -> None:
+        self._gates = gates
+        self._gate: WaitingGate | None = None
         self._link = link
         self._tracer = tracer
         self._session: Session | None = None
@@ -184,7 +206,10 @@ class Keeper:
         self._sender.limit(request.xor_cache)
         if unchanged := _unchanged(session, request):
             return unchanged, ()
-        order = CaptureOrder(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold)
+        gate = self._asked_gate(request)
+        order = CaptureOrder(
+            *(request.base, request.generation, request.sequence, request.epoch, self._robot, request.hold), gate=gate
+        )
         made = self._made(session, order, target, request)
         snapshot = made.snapshot
         commit, age_ns = _commit_at(session, snapshot.position)
@@ -202,8 +227,19 @@ class Keeper:
             frozen_bytes=session.frozen_size,
             remembered_bytes=self._sender.held,
             wanted_bytes=self._sender.wanted,
+            slack=gate.outcome if gate is not None else None,
         )
         return answer, made.descriptors
+
+    def _asked_gate(self, request: messages.Capture) -> WaitingGate | None:
+        """The gate of the followed program, which learns from all its captures; None: this one does not wait."""
+        if not self._gates or not request.lag_ns:
+            return None
+        if self._gate is None:
+            made: WaitingGate = importlib.import_module(self._gates).gate()
+            self._gate = made
+        self._gate.begin(request.lag_ns)
+        return self._gate
 
     def _lasting_notes(self, snapshot: Snapshot) -> tuple[str, ...]:
         """Notes about losses of the restore that last. Lost connections count until the program has opened as many."""
@@ -248,6 +284,8 @@ class Keeper:
             if self._is_busy:
                 raise RestoreError(f"cannot restore into pid {request.pid}: this keeper follows a process already")
             if request.bound is not None:
+                if self._gates:
+                    importlib.import_module(self._gates)
                 _become(request.bound)
             with untrusted.facts(f"restore {request.component}"):
                 self._restored, names = self._restored_from(files, request)
@@ -399,7 +437,7 @@ class Keeper:
         copy, self._copy = self._copy, None
         if copy is not None:
             copy.end()
-        session, self._session = self._session, None
+        session, self._session, self._gate = self._session, None, None
         self._sender = Sender()
         self._restored = self._revived = None
         if session is not None:
@@ -526,7 +564,7 @@ def folded(files: Descriptors) -> Snapshot:
 
 def main(arguments: list[str]) -> int:
     """Run a keeper on an inherited socket, or for the first client that connects at a path."""
-    if len(arguments) != 2 or arguments[0] != "keeper":
+    if len(arguments) not in (2, 3) or arguments[0] != "keeper":
         sys.stderr.write(USAGE)
         return 2
     for number in (signal.SIGINT, signal.SIGHUP):
@@ -540,7 +578,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"keeper: no agent to serve at {arguments[1]}: {error.strerror or error}\n")
         return 1
     link: Channel[Request] = Channel(end, Request)
-    Keeper(link, registry.engine_named(engine.PTRACE)).serve()
+    Keeper(link, registry.engine_named(engine.PTRACE), *arguments[2:]).serve()
     return 0
 
 

@@ -76,10 +76,14 @@ doubted_elsewhere: {robot: [peer, …]}: with ``team``, of whom each of the othe
 peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
-    freeze_us_max, freeze_budget_missed, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
+    freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
     exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reasons,
     output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
+    slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
+        tasks of the schedule: its captures, and those of them that delayed an activation; of the newest: the longest time between
+        two activations that was seen, how long the freeze was expected to take, how long it waited for its moment, and when it
+        began and ended (CLOCK_MONOTONIC); task: the one that was due first; None of any other component
     snapshot_size, dirty_bytes: of the newest one: bytes on the wire, and of pages; xor_hit_rate: which part of what the
         deltas of this life carried was in the cache of last contents (xor_cache of agent.toml); None before the first one
     output: immediate | committed (--output); output_waiting: bytes that wait until another robot holds them

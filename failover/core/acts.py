@@ -55,6 +55,8 @@ class Capture(Struct, frozen=True):
     Attributes:
         base: whole; otherwise a delta since the last position that was acknowledged to the keeper, or `Unchanged`.
         hold: leave the program frozen afterwards (the last delta of a handover); the act Thaw or Stop follows. Never `Unchanged`.
+        lag_ns: a program that runs tasks of the schedule stands still between two activations: how long to wait for such a moment
+            (`failover.core.schedule.slack`); 0: not at all.
     """
 
     component: str
@@ -63,6 +65,7 @@ class Capture(Struct, frozen=True):
     generation: int
     sequence: int
     hold: bool = False
+    lag_ns: int = 0
 
 
 class Ship(Struct, frozen=True):

@@ -58,6 +58,7 @@ class Captured(Struct, frozen=True):
         snapshot: a sealed memfd with the encoded snapshot; the receiver closes it.
         size: bytes of it.
         commit, age_ns: of a program that keeps its state: number of the commit that it holds, and how old that was.
+        slack: how it met the activations of the program's tasks; None: it has none, or the capture was not to wait.
         known_bytes: of its pages, those whose last content was remembered.
         frozen_bytes: of its pages, those that were copied while the program stood still.
     """
@@ -73,6 +74,7 @@ class Captured(Struct, frozen=True):
     age_ns: int = 0
     known_bytes: int = 0
     frozen_bytes: int = 0
+    slack: keeper_messages.Slack | None = None
 
 
 class Prepared(Struct, frozen=True):
@@ -282,12 +284,13 @@ class Component:
         return self.engine == COOPERATIVE and not self.keeps
 
     async def capture(
-        self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False
+        self, *, base: bool, generation: int, sequence: int, epoch: int, hold: bool = False, lag_ns: int = 0
     ) -> Captured | keeper_messages.Unchanged:
         """Take a snapshot; a base if the keeper has no acknowledged position to start from.
 
         Args:
             hold: leave the program standing still afterwards, until `thaw` or `stop`.
+            lag_ns: see `failover.core.acts.Capture`.
 
         Returns:
             `Unchanged` only where a delta of a program that keeps its state, and is not to be held, would say nothing new.
@@ -301,7 +304,7 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share())
+        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share(), lag_ns)
         async with self._standing_still(is_held_by_guard):
             with self._patience():
                 captured, descriptors = await self.keeper.ask(order)
@@ -328,6 +331,7 @@ class Component:
             captured.age_ns,
             captured.known_bytes,
             captured.frozen_bytes,
+            captured.slack,
         )
 
     async def acknowledge(self, position: Position, *, is_safe: bool = True) -> None:

@@ -14,6 +14,7 @@ from agent.system.last_alive import LastAlive
 from agent.worker.components.hooks import Hooks
 from agent.worker.components.launch import Program
 from agent.worker.components.paths import Places
+from agent.worker.components.resume_order import ResumeOrder
 from agent.worker.components.run_records import Records
 from checkpoint.linux.spawn.inherited_limits import Inheritance
 from checkpoint.store.store import Store
@@ -31,6 +32,7 @@ class Surroundings(Struct):
             output in the logs.
         here: the settings that this robot's operator gives a component.
         hooks: runs his commands.
+        order: in which programs that are taken over resume.
         last_alive: tells for how long this robot was off; None: that is not known.
     """
 
@@ -43,6 +45,7 @@ class Surroundings(Struct):
     here: Callable[[str], ComponentConfig]
     hooks: Hooks = field(default_factory=Hooks)
     last_alive: LastAlive | None = None
+    order: ResumeOrder = field(default_factory=ResumeOrder)
 
 
 def program_of(launch: Launch) -> Program:

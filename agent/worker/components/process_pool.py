@@ -41,6 +41,9 @@ SPARES_MAX: Final = 8
 REFILL_S: Final = 1.0
 """How long after one was used its successor is started: a takeover has the processor for itself."""
 
+GATES: Final = "agent.slack_gate"
+"""The module by which a keeper captures a program between two activations of its tasks."""
+
 log = logging.getLogger("failover.component")
 
 
@@ -201,7 +204,7 @@ class ProcessPool:
         """One that systemd started: it listens as a guard does."""
         name = _new_name()
         path = self._sockets / f"{name}.keeper"
-        child = self._spawn("keeper", name, ["checkpoint", "keeper", str(path)])
+        child = self._spawn("keeper", name, ["checkpoint", "keeper", str(path), GATES])
         end = await self._connected(path, child, "a keeper")
         return end, _peer_of(end)
 
@@ -209,7 +212,7 @@ class ProcessPool:
         ours, theirs = keeper_messages.pair()
         with theirs:
             try:
-                child = self._spawn("keeper", "", ["checkpoint", "keeper", str(theirs.fileno())], (theirs.fileno(),))
+                child = self._spawn("keeper", "", ["checkpoint", "keeper", str(theirs.fileno()), GATES], (theirs.fileno(),))
             except GuardError:
                 ours.close()
                 raise

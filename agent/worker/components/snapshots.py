@@ -39,7 +39,7 @@ class Snapshots(Struct, frozen=True):
             CheckpointError, AgentError, OSError: there is none, or it could not be stored; the program runs on.
         """
         captured = await component.capture(
-            base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold
+            base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold, lag_ns=act.lag_ns
         )
         self.figures.reasons = ()
         if captured.commit:

@@ -10,8 +10,10 @@ from msgspec import Struct, field
 from agent.worker.components.component import Captured
 from checkpoint.device_rules import DeviceRule, rules_of
 from checkpoint.engine import PTRACE
+from checkpoint.keeper.messages import Slack
 from checkpoint.model import Position, Snapshot
 from checkpoint.store.digest_cache import KnownDigest
+from failover.core.schedule.slack import remark
 from failover.core.types import ComponentSpec
 
 REASONS_TOLD: Final = 3
@@ -116,6 +118,37 @@ class Budget(Struct):
         )
 
 
+class SlackFigures(Struct):
+    """How captures of one component met the activations of its tasks.
+
+    Attributes:
+        captures: of those that were to wait for the end of an activation; ``squeezed``: that delayed the next one all the same.
+        last: the newest one; ``every_ns``: from the one before to it, 0: there was none.
+    """
+
+    captures: int = 0
+    squeezed: int = 0
+    last: Slack | None = None
+    every_ns: int = 0
+
+    def note(self, slack: Slack | None) -> None:
+        """Count one; None: it met none."""
+        if slack is None:
+            self.last = None
+            return
+        self.captures += 1
+        self.squeezed += slack.is_squeezed
+        self.every_ns = slack.began_ns - self.last.began_ns if self.last is not None else 0
+        self.last = slack
+
+    def remark(self) -> str:
+        """A sentence on a task that the last capture delayed; "" if it delayed none."""
+        last = self.last
+        if last is None or not last.is_squeezed:
+            return ""
+        return remark(last.task, last.period_ns, last.slack_ns, last.freeze_ns, self.every_ns or last.waited_ns)
+
+
 class Memory(Struct, frozen=True):
     """Bytes of private memory of this robot's agent.
 
@@ -139,6 +172,7 @@ class Figures(Struct):
     freeze_us: int | None = None
     freeze_us_max: int | None = None
     budget: Budget = field(default_factory=Budget)
+    slack: SlackFigures = field(default_factory=SlackFigures)
     snapshot_size: int | None = None
     dirty_bytes: int | None = None
     written_bytes: int = 0
@@ -176,6 +210,7 @@ class Figures(Struct):
         """Count one snapshot that was taken here; ``budget_ms``: the component's `freeze_budget_ms`."""
         if budget_ms:
             self.budget.note(captured, budget_ms)
+        self.slack.note(captured.slack)
         self.snapshots += 1
         self.freeze_us = captured.freeze_us
         self.freeze_us_max = max(self.freeze_us_max or 0, captured.freeze_us)

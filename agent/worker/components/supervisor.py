@@ -100,6 +100,8 @@ class Supervisor:
     def order(self, act: Act) -> None:
         """Take an act in."""
         self._note_lease(act)
+        if isinstance(act, acts.Restore):
+            self.around.order.begins(self.name)
         if isinstance(act, acts.SetLease | acts.Freeze):
             self._task(self._at_once(act))
         elif isinstance(act, acts.Warm):
@@ -193,12 +195,20 @@ class Supervisor:
                 continue
             if act.epoch < self.epoch and not isinstance(act, acts.Stop):  # type: ignore[union-attr]
                 log.info("%s: an order of epoch %d came after epoch %d; dropped", self.name, act.epoch, self.epoch)  # type: ignore[union-attr]
+                self._note_resumed(act)
                 continue
             self.epoch = max(self.epoch, act.epoch)  # type: ignore[union-attr]
             try:
                 await self._carry_out(act)
             except TROUBLE as trouble:
                 await self._told_of(act, trouble)
+            finally:
+                self._note_resumed(act)
+
+    def _note_resumed(self, act: Act) -> None:
+        """Those that run after it need not wait for it any more, whatever became of it."""
+        if isinstance(act, acts.Restore):
+            self.around.order.ended(self.name)
 
     async def _carry_out(self, act: Act) -> None:
         match act:
@@ -423,8 +433,10 @@ class Supervisor:
         try:
             if self._lease_until_ns:
                 await component.lease(self._lease_until_ns)
+            await self._predecessors(laps)
             told = self._occasions.told_by(act)
             untold = await component.resume(told)
+            self.around.order.ended(self.name)
             laps.lap("letting it go", clock.now_ns() - component.let_go_ns if component.let_go_ns else 0)
             if told:
                 self._occasions.told(told[0], untold)
@@ -434,6 +446,15 @@ class Supervisor:
         finally:
             self._coming = None
         return component, prepared.age_ns if prepared is not None else outage_ns
+
+    async def _predecessors(self, laps: clock.Laps) -> None:
+        """Wait for those that are resumed here, too."""
+        if not self.around.order.has_predecessors(self.name):
+            return
+        missing = await self.around.order.turn_of(self.name)
+        laps.lap("waiting for its predecessors")
+        if missing:
+            log.warning("%s: it resumes before %s, which do not run yet", self.name, ", ".join(sorted(missing)))
 
     async def _thaw(self, act: acts.Thaw) -> None:
         component = self._present()

@@ -149,6 +149,31 @@ def _over_budget(view: ComponentView, figures: Figures | None, settings: Setting
     return (remark,) if remark else ()
 
 
+def _squeezed(view: ComponentView, figures: Figures | None) -> tuple[str, ...]:
+    """Which of its tasks a capture delays."""
+    if figures is None or view.state not in PRIMARY_STATES:
+        return ()
+    remark = figures.slack.remark()
+    return (remark,) if remark else ()
+
+
+def _slack(view: ComponentView, figures: Figures | None) -> dict[str, Any] | None:
+    """How its captures met the activations of its tasks, at its primary; None: it has no tasks."""
+    last = figures.slack.last if figures is not None and view.state in PRIMARY_STATES else None
+    if figures is None or last is None:
+        return None
+    return {
+        "task": last.task,
+        "captures": figures.slack.captures,
+        "squeezed": figures.slack.squeezed,
+        "slack_us": last.slack_ns // 1000,
+        "freeze_us": last.freeze_ns // 1000,
+        "waited_us": last.waited_ns // 1000,
+        "began_ns": last.began_ns,
+        "ended_ns": last.ended_ns,
+    }
+
+
 def _lacks(view: ComponentView, figures: Figures | None) -> tuple[str, ...] | None:
     """What this robot, a standby, would refuse in a takeover, while there is time to do something about it; None: not known."""
     return figures.lacks if figures is not None and view.state is State.STANDBY else None
@@ -222,6 +247,7 @@ def _component(view: ComponentView, supervisor: Supervisor | None, settings: Set
         "freeze_us": figures.freeze_us if figures else view.freeze_us or None,
         "freeze_us_max": figures.freeze_us_max if figures else None,
         "freeze_budget_missed": figures.budget.missed if figures else 0,
+        "slack": _slack(view, figures),
         "snapshot_size": figures.snapshot_size if figures else None,
         "dirty_bytes": figures.dirty_bytes if figures else None,
         "xor_hit_rate": figures.xor_hit_rate if figures else None,
@@ -249,6 +275,7 @@ def _component(view: ComponentView, supervisor: Supervisor | None, settings: Set
             *(f"NOT PROTECTED, a restore of it is refused: {reason}" for reason in _contested(view, figures)),
             *_own_notes(view, figures),
             *_over_budget(view, figures, settings),
+            *_squeezed(view, figures),
             *_hung_up_devices(view, figures, settings),
             *_waiting_output(view, waiting),
         ],

@@ -142,7 +142,8 @@ class CooperativeSession:
         if parent is not None and parent.lineage != layout.lineage:
             parent = None
         until_now = self._outputs.totals() if self._outputs else (0, 0)
-        committed, seen = self._look(parent, is_held=order.hold)
+        with _admitted(order, self._pid, stands_still=self._trees is not None and not order.hold):
+            committed, seen = self._look(parent, is_held=order.hold)
         if committed is None and parent is None:
             raise NothingCommittedError(f"cannot capture {self._component}: it has committed nothing yet")
         if committed is None or (parent is not None and self._outputs and committed.outputs is PENDING):
@@ -277,6 +278,20 @@ class CooperativeSession:
             "directory": self._directory,
             "regions": [[region.kind, region.size] for region in committed.layout.regions],
         }
+
+
+@contextlib.contextmanager
+def _admitted(order: CaptureOrder, pid: int, *, stands_still: bool) -> Iterator[None]:
+    """Ask the gate before the body: a program that runs at its times commits, and its files rest, between two of them."""
+    if order.gate is None:
+        yield
+        return
+    while not order.gate.opens((pid,)):
+        pass
+    try:
+        yield
+    finally:
+        order.gate.closes(stood_still=stands_still)
 
 
 @contextlib.contextmanager

@@ -184,14 +184,16 @@ class Task:
         assert self.state in (State.WAITING, State.HELD, State.DONE)
         if self.state is State.DONE:
             return Sleep(None)
-        if now_ns < self.due_ns:
-            return Sleep(self.due_ns)
-        row = self._blocking(now_ns, look, lives)
-        if row == NO_ROW:
-            return self._start(now_ns)
-        self.state = State.HELD
-        until_ns = self._limit_ns()
-        return Sleep(until_ns if until_ns > now_ns else None, row)
+        due_ns = self.course.due_ns(self.number)
+        if now_ns < due_ns:
+            return Sleep(due_ns)
+        if self.terms.after:
+            row = self._blocking(now_ns, look, lives)
+            if row != NO_ROW:
+                self.state = State.HELD
+                until_ns = self._limit_ns()
+                return Sleep(until_ns if until_ns > now_ns else None, row)
+        return self._start(now_ns, due_ns)
 
     def end(self, now_ns: int) -> None:
         """The activation under way has ended."""
@@ -243,15 +245,17 @@ class Task:
 
     # --- Parts ---
 
-    def _start(self, now_ns: int) -> Tick:
+    def _start(self, now_ns: int, due_ns: int) -> Tick:
+        """The program waits for this: what is not needed before its work is done in `end`."""
         if self._ordered is not None:
             self._adopt_from_here(self._ordered)
         self.state = State.RUNNING
         self.started_ns = now_ns
-        self.limit_ns = self._limit_ns()
+        deadline_ns = self.terms.deadline_ns
+        self.limit_ns = due_ns + deadline_ns if deadline_ns else 0
         self.counts.started += 1
         skipped, self._skipped = self._skipped, 0
-        return Tick(self.number, self.due_ns, now_ns - self.due_ns, skipped)
+        return Tick(self.number, due_ns, now_ns - due_ns, skipped)
 
     def _count_overruns(self, now_ns: int) -> None:
         """Each activation that has fallen due before this one ended counts once, whether it will run or not."""

@@ -82,6 +82,10 @@ NAME_FIELD: Final = 16
 TERMS_FIELDS: Final = (256, 512)
 LIVE_FIELD: Final = 768
 SETTLED_FIELD: Final = LIVE_FIELD + 8
+DUE_FIELD: Final = LIVE_FIELD + 32
+STARTED_FIELD: Final = LIVE_FIELD + 24
+ENDED_FIELD: Final = LIVE_FIELD + 48
+LIMIT_FIELD: Final = LIVE_FIELD + 56
 MODES_FIELD: Final = 1024
 LATENESS_FIELD: Final = 1536
 DURATION_FIELD: Final = 1792
@@ -95,6 +99,7 @@ BLAMED_FIELD: Final = LIVE_FIELD + 104
 ADOPTED_FIELD: Final = LIVE_FIELD + 108
 COURSE_NUMBER_FIELD: Final = LIVE_FIELD + 112
 COURSES_FIELD: Final = LIVE_FIELD + 120
+LISTENERS_FIELD: Final = LIVE_FIELD + 168
 COURSE_WORDS: Final = 3
 HALF: Final = struct.Struct("<I")
 BUCKETS: Final = 64
@@ -195,9 +200,15 @@ def is_declared(view: View, index: int) -> bool:
     return bool(view.ints[(row_at(index) + FLAGS_FIELD) // 4] & DECLARED)
 
 
-def has_successors(view: View, index: int) -> bool:
-    """Whether others run after a task, so that its end wakes them."""
-    return view.ints[(row_at(index) + SUCCESSORS_FIELD) // 4] != 0
+def is_awaited(view: View, index: int) -> bool:
+    """Whether the end of an activation wakes anyone: tasks that run after it, or a capture that waits for it."""
+    at = row_at(index)
+    return view.ints[(at + SUCCESSORS_FIELD) // 4] != 0 or view.ints[(at + LISTENERS_FIELD) // 4] != 0
+
+
+def set_listening(view: View, index: int, listens: bool) -> None:
+    """A capture waits for the end of a task's activation, or does not any more; written by the one process that captures it."""
+    view.ints[(row_at(index) + LISTENERS_FIELD) // 4] = listens
 
 
 def read_terms(view: View, index: int) -> tuple[int, Terms]:
@@ -272,6 +283,20 @@ def read_live(view: View, index: int) -> Live:
     return Live(
         *(State(state) if state < len(STATES) else State.IDLE, pid, settled, number, due, began, ended_ns, limit),
         *(Counts(started, *counted), blamed - 1 if blamed <= TASKS_MAX else NO_ROW, view.ints[(at + ADOPTED_FIELD) // 4]),
+    )
+
+
+def read_pulse(view: View, index: int) -> tuple[int, int, int, int]:
+    """State, *settled*, when the activation under way was due, or the next one is, and when the newest one ended: read quickly.
+
+    They are of one instant if a second reading finds the same.
+    """
+    at, words = row_at(index), view.words
+    return (
+        view.ints[(at + LIVE_FIELD) // 4],
+        words[(at + SETTLED_FIELD) // 8],
+        words[(at + DUE_FIELD) // 8],
+        words[(at + ENDED_FIELD) // 8],
     )
 
 
@@ -371,6 +396,27 @@ def write_live(view: View, index: int, live: Live) -> None:
     view.ints[(at + LIVE_FIELD) // 4 + 1] = live.pid
     view.words[first] = live.settled
     view.ints[(at + LIVE_FIELD) // 4] = live.state
+
+
+class Begin:
+    """Writes that an activation begins: what others must know of it. All else is written at its end, by `write_live`."""
+
+    __slots__ = ("_ints", "_limit", "_started", "_state", "_words")
+
+    def __init__(self, view: View, index: int) -> None:
+        at = row_at(index)
+        self._ints, self._words = view.ints, view.words
+        self._state, self._started, self._limit = (at + LIVE_FIELD) // 4, (at + STARTED_FIELD) // 8, (at + LIMIT_FIELD) // 8
+
+    def write(self, started: int, began_ns: int, limit_ns: int) -> None:
+        """The state last.
+
+        Args:
+            started: activations that began, with this one.
+        """
+        words, first = self._words, self._started
+        words[first], words[first + 2], words[self._limit] = started, began_ns, limit_ns
+        self._ints[self._state] = State.RUNNING
 
 
 def write_course(view: View, index: int, course: Course) -> None:

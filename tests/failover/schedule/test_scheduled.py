@@ -59,10 +59,20 @@ def test_activations_are_due_a_period_apart_and_the_last_user_leaves_nothing(pla
         assert all(tick.late_ns >= 0 for tick in ticks)
         live = task.live
         assert (live.state, live.pid, live.counts.started, live.counts.ended) == (State.RUNNING, os.getpid(), 7, 6)
-        assert sum(layout.read_histogram(file.table, 0, layout.LATENESS_FIELD)) == 7
+        assert sum(layout.read_histogram(file.table, 0, layout.LATENESS_FIELD)) == 6  # the one under way is told at its end
         assert sum(layout.read_histogram(file.table, 0, layout.DURATION_FIELD)) == 6
         file.close()
     assert not place.exists()
+
+
+def test_a_task_that_wakes_early_begins_at_its_instant(place: Path) -> None:
+    with failover.scheduled("a", period=0.005, early=0.001) as task:
+        ticks = [tick for tick, _ in zip(task, range(10), strict=False)]
+        assert all(tick.late_ns >= 0 for tick in ticks)
+        assert all(tick.due_ns == ticks[0].due_ns + (tick.number - ticks[0].number) * 5 * MS for tick in ticks)
+    for early in (-0.001, 0.002, float("nan")):
+        with pytest.raises(ScheduleError, match="early = "):
+            failover.scheduled("a", period=0.005, early=early)
 
 
 def test_a_one_shot_task_runs_once_and_its_loop_ends(place: Path) -> None:

@@ -266,8 +266,9 @@ class PtraceSession:
         Args:
             may_stay: the pages of a single process need not be read.
         """
-        deadline = time.monotonic() + MOVED_S
+        deadline = 0.0
         self._standstill.longest_us = 0
+        began = time.monotonic()
         copied: RunningCopy | None = None
         given_up = 0
         self._budget.begin_capture()
@@ -281,8 +282,11 @@ class PtraceSession:
                     self._refuse(memory_limits.refuse_capture((self.pid, *(process.pid for process in others))))
                 may_stay = may_stay and not self._tree.processes()
                 copied = None if may_stay else self._copied_running(order, copied, base=base)
+                if copied is not None and not self._standstill.is_held:
+                    copied = self._ready(order, copied, base=base)
+                deadline = deadline or time.monotonic() + MOVED_S  # the wait for the gate does not count
                 self._budget.begin(is_free=order.hold, is_last=given_up == FREEZES_MAX - 1)
-                frozen = self._frozen_look(copied, base=base, hold=order.hold)
+                frozen = self._frozen_look(copied, base=base, order=order)
                 if not order.hold:
                     self._require_whole(frozen.first, frozen.others)
                 if frozen.others:
@@ -290,7 +294,8 @@ class PtraceSession:
                 return frozen
             except MovedError as moved:
                 let_go(moved)  # its frames hold what was copied
-                is_last = time.monotonic() > deadline and not may_stay  # one that took it for a single process is never the last
+                is_late = time.monotonic() > (deadline or began + MOVED_S)
+                is_last = is_late and not may_stay  # one that took it for a single process is never the last
                 self._is_single, may_stay = self._is_single and not may_stay, False
                 if is_last:
                     raise
@@ -325,6 +330,17 @@ class PtraceSession:
         self._tree.copy_running(base=base, enough=enough, again=is_again)
         return copied
 
+    def _ready(self, order: CaptureOrder, copied: RunningCopy, *, base: bool) -> RunningCopy:
+        """Be ready for the freeze, and wait until the program may stand still; what it writes meanwhile is copied again."""
+        while True:
+            processes = (self._first, *self._tree.processes())
+            self._first.memory.buffer.begin()
+            for process in processes:
+                process.rehearse()
+            if order.gate is None or order.gate.opens(tuple(process.pid for process in processes)):
+                return copied
+            copied = self._copied_running(order, copied, base=base)
+
     def _enough(self) -> int:
         """Pages that each process may leave for the freeze; 0 where no budget is set."""
         return max(1, self._budget.page_count // (1 + len(self._tree.processes()))) if self._budget else 0
@@ -358,14 +374,18 @@ class PtraceSession:
 
     # While it stands still
 
-    def _frozen_look(self, copied: RunningCopy | None, *, base: bool, hold: bool) -> Frozen:
-        """Everything that needs the program to stand still."""
+    def _frozen_look(self, copied: RunningCopy | None, *, base: bool, order: CaptureOrder) -> Frozen:
+        """Everything that needs the program to stand still; the gate is told when it is over."""
+        try:
+            return self._looked_at(copied, base=base, hold=order.hold)
+        finally:
+            if order.gate is not None:
+                order.gate.closes(stood_still=True)
+
+    def _looked_at(self, copied: RunningCopy | None, *, base: bool, hold: bool) -> Frozen:
         self._first.memory.buffer.begin()
         if copied is None:
             self._first.prepare(base=base)
-        elif not self._standstill.is_held:
-            for process in (self._first, *self._tree.processes()):
-                process.rehearse()
         began = self._standstill.freeze()
         try:
             self._budget.require()

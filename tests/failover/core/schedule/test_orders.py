@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from failover.core.schedule.admission import admission, by_deadline, priorities, response_ns
 from failover.core.schedule.course import Overrun
 from failover.core.schedule.orders import Change, Row, added, changed, circle_of, removed
-from failover.core.schedule.slack import window
 from failover.core.schedule.terms import Declaration, Kind, Mode, Terms, checked, nanoseconds
 from failover.errors import ScheduleError
 
@@ -191,12 +190,3 @@ def test_what_does_not_fit_is_told_for_each_set_of_processors() -> None:
     (told,) = admission(terms, {}, 2)
     assert (told.late, told.fits) == (("b",), False)
     assert "b may take 0.01 s on processor 0, longer than its deadline" in told.sentence()
-
-
-def test_the_slack_is_from_the_last_end_to_the_first_due() -> None:
-    assert window([(True, 0, 5)]) is None
-    found = window([(False, 10 * MS, 40 * MS), (False, 12 * MS, 30 * MS)], margin_ns=MS)
-    assert found is not None and (found.begin_ns, found.end_ns) == (12 * MS, 29 * MS)
-    assert (found.holds(12 * MS, 17 * MS), found.holds(13 * MS, 17 * MS), found.holds(11 * MS, 1)) == (True, False, False)
-    forever = window([(False, 1, None)])
-    assert forever is not None and forever.holds(5, 10**12)

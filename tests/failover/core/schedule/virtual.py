@@ -128,8 +128,8 @@ def lateness_accumulates() -> Iterator[None]:
     """The next activation is due a period after this one has begun."""
     honest = Task._start
 
-    def start(self: Task, now_ns: int) -> Tick:
-        tick = honest(self, now_ns)
+    def start(self: Task, now_ns: int, due_ns: int) -> Tick:
+        tick = honest(self, now_ns, due_ns)
         self.course = Course(self.number, now_ns, self.terms.period_ns)
         return tick
 

@@ -1,0 +1,140 @@
+"""The gate of a keeper: a capture of a real process that runs tasks begins between two activations."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from agent import slack_gate
+from agent.slack_gate import SlackGate, held_rows, openings_of
+from failover.boards import SCHEDULE_NAME, directory
+from failover.boards.schedule_file import ScheduleFile
+from failover.core.schedule import layout
+
+LAG_NS = 5_000_000_000
+TWO_PROCESSORS = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+STEADY = """
+import sys, time, failover
+with failover.scheduled(sys.argv[1], period=0.2) as task:
+    for tick in task:
+        begun = time.monotonic_ns()
+        time.sleep(0.1)
+        print(begun, time.monotonic_ns(), flush=True)
+"""
+REST = """
+import sys, failover
+with failover.scheduled(sys.argv[1], period=1000, cpus=tuple(map(int, sys.argv[2:]))):
+    print(flush=True)
+    sys.stdin.read()
+"""
+IDLE = "import sys; print(flush=True); sys.stdin.read()"
+POSING = """
+import fcntl, os, sys
+from failover.boards import directory, locks
+from failover.core.schedule.layout import ROW_LOCKS
+locks.take(os.open(os.environ[directory.VARIABLE] + "/schedule", os.O_RDWR), ROW_LOCKS)
+print(flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A directory with a schedule."""
+    directory.make_schedule(tmp_path, "robot1", mode=0o600)
+    return tmp_path
+
+
+@pytest.fixture
+def steady(place: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that runs a task half of the time, and says when."""
+    with process(STEADY, place, "steady") as child:
+        yield child
+
+
+@contextmanager
+def process(program: str, place: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """A process that has said its first line."""
+    environment = {**os.environ, directory.VARIABLE: str(place)}
+    command = [sys.executable, "-c", program, *words]
+    with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        yield child
+        child.kill()
+
+
+def captured(gate: SlackGate, pid: int, lag_ns: int = LAG_NS) -> slack_gate.Slack | None:
+    gate.begin(lag_ns)
+    while not gate.opens((pid,)):
+        pass
+    gate.closes(stood_still=True)
+    return gate.outcome
+
+
+def test_captures_begin_between_two_activations(steady: subprocess.Popen[str]) -> None:
+    gate, began = slack_gate.gate(), []
+    for _ in range(20):
+        found = captured(gate, steady.pid)
+        assert found is not None and (found.task, found.period_ns) == ("steady", 200_000_000)
+        assert not found.is_squeezed
+        began.append(found.began_ns)
+        time.sleep(0.03)  # so that they ask at different instants of a period
+    assert steady.stdout is not None
+    activations: list[tuple[int, int]] = []
+    while not activations or activations[-1][0] < began[-1]:
+        begun, ended = steady.stdout.readline().split()
+        activations.append((int(begun), int(ended)))
+    assert not [one for one in began for begun, ended in activations if begun <= one < ended]
+
+
+def test_the_wait_for_an_end_leaves_no_flag_behind(steady: subprocess.Popen[str], place: Path) -> None:
+    captured(slack_gate.gate(), steady.pid)
+    file = ScheduleFile.open(place / SCHEDULE_NAME)
+    row = file.row_of("steady")
+    assert row is not None and not layout.is_awaited(file.table, row)
+    file.close()
+
+
+def test_a_program_without_tasks_is_captured_at_once(place: Path) -> None:
+    with process(IDLE, place) as child:
+        assert captured(slack_gate.gate(), child.pid) is None
+    assert captured(slack_gate.gate(), 2**22 - 1) is None  # it has ended
+
+
+def test_the_kernel_tells_which_rows_a_process_runs(steady: subprocess.Popen[str], place: Path) -> None:
+    (opening,) = openings_of(steady.pid)
+    file = ScheduleFile.open(place / SCHEDULE_NAME)
+    assert opening.rows == (file.row_of("steady"),)
+    file.close()
+    assert held_rows("pos:\t0\nlock:\t1: OFDLCK ADVISORY  WRITE -1 00:1a:77 2199023255554 2199023255555\n") == (2, 3)
+    assert held_rows("lock:\t1: OFDLCK ADVISORY  READ -1 00:1a:77 2199023255554 2199023255555\n") == ()
+    assert held_rows("lock:\t1: OFDLCK ADVISORY  WRITE -1 00:1a:77 0 EOF\nlock:\t2:\n") == ()
+
+
+@pytest.mark.parametrize(("cpus", "waits"), [(("0", "0"), True), pytest.param(("0", "1"), False, marks=TWO_PROCESSORS)])
+def test_two_programs_of_one_processor_are_not_frozen_at_the_same_time(place: Path, cpus: tuple[str, str], waits: bool) -> None:
+    with process(REST, place, "first", cpus[0]) as one, process(REST, place, "second", cpus[1]) as other:
+        first, second = slack_gate.gate(), slack_gate.gate()
+        first.begin(LAG_NS)
+        second.begin(LAG_NS)
+        assert first.opens((one.pid,))
+        assert second.opens((other.pid,)) is not waits
+        first.closes(stood_still=True)
+        assert second.opens((other.pid,))
+
+
+def test_a_schedule_that_is_none_stands_in_no_capture(tmp_path: Path) -> None:
+    place = tmp_path / "other"
+    place.mkdir()
+    (place / SCHEDULE_NAME).write_bytes(b"x" * 100)
+    with process(POSING, place) as child:
+        assert openings_of(child.pid)
+        assert captured(slack_gate.gate(), child.pid) is None
