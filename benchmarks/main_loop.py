@@ -144,7 +144,7 @@ def _shares(span_s: float, directory: Path) -> list[Figure]:
         directory.mkdir()
         stage.start()
         pids = [int(robot.status()["pid"]) for robot in stage.robots]
-        boards = [open_board(agents_place(TEAM, name)) for name in stage.names]
+        boards = [open_board(agents_place(TEAM, robot.name)) for robot in stage.robots]
         handles = [[board.item(f"item{number}") for number in range(ITEMS)] for board in boards]
         try:
             _put_for(handles, 1.0)
