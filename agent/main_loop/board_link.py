@@ -64,7 +64,7 @@ class BoardLink:
     def __init__(self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int) -> None:
         self._file = own
         self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
-        self.turns = Turns()
+        self._turns: dict[int, Turns] = {}
         self.dropped: Counter[str] = Counter()
         self._own = OwnItems(own)
         self._gone: dict[int, int] = {}
@@ -86,16 +86,32 @@ class BoardLink:
 
     # --- Out ---
 
-    def due(self, round_: int, now_ns: int) -> list[Portion]:
-        """What goes into the frame of this round, with its age at ``now_ns``."""
+    def due(self, round_: int, now_ns: int, medium: int = 0, since: int | None = None) -> list[Portion]:
+        """What goes into the frame of this round, with its age at ``now_ns``.
+
+        Args:
+            medium: each has turns of its own, as each has room of its own; 0: the links without slots.
+            since: see `Turns.due`.
+        """
         try:
             if self._own.look(now_ns):
-                self.turns.hold(Sent(one.id, one.period, one.phase) for one in self._own.records.values())
-            numbers = self.turns.due(round_)
+                self._hold(*self._turns.values())
+            numbers = self._turns_of(medium).due(round_, since)
             return self._portions(numbers, self._own.newest(), now_ns) if numbers else []
         except (BoardError, OSError):
             self.dropped[UNREADABLE] += 1
             return []
+
+    def _turns_of(self, medium: int) -> Turns:
+        if medium not in self._turns:
+            self._turns[medium] = Turns()
+            self._hold(self._turns[medium])
+        return self._turns[medium]
+
+    def _hold(self, *turns: Turns) -> None:
+        items = [Sent(one.id, one.period, one.phase) for one in self._own.records.values()]
+        for one in turns:
+            one.hold(items)
 
     def urgent(self, now_ns: int) -> list[Portion]:
         """Urgent items that were put since they last went, as often as `Bucket` allows it."""
@@ -108,9 +124,9 @@ class BoardLink:
         allowed = [number for number in put if self._buckets.setdefault(number, Bucket()).take(now_ns)]
         return self._portions(allowed, table, now_ns)
 
-    def placed(self, portions: Sequence[Portion], count: int) -> None:
+    def placed(self, portions: Sequence[Portion], count: int, medium: int = 0) -> None:
         """The first ``count`` of what was due found room in the frame."""
-        self.turns.left(portion.number for portion in portions[count:])
+        self._turns_of(medium).left(portion.number for portion in portions[count:])
         self.went(portions[:count])
 
     def went(self, portions: Sequence[Portion]) -> None:
@@ -177,7 +193,7 @@ class BoardLink:
     def left_out(self) -> Counter[str]:
         """Values that were not taken, by reason, and those that waited."""
         counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped)
-        return counts + Counter({WAITED: sum(self.turns.waited.values())})
+        return counts + Counter({WAITED: sum(sum(turns.waited.values()) for turns in self._turns.values())})
 
 
 def way_bound_us(way_ns: int | None) -> int:
