@@ -84,6 +84,10 @@ class BoardLink:
         peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
         return cls(own, peers, round_ns)
 
+    def keep_pace(self, round_ns: int) -> None:
+        """Rounds last so long now: what counts as missed, and as old, follows."""
+        self._round_ns = round_ns
+
     # --- Out ---
 
     def due(self, round_: int, now_ns: int, medium: int = 0, since: int | None = None) -> list[Portion]:

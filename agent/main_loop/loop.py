@@ -204,7 +204,7 @@ class MainLoop:
         from failover.boards.directory import agents_place
 
         try:
-            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._outbox.beat_ns)
+            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._media.round_ns)
         except (FailoverError, OSError) as error:
             log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
@@ -422,6 +422,8 @@ class MainLoop:
                 self._frames.hear(peer, key)
             case LinksAre(links):
                 self._media.take(links, clock.now_ns())
+                if self._board is not None:
+                    self._board.keep_pace(self._media.round_ns)
             case Alive():
                 pass
             case _:

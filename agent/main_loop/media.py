@@ -210,6 +210,13 @@ class Media:
         """Whether frames leave over a link that never has slots: its pace is the board's."""
         return len(self._slotted) < len(self._links)
 
+    @property
+    def round_ns(self) -> int:
+        """The longest round of items: a heartbeat's period; where all links have slots, a round that the reference stretched."""
+        if self.at_once:
+            return self._beat_ns
+        return max(stretched_ns(link.period_ns, len(self._roster)) for link in self._slotted)
+
     def is_first(self, link: Link) -> bool:
         """Whether this is the first link with slots: the pace of the board where all have slots."""
         return link is self._slotted[0]
@@ -331,6 +338,11 @@ class Media:
                 f"{link.now.name}: rounds may last {least_ms // BEATS_IN_LEASE_MIN} ms, and leases {lease_ms} ms: fewer than "
                 f"{BEATS_IN_LEASE_MIN} lost frames can freeze this robot; set lease_ms to {least_ms} on all robots"
             )
+
+
+def stretched_ns(period_ns: int, robots: int) -> int:
+    """The longest round of so many robots: the reference follows delays of a part of a slot."""
+    return round(period_ns * (1 + Terms().epsilon / max(robots, 2)))
 
 
 def lease_needed_ms(terms: Terms, robots: int) -> int:
