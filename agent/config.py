@@ -148,6 +148,25 @@ class ComponentConfig:
         )
 
 
+T_TUP_MS_MIN: Final = 5
+T_TUP_MS_MAX: Final = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class MediumConfig:
+    """How frames leave over one interface; ``[media.wlan0]``.
+
+    Attributes:
+        cast: multicast, broadcast, unicast; auto: the first of them that the other members hear.
+        slots: robots take turns, RA-TDMA; auto: on a radio whose rounds the lease allows.
+        t_tup_ms: the round, where there are slots; the same at every robot.
+    """
+
+    cast: Literal["auto", "multicast", "broadcast", "unicast"] = "auto"
+    slots: bool | Literal["auto"] = "auto"
+    t_tup_ms: int = 50
+
+
 @dataclass(frozen=True, slots=True)
 class Config:
     """The whole file. Times in milliseconds.
@@ -179,6 +198,7 @@ class Config:
         keep_for: spread over this span; older ones go.
         keep_size: of the whole store; beyond it the oldest of those go. "": as much as there is.
         wireless: interfaces that count as wireless though the kernel cannot know: an Ethernet port that leads to a radio.
+        media: how frames leave over an interface, by its name.
     """
 
     robot: str
@@ -200,6 +220,7 @@ class Config:
     xor_cache: str = "64MB"
     snapshots_over: Literal["wired", "any"] = "wired"
     wireless: list[str] = field(default_factory=list)
+    media: dict[str, MediumConfig] = field(default_factory=dict)
     bring: bool = True
     bring_size: str = "1GB"
     portable: bool | str = False
@@ -214,6 +235,10 @@ class Config:
     def xor_cache_size(self) -> int:
         """The same in bytes."""
         return size_bytes(self.xor_cache) if self.xor_cache else 0
+
+    def medium(self, interface: str) -> MediumConfig:
+        """How frames leave over an interface; the defaults where the file says nothing of it."""
+        return self.media.get(interface, MediumConfig())
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other.
@@ -250,8 +275,21 @@ class Config:
         if self.keep_size:
             _check_quantity("keep_size", size_bytes, self.keep_size)
         _check_level(self.portable)
+        self._check_media()
         if self.link_mbit_s < 0:
             raise ValueError(f"link_mbit_s is {self.link_mbit_s}; 0 means no cap")
+
+    def _check_media(self) -> None:
+        for name, medium in self.media.items():
+            if not T_TUP_MS_MIN <= medium.t_tup_ms <= T_TUP_MS_MAX:
+                raise ValueError(
+                    f"media.{name}.t_tup_ms is {medium.t_tup_ms}; it must be at least {T_TUP_MS_MIN} and at most {T_TUP_MS_MAX}"
+                )
+            if medium.slots is True and self.lease_ms < BEATS_IN_LEASE_MIN * medium.t_tup_ms:
+                raise ValueError(
+                    f"lease_ms is {self.lease_ms}: with slots on {name} in rounds of {medium.t_tup_ms} ms give at least "
+                    f"{BEATS_IN_LEASE_MIN * medium.t_tup_ms}"
+                )
 
 
 def _check_quantity(key: str, read: Callable[[str], int], text: str) -> None:

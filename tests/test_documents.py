@@ -15,7 +15,7 @@ import agent.errors
 import agent.main
 import checkpoint.errors
 import failover.errors
-from agent.config import ComponentConfig, Config, HooksConfig
+from agent.config import ComponentConfig, Config, HooksConfig, MediumConfig
 from agent.worker.control import status_view
 from agent.worker.network.replication_link import LinkState
 from failover.cli import parser
@@ -130,6 +130,7 @@ def defaults(kind: type[Any]) -> dict[str, object]:
     [
         ("agent.toml: one robot", Config),
         ("agent.toml: one component", ComponentConfig),
+        ("agent.toml: one medium", MediumConfig),
         ("agent.toml: hooks of one component", HooksConfig),
         ("team.toml: who belongs", Robot),
         ("team.toml: the board", BoardConfig),

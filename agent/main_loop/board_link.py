@@ -70,7 +70,7 @@ class BoardLink:
     ) -> None:
         self._file = own
         self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
-        self.turns = Turns()
+        self._turns: dict[int, Turns] = {}
         self.dropped: Counter[str] = Counter()
         self._own = OwnItems(own)
         self._gone: dict[int, int] = {}
@@ -94,17 +94,26 @@ class BoardLink:
         agents = Primaries.open(place) if (place / directory.AGENT_NAME).exists() else None
         return cls(own, peers, round_ns, agents)
 
+    def keep_pace(self, round_ns: int) -> None:
+        """Rounds last so long now: what counts as missed, and as old, follows."""
+        self._round_ns = round_ns
+
     # --- Out ---
 
-    def due(self, round_: int, now_ns: int) -> list[Portion]:
-        """What goes into the frame of this round, with its age at ``now_ns``; first what is told of items that were added."""
+    def due(self, round_: int, now_ns: int, medium: int = 0, since: int | None = None) -> list[Portion]:
+        """What goes into the frame of this round, with its age at ``now_ns``; first what is told of items that were added.
+
+        Args:
+            medium: each has turns of its own, as each has room of its own; 0: the links without slots.
+            since: see `Turns.due`.
+        """
         try:
             if self._own.look(now_ns):
-                self.turns.hold(Sent(one.id, one.period, one.phase) for one in self._own.records.values())
+                self._hold(*self._turns.values())
                 self._announcements.hold(self._own.records.values())
                 self.wakes.look_again()
             told = self._announcements.due(round_)
-            due = self.turns.due(round_)
+            due = self._turns_of(medium).due(round_, since)
             if not due:
                 return told
             table, records = self._own.newest(), self._own.records
@@ -112,6 +121,17 @@ class BoardLink:
         except (BoardError, OSError):
             self.dropped[UNREADABLE] += 1
             return []
+
+    def _turns_of(self, medium: int) -> Turns:
+        if medium not in self._turns:
+            self._turns[medium] = Turns()
+            self._hold(self._turns[medium])
+        return self._turns[medium]
+
+    def _hold(self, *turns: Turns) -> None:
+        items = [Sent(one.id, one.period, one.phase) for one in self._own.records.values()]
+        for one in turns:
+            one.hold(items)
 
     def urgent(self, now_ns: int) -> list[Portion]:
         """Urgent items that were put since they last went, as often as `Bucket` allows it."""
@@ -128,9 +148,17 @@ class BoardLink:
         """What `urgent` gave is on its way: the thread that waits for puts may go on."""
         self.wakes.seen_to(self._looked)
 
-    def placed(self, portions: Sequence[Portion], count: int) -> None:
+    def leave_for_slot(self) -> None:
+        """Urgent items that were put wait for this robot's slot; the thread that waits for puts may go on."""
+        try:
+            self._looked = self._own.numbers(self._own.urgent)
+        except OSError:
+            self.dropped[UNREADABLE] += 1
+        self.seen_to()
+
+    def placed(self, portions: Sequence[Portion], count: int, medium: int = 0) -> None:
         """The first ``count`` of what was due found room in the frame."""
-        self.turns.left(portion.number for portion in portions[count:] if portion.number < RESERVED)
+        self._turns_of(medium).left(portion.number for portion in portions[count:] if portion.number < RESERVED)
         self.went(portions[:count])
 
     def went(self, portions: Sequence[Portion]) -> None:
@@ -210,7 +238,8 @@ class BoardLink:
         """Values that were not taken, by reason, and those that waited."""
         counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped) + self._announcements.refused()
         left_out = self._primaries.left_out if self._primaries is not None else 0
-        return counts + Counter({WAITED: sum(self.turns.waited.values()), LEFT_OUT: left_out})
+        waited = sum(sum(turns.waited.values()) for turns in self._turns.values())
+        return counts + Counter({WAITED: waited, LEFT_OUT: left_out})
 
 
 def way_bound_us(way_ns: int | None) -> int:

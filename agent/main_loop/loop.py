@@ -23,9 +23,10 @@ from agent.config import Settings
 from agent.core_config import node_config
 from agent.errors import AgentError
 from agent.main_loop import messages, starvation, vote_record
-from agent.main_loop.beat_sockets import TURN_LIMIT, BeatLane
+from agent.main_loop.beat_sockets import NOT_CAST, TURN_LIMIT, BeatLane
 from agent.main_loop.duplicate_beats import Copies
 from agent.main_loop.event_log_writer import EventLogWriter
+from agent.main_loop.media import Link, Media
 from agent.main_loop.messages import (
     Alive,
     BeatCounts,
@@ -34,6 +35,7 @@ from agent.main_loop.messages import (
     HearKey,
     Inventory,
     Life,
+    LinksAre,
     SpeakKey,
     Told,
     ToMainLoop,
@@ -51,6 +53,7 @@ from failover.core.acts import Act
 from failover.core.events import Event, Received, Tick
 from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
+from failover.core.frames.lanes import FrameLanes, medium_of
 from failover.core.node import URGENT_GAP_NS, Node
 from failover.core.wire.messages import Beat
 from failover.errors import FailoverError
@@ -111,11 +114,15 @@ class MainLoop:
         self._me = settings.config.robot
         self._record_file = record_file
         self._notifier = notifier
-        self._beats = BeatLane(settings.me, settings.peers)
+        self._beats = BeatLane(settings.me, settings.peers, settings.team.team)
         round_us = settings.config.beat_ms * 1_000
         has_board, members = bool(settings.team.board.items), settings.team.roster()
         boot = record_file.record.boot
-        self._frames = FrameLane(self._me, settings.team.team, members, boot, round_us, bounds_ways=has_board)
+        self._frames = FrameLanes(
+            lambda medium: FrameLane(self._me, settings.team.team, members, boot, round_us, medium, bounds_ways=has_board)
+        )
+        self._media = Media(settings, self._beats, self._frames, members)
+        self._beat: Beat | None = None
         self._has_board = has_board and settings.me.role == "robot"
         self._board: BoardLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
@@ -145,7 +152,7 @@ class MainLoop:
         self._sent = self._heard = self._late_us_max = self._gap_us_max = self._gaps = 0
         self._heard_at: dict[str, int] = {}
         self._copies = Copies()
-        self._newest_part: dict[str, tuple[int, int]] = {}
+        self._newest_part: dict[tuple[str, int], tuple[int, int]] = {}
         self._unlike: set[str] = set()
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
@@ -197,7 +204,7 @@ class MainLoop:
         from failover.boards.directory import agents_place
 
         try:
-            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._outbox.beat_ns)
+            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._media.round_ns)
         except (FailoverError, OSError) as error:
             log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
@@ -241,6 +248,8 @@ class MainLoop:
                 self._urgent_ns = self._sent_ns + URGENT_GAP_NS
         if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
             self._send_urgent()
+        if self._media.is_slotted:
+            self._take_slots()
         self._watch_worker()
         if self._node is not None:
             late_ns = clock.now_ns() - self._node.next_deadline_ns()
@@ -254,7 +263,8 @@ class MainLoop:
         In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
-        self._rests = self._node is not None and self._board is None and self._node.rests(now_ns)
+        has_leisure = self._node is not None and self._board is None and not self._media.is_slotted
+        self._rests = has_leisure and self._node is not None and self._node.rests(now_ns)
         listens = not self._rests and now_ns >= self._deaf_until_ns
         if listens != self._listens:
             self._listens = listens
@@ -289,6 +299,9 @@ class MainLoop:
         deadline_ns = self._node.next_deadline_ns()
         if self._urgent_ns is not None:
             deadline_ns = min(deadline_ns, self._urgent_ns)
+        slot_ns = self._media.wakes_ns()
+        if slot_ns is not None and self._beat is not None:
+            deadline_ns = min(deadline_ns, slot_ns)
         return deadline_ns if self._listens or self._rests else min(deadline_ns, self._deaf_until_ns)
 
     # --- events in ---
@@ -306,22 +319,39 @@ class MainLoop:
     def _hear(self) -> None:
         self._read_ns = clock.now_ns()
         taken = refused = 0
-        for frame, link, wall_ns, sender in self._beats.receive():
+        for frame, link, wall_ns, sender, place in self._beats.receive():
             taken += 1
             now_ns, came_ns = clock.now_and_arrival_ns(wall_ns)
-            opened = self._frames.open(frame, came_ns)
+            opened, is_cast = self._frames.open(frame, came_ns), place != NOT_CAST
             if not isinstance(opened, Refused):
                 if self._board is not None:
                     self._board.take(opened, came_ns)  # first: programs wait for it
-                self._copies.heard(opened.part, link)
+                self._copies.heard(opened.part, link, cast=is_cast)
+                self._note_way(opened.part, link, place, came_ns)
                 self._take_part(opened.part, link, now_ns, self._counts_from_ns(now_ns, came_ns))
-            elif not self._copies.admit(opened, link, now_ns):
+            elif self._copies.admit(opened, link, now_ns, medium=medium_of(frame), cast=is_cast):
+                self._note_way_of_copy(opened, link, place, frame)
+            else:
                 self._refused[str(opened.reason)] += 1
                 refused += 1
                 if sign := self._unread.of_beat(opened, sender, clock.now_ns()):
                     self._step(sign)
         if taken >= TURN_LIMIT and refused > taken // 2:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
+
+    def _note_way(self, part: Part, link: str, place: int, came_ns: int) -> None:
+        """By which link a part came, and whether it was cast; what it says of slots."""
+        self._media.heard(part.sender, link, came_ns)
+        if place != NOT_CAST:
+            self._media.heard_cast(place, part.medium, part.rank, part.boot, part.counter)
+        if part.slots is not None and part.medium:
+            self._media.heard_slots(part, link, came_ns)
+
+    def _note_way_of_copy(self, copy: Refused, link: str, place: int, frame: bytes) -> None:
+        """The same of a copy of a part that was believed."""
+        self._media.heard(copy.sender, link, self._read_ns)
+        if place != NOT_CAST:
+            self._media.heard_cast_copy(place, medium_of(frame), copy.sender, copy.counter)
 
     def _take_part(self, part: Part, link: str, now_ns: int, came_ns: int) -> None:
         self._count_part(part)
@@ -345,12 +375,12 @@ class MainLoop:
 
     def _count_part(self, part: Part) -> None:
         """Note how many parts of the peer's frames were lost before this one, and whether its ranks are ours."""
-        peer = part.sender
-        boot, counter = self._newest_part.get(peer, (part.boot, part.counter - 1))
+        peer, lane = part.sender, (part.sender, part.medium)
+        boot, counter = self._newest_part.get(lane, (part.boot, part.counter - 1))
         missing = part.counter - counter - 1 if part.boot == boot else 0
         self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
         if part.boot != boot or missing >= 0:
-            self._newest_part[peer] = (part.boot, part.counter)
+            self._newest_part[lane] = (part.boot, part.counter)
         if not part.alike:
             self._unlike.add(peer)
         elif self._unlike:
@@ -389,6 +419,10 @@ class MainLoop:
                 self._frames.speak(peer, key)
             case HearKey(peer, key):
                 self._frames.hear(peer, key)
+            case LinksAre(links):
+                self._media.take(links, clock.now_ns())
+                if self._board is not None:
+                    self._board.keep_pace(self._media.round_ns)
             case Alive():
                 pass
             case _:
@@ -437,21 +471,32 @@ class MainLoop:
             self._act(act)
 
     def _send(self, beat: Beat) -> None:
-        """A beat, and the items whose round it is: a beat that leaves earlier, because something changed, begins no round."""
+        """A beat, and the items whose round it is: a beat that leaves earlier, because something changed, begins no round.
+
+        Where robots take turns the beat waits for this robot's slot; a newer one takes its place. To the others it is as late as
+        one that the network held up.
+        """
         now_ns = clock.now_ns()
-        if self._board is None or now_ns - self._round_ns <= self._outbox.beat_ns // 2:
+        self._beat = beat
+        if self._board is None or not self._media.at_once or now_ns - self._round_ns <= self._outbox.beat_ns // 2:
             self._send_frame(beat, (), now_ns)
             return
-        self._round, self._round_ns = self._round + 1, now_ns
-        self._board.tell_states(now_ns, self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000)
-        self._board.tell_primaries(self._node.primaries() if self._node is not None else {}, now_ns)
+        self._begin_round(self._board, now_ns)
         items = self._board.due(self._round, now_ns)
         self._board.placed(items, self._send_frame(beat, items, now_ns))
 
+    def _begin_round(self, board: BoardLink, now_ns: int) -> None:
+        self._round, self._round_ns = self._round + 1, now_ns
+        board.tell_states(now_ns, self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000)
+        board.tell_primaries(self._node.primaries() if self._node is not None else {}, now_ns)
+
     def _send_urgent(self) -> None:
-        """Items that cannot wait for their round, without a beat."""
+        """Items that cannot wait for their round, without a beat. Where robots take turns they wait for this robot's slot."""
         self._urgent_ns = None
         if self._board is None:
+            return
+        if not self._media.at_once:
+            self._board.leave_for_slot()
             return
         now_ns = clock.now_ns()
         items = self._board.urgent(now_ns)
@@ -460,14 +505,34 @@ class MainLoop:
         self._board.seen_to()
 
     def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:
-        """One frame, to everybody over every link; how many of the items are in it."""
-        made, placed = self._frames.seal(beat, items, now_ns, round_=self._round)
-        for sealed in made:
-            for peer in sealed.to:
-                for datagram in sealed.datagrams:
-                    self._beats.send(peer, datagram)
+        """One frame, to everybody over every link where none waits for a slot; how many of the items are in it."""
+        patience_ns = self._rest_ns if self._rests else 0
         self._sent_ns = now_ns
-        return placed
+        return self._media.send(beat, items, now_ns, self._round, patience_ns=patience_ns)
+
+    def _take_slots(self) -> None:
+        """Send where it is this robot's turn; what has come before may move the turn, so it is read first."""
+        slot_ns = self._media.wakes_ns()
+        if slot_ns is None or self._beat is None or clock.now_ns() < slot_ns:
+            return
+        self._hear()
+        for link in self._media.due():
+            self._send_in_slot(link, self._beat)
+
+    def _send_in_slot(self, link: Link, beat: Beat) -> None:
+        """The newest beat, and the items whose round was since the last slot here."""
+        if self._board is None:
+            self._media.send_in_slot(link, beat, (), self._round)
+            return
+        now_ns = clock.now_ns()
+        if not self._media.at_once and self._media.is_first(link):
+            self._begin_round(self._board, now_ns)
+        items = self._board.due(self._round, now_ns, link.number, link.turned)
+        if not self._media.at_once:
+            numbers = {item.number for item in items}
+            items += [item for item in self._board.urgent(now_ns) if item.number not in numbers]
+        link.turned = self._round
+        self._board.placed(items, self._media.send_in_slot(link, beat, items, self._round), link.number)
 
     def _act(self, act: Act) -> None:
         self._worker.order(act)
@@ -487,21 +552,18 @@ class MainLoop:
             dict(self._lost),
             self._items_left_out(),
         )
-        troubles = tuple(
-            filter(
-                None,
-                (self._persister.trouble, self._event_log.trouble, *map(UNLIKE.format, sorted(self._unlike))),
-            )
-        )
+        unlike = map(UNLIKE.format, sorted(self._unlike))
+        sentences = (self._persister.trouble, self._event_log.trouble, *unlike, *self._media.troubles())
+        troubles = tuple(filter(None, sentences))
         if question.what == "why":
             return Told(question.number, now_ns, unwritten=self._event_log.unwritten(), beats=counts, troubles=troubles)
         status = self._node.status(now_ns) if self._node is not None else None
-        return Told(question.number, now_ns, status, beats=counts, troubles=troubles)
+        return Told(question.number, now_ns, status, beats=counts, troubles=troubles, media=self._media.views())
 
     def _items_left_out(self) -> dict[str, int]:
         """Values that were not taken, by reason, and those that waited."""
         left_out = self._board.left_out() if self._board is not None else Counter()
-        return dict(self._frames.assembly.dropped + left_out)
+        return dict(sum((lane.assembly.dropped for lane in self._frames.all()), left_out))
 
     def _end(self) -> None:
         self._worker.send(Farewell())

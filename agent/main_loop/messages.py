@@ -14,6 +14,7 @@ from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.event_log.decisions import Line
 from failover.core.events import Event
+from failover.core.frames.terms import SlotsView
 from failover.core.types import Found, Held, StatusView
 
 ACTS: Final[dict[str, Any]] = {
@@ -102,6 +103,25 @@ class HearKey(msgspec.Struct, frozen=True, tag=True):
     key: bytes
 
 
+class LinkNow(msgspec.Struct, frozen=True, array_like=True):
+    """One of this robot's links, as the kernel has it now.
+
+    Attributes:
+        name, index: of the interface that has its beat address; "" and 0 while none has it.
+    """
+
+    name: str = ""
+    index: int = 0
+    is_wireless: bool = False
+    is_loopback: bool = False
+
+
+class LinksAre(msgspec.Struct, frozen=True, tag=True):
+    """Worker to main loop, at each change: this robot's links, in the order of its beat addresses."""
+
+    links: tuple[LinkNow, ...]
+
+
 class Ask(msgspec.Struct, frozen=True, tag=True):
     """Worker to main loop: show me the team, or the decisions that are not on the disk yet. Answer: `Told`."""
 
@@ -132,6 +152,27 @@ class BeatCounts(msgspec.Struct, frozen=True):
     items: dict[str, int] = {}
 
 
+class MediumView(msgspec.Struct, frozen=True):
+    """How frames leave over one link.
+
+    Attributes:
+        link: its interface, "" while it has none.
+        cast: multicast, broadcast or unicast; ``because``: why not multicast, or "".
+        by_unicast: the members that get frames by unicast besides: they did not say that they hear the cast.
+        period_ms: between two frames.
+        no_slots: why it has none though it is a radio, or "".
+        slots: None where frames leave at once.
+    """
+
+    link: str
+    cast: str
+    because: str
+    by_unicast: tuple[str, ...]
+    period_ms: int
+    no_slots: str = ""
+    slots: SlotsView | None = None
+
+
 class Told(msgspec.Struct, frozen=True, tag=True):
     """Main loop to worker: the answer to `Ask`.
 
@@ -146,6 +187,7 @@ class Told(msgspec.Struct, frozen=True, tag=True):
     unwritten: tuple[Line, ...] = ()
     beats: BeatCounts = BeatCounts()
     troubles: tuple[str, ...] = ()
+    media: tuple[MediumView, ...] = ()
 
 
 class Farewell(msgspec.Struct, frozen=True, tag=True):
@@ -153,7 +195,7 @@ class Farewell(msgspec.Struct, frozen=True, tag=True):
 
 
 ToWorker = Order | Life | Told | Farewell
-ToMainLoop = Happened | Inventory | SpeakKey | HearKey | Alive | Ask
+ToMainLoop = Happened | Inventory | SpeakKey | HearKey | LinksAre | Alive | Ask
 
 
 def order(act: Act) -> Order:

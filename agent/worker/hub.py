@@ -23,7 +23,19 @@ from agent import config as configuration
 from agent.config import Settings
 from agent.errors import AgentError, LaneError
 from agent.main_loop import messages
-from agent.main_loop.messages import Alive, Ask, Farewell, HearKey, Life, Order, SpeakKey, Told, ToWorker
+from agent.main_loop.messages import (
+    Alive,
+    Ask,
+    Farewell,
+    HearKey,
+    Life,
+    LinkNow,
+    LinksAre,
+    Order,
+    SpeakKey,
+    Told,
+    ToWorker,
+)
 from agent.system import syscalls
 from agent.system.log_setup import set_up_log
 from agent.system.systemd_units import starter
@@ -32,7 +44,7 @@ from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import ControlServer
 from agent.worker.network.connections import BULK, AllConnections
 from agent.worker.network.link_monitor import Wires
-from agent.worker.network.links import Facts, Links
+from agent.worker.network.links import Facts, Link, Links, Medium
 from agent.worker.network.remote_orders import Errands
 from agent.worker.network.replication_link import Keys, LinkState, public_key_of
 from checkpoint.errors import CheckpointError
@@ -293,6 +305,7 @@ class Switchboard:
             self.tell(events.Unread(peer, why))
 
     async def _links_changed(self, sentences: list[str]) -> None:
+        self._say(LinksAre(tuple(map(_link_now, self._links.of_beats()))))
         for sentence in sentences:
             log.info("%s", sentence)
             self.tell(events.Noticed("", sentence))
@@ -364,6 +377,12 @@ class Switchboard:
             *self._connections.troubles,
             *self._links.notes(),
         ]
+
+
+def _link_now(link: Link | None) -> LinkNow:
+    if link is None:
+        return LinkNow()
+    return LinkNow(link.name, link.index, link.medium is Medium.WIRELESS, link.medium is Medium.LOOPBACK)
 
 
 def make_directory(directory: Path) -> None:

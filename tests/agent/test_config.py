@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from agent import config as configuration
-from agent.config import ComponentConfig, Config
+from agent.config import ComponentConfig, Config, MediumConfig
 from agent.core_config import level_of, node_config, started_here
 from agent.errors import ConfigError
 from agent.main import main as agent_main
@@ -24,6 +24,7 @@ from checkpoint.linux.spawn.inherited_limits import Inheritance
 from failover.config import team
 from failover.config.team import Robot, Role, Team
 from failover.core.types import Launch, Rule
+from failover.errors import FailoverError
 
 DOCUMENTED = Path(__file__).parents[2] / "systemd" / "agent.toml"
 ROBOT = Robot(("127.0.0.1:7420",), "127.0.0.1:7421")
@@ -47,12 +48,14 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     documented = tomllib.loads(re.sub(r"^#(\w+ = |\[)", r"\1", text, flags=re.MULTILINE))
     (component,) = documented.pop("components").values()
     (task,) = documented.pop("tasks").values()
+    (medium,) = documented.pop("media").values()
     assert documented.pop("robot") == "robot1"
     defaults = dataclasses.asdict(Config("robot1"))
-    del defaults["robot"], defaults["components"], defaults["tasks"]
+    del defaults["robot"], defaults["components"], defaults["tasks"], defaults["media"]
     assert documented == defaults
     assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
     assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
+    assert medium == dataclasses.asdict(MediumConfig())
     assert set(task) == {one.name for one in dataclasses.fields(TaskConfig)}
     assert msgspec.convert(task, TaskConfig) == TaskConfig()
 
@@ -361,3 +364,24 @@ def test_a_witness_under_the_pair_rule_is_refused(directory: Path) -> None:
     team.write(directory / "team", Team("lab", members))
     with pytest.raises(ConfigError, match=r'robot2 would have no vote; set rule = "majority"'):
         configuration.load(written(directory))
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (("[media.wlan0]", "t_tup_ms = 2"), "media.wlan0.t_tup_ms is 2; it must be at least 5 and at most 1000"),
+        (("lease_ms = 199", "[media.wlan0]", "slots = true"), "with slots on wlan0 in rounds of 50 ms give at least 200"),
+        (("[media.wlan0]", 'cast = "multicats"'), "multicast"),
+        (("[media.wlan0]", 'slots = "no"'), "slots"),
+        (("[media.wlan0]", "slot = true"), "unknown key 'slot'"),
+    ],
+)
+def test_a_medium_that_cannot_work_is_refused_by_name(directory: Path, lines: tuple[str, ...], says: str) -> None:
+    with pytest.raises((ConfigError, FailoverError), match=re.escape(says)):
+        configuration.load(written(directory, *lines))
+
+
+def test_slots_by_name_work_with_a_lease_of_four_rounds(directory: Path) -> None:
+    loaded = configuration.load(written(directory, "lease_ms = 200", "[media.wlan0]", "slots = true"))
+    assert loaded.config.medium("wlan0").slots is True
+    assert loaded.config.medium("eth0") == MediumConfig()

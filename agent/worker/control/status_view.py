@@ -14,12 +14,13 @@ from msgspec.structs import asdict
 
 from agent.config import Settings
 from agent.guard.output_pump import HOLD_LIMIT
-from agent.main_loop.messages import Life, Told
+from agent.main_loop.messages import Life, MediumView, Told
 from agent.system import clock
 from agent.worker.control import fencing_status
 from agent.worker.network.replication_link import LinkState, PeerConnection
 from checkpoint.device_rules import merged, missing
 from checkpoint.engine import COOPERATIVE, PTRACE
+from failover.core.frames.terms import SlotsView
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
@@ -98,6 +99,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "healthy": view.healthy if view else False,
         "notes": notes,
         "links": ours.interfaces,
+        "media": [_medium(one) for one in told.media],
         "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
         "components": [
             _component(one, ours.supervisors.get(one.name), settings, ours.store) for one in (view.components if view else ())
@@ -113,6 +115,29 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
             "items": dict(beats.items),
         },
         "lanes_pid": os.getpid(),
+    }
+
+
+def _medium(view: MediumView) -> dict[str, Any]:
+    return {
+        "link": view.link,
+        "cast": view.cast,
+        "because": view.because,
+        "by_unicast": list(view.by_unicast),
+        "period_ms": view.period_ms,
+        "no_slots": view.no_slots,
+        "slots": _slots(view.slots) if view.slots is not None else None,
+    }
+
+
+def _slots(view: SlotsView) -> dict[str, Any]:
+    peers = [{**asdict(peer), "seen": peer.seen.name.lower()} for peer in view.peers]
+    return {
+        **asdict(view),
+        "own": str(view.own),
+        "members": list(view.members),
+        "deaf": list(map(list, view.deaf)),
+        "peers": peers,
     }
 
 

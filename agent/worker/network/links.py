@@ -164,9 +164,9 @@ class Links:
         Args:
             anywhere: snapshots may travel over wireless links too.
         """
-        hosts = (resolved(split_address(address, "address")[0]) for address in (me.bulk, *me.beats))
+        hosts = [resolved(split_address(address, "address")[0]) for address in (me.bulk, *me.beats)]
         self._hosts = tuple(dict.fromkeys(hosts))
-        self._bulk = self._hosts[0]
+        self._bulk, *self._beats = hosts
         self._facts = facts
         self._anywhere = anywhere
         self._known: dict[str, Link | None] = {}
@@ -206,6 +206,10 @@ class Links:
         if link is None or link.medium is Medium.LOOPBACK or not can_pin(link.name):
             return None
         return Device(link.name, link.index)
+
+    def of_beats(self) -> list[Link | None]:
+        """The link of each beat address, in their order."""
+        return [self.at(host) for host in self._beats]
 
     def notes(self) -> list[str]:
         """For the status: each fault of this robot's links, a sentence each."""

@@ -39,10 +39,21 @@ class Turns:
         self._items = {item.number: item for item in items}
         self._waiting = {number: None for number in self._waiting if number in self._items}
 
-    def due(self, round_: int) -> list[int]:
-        """Numbers of the items for the frame of this round, in the order in which they are to find room."""
+    def due(self, round_: int, since: int | None = None) -> list[int]:
+        """Numbers of the items for the frame of this round, in the order in which they are to find room.
+
+        Args:
+            since: round of the frame before, for frames that leave more seldom than rounds pass: a turn after that counts, too.
+        """
         waiting = list(self._waiting)
-        turn = [item.number for item in self._items.values() if (round_ - item.phase) % item.period == 0]
+        if since is None:
+            turn = [item.number for item in self._items.values() if (round_ - item.phase) % item.period == 0]
+        else:
+            turn = [
+                item.number
+                for item in self._items.values()
+                if (round_ - item.phase) // item.period > (since - item.phase) // item.period
+            ]
         return [*waiting, *[number for number in turn if number not in self._waiting]] if waiting else turn
 
     def left(self, numbers: Iterable[int]) -> None:

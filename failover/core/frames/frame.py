@@ -22,6 +22,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from checkpoint.errors import UNDECODABLE
+from failover.core.frames import casts as frame_casts
 from failover.core.frames.roster import RANKS_MAX, SEEN_PER_WORD, Roster
 from failover.core.frames.terms import Said
 from failover.core.types import PEERS_MAX
@@ -89,6 +90,8 @@ PIECE_SIZE_MIN: Final = 64
 BODY_HEAD: Final = 1 + 1 + 1 + 3 + 9
 """Bytes of a body without content: the array's head, no slots, no beat, the head of many items, the instant."""
 
+NO_CASTS: Final[tuple[bytes, ...]] = ()
+
 
 class Reason(enum.StrEnum):
     """Why a frame was not believed."""
@@ -99,6 +102,7 @@ class Reason(enum.StrEnum):
     PART = "a part beyond its parts"
     ROSTER = "another roster"
     UNKNOWN_KEY = "unknown key"
+    UNSEALED = "sealed for other robots only"
     FORGED = "wrong authentication code"
     MALFORMED = "not a well-formed frame"
     SENDER = "key of another sender"
@@ -149,12 +153,14 @@ class Body(Struct, frozen=True, array_like=True, gc=False):
 
     Attributes:
         left_us: instant of the ages of its items, by the sender's clock.
+        casts: which casts the sender heard (`failover.core.frames.casts`); in the first part of a frame, if of any.
     """
 
     slots: Said | None = None
     beat: Beat | None = None
     items: tuple[Portion, ...] = ()
     left_us: Annotated[int, Meta(ge=0)] = 0
+    casts: tuple[bytes, ...] = NO_CASTS
 
 
 class Part(Struct, frozen=True, gc=False):
@@ -180,6 +186,7 @@ class Part(Struct, frozen=True, gc=False):
     beat: Beat | None
     items: tuple[Portion, ...]
     left_us: int
+    casts: tuple[bytes, ...] = NO_CASTS
 
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -203,7 +210,13 @@ def beat_size_max(members: int) -> int:
     """Bytes of a beat that fits a part beside the slots, in a team of so many."""
     views = 1 + 9 * -(-members // SEEN_PER_WORD)
     slots = 1 + 5 + 9 + 5 + views + 3 + ECHO_SIZE_MAX * echoes_max(members)
-    return body_size_max(members) - BODY_HEAD + 2 - slots
+    return body_size_max(members) - BODY_HEAD + 2 - slots - casts_size_max(members)
+
+
+def casts_size_max(members: int) -> int:
+    """Bytes of what a frame says of casts; a team of which each member gets a datagram of its own has none."""
+    counters = 2 + frame_casts.COUNTER_SIZE * members
+    return 1 + frame_casts.LINKS_MAX * counters if members - 1 <= CODES_MAX else 0
 
 
 def echoes_max(members: int) -> int:
@@ -216,17 +229,25 @@ def size_of(value: Any) -> int:
     return len(_encode(value))
 
 
-def bodies(said: Said | None, beat: Beat | None, items: Sequence[Portion], left_us: int, room: int) -> tuple[list[bytes], int]:
+def bodies(
+    said: Said | None,
+    beat: Beat | None,
+    items: Sequence[Portion],
+    left_us: int,
+    room: int,
+    casts: tuple[bytes, ...] = NO_CASTS,
+) -> tuple[list[bytes], int]:
     """The bodies of a frame's parts, each of at most ``room`` bytes, and how many of the items, the first ones, found a place.
 
     An item that is longer than a part has room goes in several; they follow each other.
     """
-    whole = _encode((said, beat, items, left_us))
+    tail = (left_us, casts) if casts else (left_us,)
+    whole = _encode((said, beat, items, *tail))
     if len(whole) <= room:
         return [whole], len(items)
     parts: list[list[Portion]] = [[]]
     fresh = room - BODY_HEAD
-    left = fresh + 2 - size_of(said) - size_of(beat)
+    left = fresh + 2 - size_of(said) - size_of(beat) - (size_of(casts) if casts else 0)
     assert left >= 0, f"slots and beat do not fit the {room} bytes of a part"
     placed = 0
     for item in items:
@@ -244,7 +265,7 @@ def bodies(said: Said | None, beat: Beat | None, items: Sequence[Portion], left_
         placed += 1
     first, *others = parts
     rest = [_encode((None, None, part, left_us)) for part in others]
-    return [_encode((said, beat, first, left_us)), *rest], placed
+    return [_encode((said, beat, first, *tail)), *rest], placed
 
 
 def _pieces(item: Portion, left: int, fresh: int) -> Iterable[Portion]:
@@ -426,14 +447,16 @@ class Receiver:
         alike = roster == self._digest
         sender = self._senders.get(name)
         if sender is None:
-            return Refused(Reason.UNKNOWN_KEY)
+            place = self._me - (self._me > rank)
+            is_cast = alike and count == len(self._roster) - 1 and _is_unsealed(datagram, range(place, place + 1))
+            return Refused(Reason.UNSEALED if is_cast else Reason.UNKNOWN_KEY)
         places = self._places(rank, count, alike, sender)
         if not places:
             return Refused(Reason.ROSTER)
         body = datagram[start:]
         refusal = _check(datagram, body, places, sender.keys)
         if refusal is not None:
-            return Refused(refusal)
+            return Refused(Reason.UNSEALED if alike and _is_unsealed(datagram, places) else refusal)
         try:
             said = _decode(body)
         except UNDECODABLE:
@@ -452,7 +475,21 @@ class Receiver:
                 return Refused(Reason.ROSTER, sender.name)
             slots, items = None, ()
         return Part(
-            sender.name, alike, sender.rank, medium, flags, boot, counter, round_, part, parts, slots, beat, items, said.left_us
+            sender.name,
+            alike,
+            sender.rank,
+            medium,
+            flags,
+            boot,
+            counter,
+            round_,
+            part,
+            parts,
+            slots,
+            beat,
+            items,
+            said.left_us,
+            said.casts,
         )
 
     def _places(self, rank: int, count: int, alike: bool, sender: _Sender) -> range:
@@ -476,6 +513,11 @@ def _check(datagram: bytes, body: bytes, places: range, keys: Sequence[bytes]) -
                 if hmac.compare_digest(datagram[at : at + SEAL_SIZE], _authenticator(digest, key)):
                     return None
     return Reason.FORGED if digest else Reason.UNKNOWN_KEY
+
+
+def _is_unsealed(datagram: bytes, places: range) -> bool:
+    """Whether the sender has not told us a key yet: what it casts to all comes nevertheless."""
+    return all(datagram.startswith(_NO_SEAL, HEADER.size + SEAL_SIZE * place) for place in places)
 
 
 def _is_sound(beat: Beat | None, items: Sequence[Portion], boot: int, counter: int) -> bool:

@@ -9,12 +9,15 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
 from msgspec import Struct
 
 from failover.core.frames.assembly import Assembly
+from failover.core.frames.casts import Casts
 from failover.core.frames.clock_offset import ClockOffset
 from failover.core.frames.frame import (
     AGE_US_MAX,
+    NO_CASTS,
     Part,
     Portion,
     Receiver,
@@ -78,6 +81,9 @@ class FrameLane:
         round_us: between two of its frames.
         medium: its number; 0: all links.
         bounds_ways: bound how long frames are on their way. Only ages of items need it: a team without a board does without.
+
+    Attributes:
+        casts: None where no frame can be cast: each member gets a datagram of its own, or no link of this robot is known to cast.
     """
 
     def __init__(
@@ -95,6 +101,12 @@ class FrameLane:
         self._shares = self._shared()
         self._echo_from = 0
         self.assembly = Assembly()
+        self.casts: Casts | None = None
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether one datagram is for all members, so that it can be cast."""
+        return len(self._others) == self._codes
 
     @property
     def counter(self) -> int:
@@ -139,7 +151,10 @@ class FrameLane:
         """
         if said is None and self._bounds_ways:
             said = Said(self._round_us, 0, 0, (), self._echo(now_ns))
-        parts, placed = bodies(said, beat, items, now_ns // US, self._room)
+        elif said is not None and len(said.echo) > self._echoes:
+            said = msgspec.structs.replace(said, echo=self._some(said.echo))
+        casts = self.casts.says() if self.casts is not None else NO_CASTS
+        parts, placed = bodies(said, beat, items, now_ns // US, self._room, casts)
         made = [
             Sealed(to, self._sealer.seal(parts, keys, medium=self._medium, flags=flags, round_=round_, again=number > 0))
             for number, (to, keys) in enumerate(self._shares)
@@ -166,6 +181,8 @@ class FrameLane:
         peer = self._peers.get(part.rank)
         if peer is None or not part.alike:
             return Heard(part, (), None)
+        if part.casts and self.casts is not None:
+            self.casts.told(part.rank, part.casts)
         if not self._bounds_ways and not part.items:
             return Heard(part, (), None)
         if part.boot > peer.boot:
@@ -204,7 +221,13 @@ class FrameLane:
     def _echo(self, now_ns: int) -> tuple[tuple[int, int, int], ...]:
         """Of whom we have heard lately; in a large team of some, in turn."""
         recent = [(rank, peer) for rank, peer in self._peers.items() if peer.counter and now_ns - peer.came_ns < ECHOED_NS]
-        if len(recent) > self._echoes:
-            self._echo_from = (self._echo_from + self._echoes) % len(recent)
-            recent = (recent + recent)[self._echo_from : self._echo_from + self._echoes]
-        return tuple((rank, peer.counter, min(max(now_ns - peer.came_ns, 0) // US, AGE_US_MAX)) for rank, peer in recent)
+        return self._some(
+            tuple((rank, peer.counter, min(max(now_ns - peer.came_ns, 0) // US, AGE_US_MAX)) for rank, peer in recent)
+        )
+
+    def _some(self, echoes: tuple[tuple[int, int, int], ...]) -> tuple[tuple[int, int, int], ...]:
+        """As many as a frame has room for, in turn."""
+        if len(echoes) <= self._echoes:
+            return echoes
+        self._echo_from = (self._echo_from + self._echoes) % len(echoes)
+        return (echoes + echoes)[self._echo_from : self._echo_from + self._echoes]

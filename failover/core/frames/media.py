@@ -30,6 +30,10 @@ UNHEARD_ROUNDS = 20
 """Rounds without a sign that any robot hears us, though we hear some, after which another way to cast is tried: a second."""
 
 
+RETRY_ROUNDS = 3_000
+"""Rounds after which ``auto`` begins again with multicast: a minute of heartbeats. Switches and filters are set up anew."""
+
+
 class Cast(enum.StrEnum):
     """How a frame reaches all members of a medium."""
 
@@ -115,13 +119,17 @@ def dropped(items: tuple[tuple[int, int], ...], size_max: int) -> tuple[int, ...
 
 
 class Casting:
-    """Which way frames are cast on one medium now. Invariant: under another setting than ``auto`` it never changes."""
+    """Which way frames are cast on one medium now. Invariant: under another setting than ``auto`` it never changes.
+
+    Attributes:
+        why: the present way was chosen, "" for the first choice.
+    """
 
     def __init__(self, cast: Cast) -> None:
         self._is_auto = cast is Cast.AUTO
         self.now = Cast.MULTICAST if self._is_auto else cast
         self.why = ""
-        self._unheard = 0
+        self._unheard = self._rounds = 0
 
     def failed(self, reason: str) -> bool:
         """The kernel refused a send; whether another way is to be tried at once."""
@@ -129,6 +137,10 @@ class Casting:
 
     def round_over(self, heard: int, hears_us: int) -> bool:
         """Once a round: how many robots we hear, and how many of those hear us; whether frames are cast in another way now."""
+        self._rounds += 1
+        if self._is_auto and self.now is not Cast.MULTICAST and self._rounds >= RETRY_ROUNDS:
+            self.now, self._unheard, self._rounds = Cast.MULTICAST, 0, 0
+            return True
         self._unheard = self._unheard + 1 if heard and not hears_us else 0
         return self._unheard >= UNHEARD_ROUNDS and self._fall_back(f"{heard} robots are heard, and none has heard a {self.now}")
 
@@ -136,5 +148,5 @@ class Casting:
         after = FALLBACK.get(self.now) if self._is_auto else None
         if after is None:
             return False
-        self.now, self.why, self._unheard = after, reason, 0
+        self.now, self.why, self._unheard, self._rounds = after, reason, 0, 0
         return True

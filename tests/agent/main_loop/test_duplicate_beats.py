@@ -52,3 +52,17 @@ def test_only_beats_that_are_authentic_and_were_heard_prove_a_link() -> None:
     assert not copies.admit(again(8), "wlan0", 100)
     assert not copies.admit(Refused(Reason.REPLAYED, "robot2", 7), "wlan0", 100)
     assert not copies.admit(again(7), "", 100)
+
+
+def test_a_frame_comes_over_one_link_by_cast_and_by_unicast_and_each_once() -> None:
+    copies = Copies()
+    copies.heard(beat(7), "eth0", cast=True)
+    assert not copies.admit(again(7), "eth0", 100, cast=True)
+    assert copies.admit(again(7), "eth0", 200)
+    assert not copies.admit(again(7), "eth0", 300)
+
+
+def test_each_medium_counts_by_itself() -> None:
+    copies = Copies()
+    copies.heard(beat(7), "eth0")
+    assert not copies.admit(again(7), "wlan0", 100, medium=1)

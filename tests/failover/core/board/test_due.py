@@ -61,3 +61,12 @@ def test_an_urgent_item_goes_ten_times_a_second_and_ten_times_at_one_time(gaps_n
         later = [one for one in went[number:] if one - at_ns < NS_PER_S]
         assert len(later) <= 2 * URGENT_PER_S
     assert went[0] == gaps_ns[0] + 1
+
+
+def test_a_frame_that_leaves_more_seldom_than_rounds_pass_carries_every_turn_since_the_one_before() -> None:
+    both = turns((0, 1, 0), (1, 3, 1), (2, 10, 5))
+    assert both.due(3, since=0) == [0, 1]
+    assert both.due(5, since=3) == [0, 1, 2]
+    assert both.due(6, since=5) == [0]
+    assert both.due(5, since=5) == []
+    assert [both.due(round_, since=round_ - 1) for round_ in range(1, 31)] == [both.due(round_) for round_ in range(1, 31)]

@@ -131,7 +131,7 @@ def test_a_key_that_was_not_handed_over_is_no_key() -> None:
     silent = FrameLane("robot1", "team", TEAM, 1, 20_000)
     made, _ = silent.seal(Beat("robot1", 1, 1), (), MS)
     assert made[0].to == ()
-    assert lane("robot2").open(made[0].datagrams[0], MS) == Refused(Reason.UNKNOWN_KEY)
+    assert lane("robot2").open(made[0].datagrams[0], MS) == Refused(Reason.UNSEALED)
 
 
 def test_a_large_team_gets_a_datagram_each_and_all_of_them_have_one_counter() -> None:

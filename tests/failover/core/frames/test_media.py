@@ -8,7 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failover.core.frames.media import LOAD_MAX, UNHEARD_ROUNDS, Cast, Casting, Medium, air_us, dropped, overload, room
+from failover.core.frames.media import (
+    LOAD_MAX,
+    RETRY_ROUNDS,
+    UNHEARD_ROUNDS,
+    Cast,
+    Casting,
+    Medium,
+    air_us,
+    dropped,
+    overload,
+    room,
+)
 
 RADIO = Medium("wlan0", is_wireless=True, rate_mbps=1)
 
@@ -95,3 +106,12 @@ def test_a_way_that_was_chosen_is_kept(cast: Cast) -> None:
     assert not casting.failed("EACCES")
     assert not any(casting.round_over(3, 0) for _ in range(10 * UNHEARD_ROUNDS))
     assert casting.now is cast
+
+
+def test_a_way_that_did_not_work_is_tried_again_after_a_while() -> None:
+    casting = Casting(Cast.AUTO)
+    for _ in range(2 * UNHEARD_ROUNDS):
+        casting.round_over(3, 0)
+    assert casting.now is Cast.UNICAST
+    assert [casting.round_over(3, 0) for _ in range(RETRY_ROUNDS)].index(True) == RETRY_ROUNDS - 1
+    assert casting.now is Cast.MULTICAST
