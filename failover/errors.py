@@ -162,7 +162,7 @@ class NoAnswerError(FailoverError, TimeoutError):
 
 
 class ProgramError(FailoverError):
-    """Something about a program that is sent to a robot does not work, and nothing changed; the message says what and the cure."""
+    """Something about a program that is sent to a robot does not work, and nothing changed; the message says what to do."""
 
 
 class BundleRefusedError(ProgramError):

@@ -117,11 +117,12 @@ def split(content: bytes | memoryview) -> tuple[Signature | None, memoryview]:
 def _signature(block: bytes) -> Signature:
     try:
         found = msgspec.json.decode(block.rstrip(b" "), type=Signature)
-        sizes = [len(bytes.fromhex(one)) for one in (found.digest, found.key, found.signature)]
+        words = [bytes.fromhex(one) for one in (found.digest, found.key, found.signature)]
         exact = msgspec.json.encode(found, order="sorted").ljust(BLOCK, b" ")
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BundleRefusedError(f"the bundle's signature is damaged: {error}") from error
-    if sizes != [32, KEY_SIZE, SIGNATURE_SIZE] or exact != block:
+    is_ours = [one.hex() for one in words] == [found.digest, found.key, found.signature]  # in small letters
+    if [len(one) for one in words] != [32, KEY_SIZE, SIGNATURE_SIZE] or not is_ours or exact != block:
         raise BundleRefusedError("the bundle's signature is damaged: it is not as failover writes it")
     if not 0 <= found.signed_s < TIME_MAX or not 0 <= found.until_s < TIME_MAX:
         raise BundleRefusedError("the bundle's signature is damaged: its times cannot be")
