@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import getpass
+import io
 import json
 import signal
 import subprocess
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from failover.cli import main
 from failover.drivers.here import Here, lives
 from tests.failover.drivers.serving import until
 from tests.failover.programs.senders import RULES
@@ -22,10 +25,10 @@ PATH = "University/Lab/Robotino/Engines/3/PWM"
 
 
 def typed(*words: str) -> str:
-    """What a command prints."""
-    return subprocess.run(
-        [sys.executable, "-m", "failover", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True, timeout=110
-    ).stdout
+    """What a command prints; in this process, which has loaded all of it."""
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.chdir(ROOT):
+        assert main.main(words) == 0
+    return said.getvalue()
 
 
 @contextmanager
