@@ -161,6 +161,14 @@ class NoAnswerError(FailoverError, TimeoutError):
     """A driver did not answer in time; whether the message was carried out is not known."""
 
 
+class ProgramError(FailoverError):
+    """Something about a program that is sent to a robot does not work, and nothing changed; the message says what to do."""
+
+
+class BundleRefusedError(ProgramError):
+    """A bundle may not run here; the message says why. Nothing of it was unpacked."""
+
+
 class StateError(FailoverError):
     """Something about the state that a program keeps (``failover.state``) does not work.
 

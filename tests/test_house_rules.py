@@ -56,6 +56,7 @@ DOORS = {
     "ptrace": ("checkpoint/linux/trace/tracee.py",),
     "zstandard": ("checkpoint/snapshot/compression.py",),
     "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
+    "cryptography": ("failover/programs/keys.py",),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),
@@ -241,6 +242,7 @@ def test_each_dependency_enters_through_its_door() -> None:
 DATACLASSES = {
     "failover/kept_state/period.py": "a field that is not shown",
     "failover/config/board.py": "read from TOML by its fields",
+    "failover/config/programs.py": "read from TOML by its fields",
     "failover/config/rights.py": "read from TOML by its fields",
     "failover/config/team.py": "read from TOML by its fields",
     "failover/state/record_libraries.py": "programs have some",

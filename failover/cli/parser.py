@@ -433,6 +433,23 @@ VERBS: Final = (
         "failover.cli.verbs.drivers:path",
     ),
     Verb(
+        "program",
+        "programs sent to running robots: pack, sign, send, run, switch, rollback",
+        """
+        A bundle is a driver with its manifest and a person's signature, in one file. It is checked before anything of it is
+        unpacked, waits warm beside the version that runs, takes over between two messages with the state of the old one, and is
+        rolled back if it fails its trial (docs/programs.md). No agent is needed. failover program ACT --help explains an act.
+
+          failover program key anna.key
+          failover program pack engine-2 -o engine.bundle --key anna.key
+          failover program send engine.bundle
+          failover program run engine
+          failover program switch engine 2.0
+        """,
+        "failover.cli.arguments.programs:program",
+        "failover.cli.verbs.programs:show",
+    ),
+    Verb(
         "check",
         "can failover protect programs here, or this process; and what to change",
         """

@@ -139,7 +139,7 @@ class Actor:
             if self._declaration.verbs[message.verb].marked.coalesce == "latest":
                 while (following := self._mailbox.take_same(message.verb, now_ns)) is not None:
                     run.append(following)
-        said = self._carried_out(run)
+        said = self.carried_out(run)
         left_ns = clock()
         for replaced in run[:-1]:
             self._done(replaced, _as_merged(replaced, said), left_ns)
@@ -154,7 +154,8 @@ class Actor:
                 self._paths.popitem(last=False)
         self._mailbox.done(message, msgspec.structs.replace(said, hops=hops))
 
-    def _carried_out(self, run: Sequence[Envelope]) -> Envelope:
+    def carried_out(self, run: Sequence[Envelope]) -> Envelope:
+        """The answer to messages that become one; the mailbox is not touched."""
         message = merged(run) if len(run) > 1 else run[0]
         if own := self._own.get(message.verb):
             return answer(message, own(message, message.hops[-1].came_ns))
@@ -166,9 +167,10 @@ class Actor:
             arguments = _arguments(verb, message.body)
         except (msgspec.ValidationError, TypeError) as error:
             return refusal(message, "bad_body", f"the body of {verb.name} is not as declared: {error}")
-        return self._called(verb, arguments, message)
+        return self.called(verb, arguments, message)
 
-    def _called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
+    def called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
+        """The answer of one method."""
         try:
             return answer(message, _plain(getattr(self._instance, verb.name)(**arguments)))
         except EnvelopeError as error:
@@ -222,7 +224,7 @@ class Actor:
                 continue
             period_ns = round(SECOND / those[0].verb.marked.rate_hz)
             self._samples_ns[name] = max(self._samples_ns[name] + period_ns, now_ns)
-            said = self._called(those[0].verb, {}, Envelope(verb=name))
+            said = self.called(those[0].verb, {}, Envelope(verb=name))
             for one in those:
                 envelope = msgspec.structs.replace(said, to=one.to, verb=name, sender=self._declaration.path)
                 if not publish(one.whose, envelope):

@@ -66,6 +66,16 @@ class NameService:
         self._exchange.be_door(self._now_ns())
         self._thread.start()
 
+    def replace(self, record: Record) -> None:
+        """Register another record of the same path.
+
+        Raises:
+            NameFormatError: it cannot be registered; the one before stands.
+        """
+        with self._lock:
+            self.record = self._scan.put(record, self._now_ns())
+        os.eventfd_write(self._wake, 1)
+
     def tree(self) -> Tree:
         """All names as this process knows them now."""
         with self._lock:

@@ -27,7 +27,8 @@ from failover.drivers.actor import Actor, Whose
 from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
-from failover.errors import EnvelopeError
+from failover.errors import DriverError, EnvelopeError
+from failover.kept_state.component import kept_of
 
 T = TypeVar("T")
 
@@ -85,6 +86,11 @@ def run(cls: type[T]) -> T:
         DriverError: it cannot take messages.
         NameFormatError: its path belongs to another robot.
     """
+    if kept_of(cls):
+        raise DriverError(
+            f"{cls.__name__} keeps attributes (failover.kept), and a driver keeps none yet: what it knows ends with it; "
+            "failover program run keeps them"
+        )
     serving = Serving(cls)
     with serving, _signals(serving):
         for line in serving.addresses_told():
@@ -114,12 +120,16 @@ class Serving:
             self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             stack.callback(os.close, self._wake)
             self._open(declaration, stack)
-            self.service = NameService(self.here, self._record(declaration), terms)
+            self.service = NameService(self.here, self.record_of(declaration), terms)
             stack.callback(self.service.close)
-            self.instance = cls()
-            self._actor = Actor(self.instance, declaration, f"{self.here.robot}/{self._name}")
+            self.instance, self._actor = self._made(cls, declaration, f"{self.here.robot}/{self._name}")
             self.service.start()
             self._stack = stack.pop_all()
+
+    def _made(self, cls: type, declaration: Declaration, who: str) -> tuple[Any, Actor]:
+        """The driver, and what hands it its messages."""
+        instance = cls()
+        return instance, Actor(instance, declaration, who)
 
     def _open(self, declaration: Declaration, stack: contextlib.ExitStack) -> None:
         path = declaration.path
@@ -150,7 +160,7 @@ class Serving:
         self._poller.add(self._listener.fileno())
         self._addresses.append(f"unix://{hand}")
 
-    def _record(self, declaration: Declaration) -> Record:
+    def record_of(self, declaration: Declaration) -> Record:
         """With the schemas of its verbs, if a record has room for them; else with their names."""
         record = Record(
             declaration.path,
@@ -182,6 +192,10 @@ class Serving:
     def stop(self) -> None:
         """End `serve` after the message in hand."""
         self._is_over = True
+        self.wake()
+
+    def wake(self) -> None:
+        """Have `serve` look at its actor, from any thread or signal."""
         with contextlib.suppress(OSError):
             os.eventfd_write(self._wake, 1)
 

@@ -171,7 +171,21 @@ def kept_of(cls: type) -> dict[str, Kept]:
     return found
 
 
-def schema_of(cls: type, declaration: Declaration, name: str) -> Schema:
+class Versioned(Protocol):
+    """A declaration with a version of the kept state."""
+
+    @property
+    def version(self) -> int:
+        """Of the state's form."""
+        ...
+
+    @property
+    def migrations(self) -> Mapping[int, Callable[[Any], Any]] | None:
+        """By the version that they start from."""
+        ...
+
+
+def schema_of(cls: type, declaration: Versioned, name: str) -> Schema:
     """The schema of everything that a class keeps: one, so that an object in two attributes stays one."""
     try:
         hints = typing.get_type_hints(cls, include_extras=True)

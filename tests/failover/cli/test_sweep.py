@@ -32,6 +32,25 @@ TASKS = (
     *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
 )
 RIGHTS = (["list"], ["why", "root", "see", "/x"])
+PROGRAMS = (
+    *(
+        ["verify", "missing"],
+        ["verify", "junk"],
+        ["verify", "directory"],
+        ["send", "sparse"],
+        ["sign", "junk", "--key", "missing"],
+    ),
+    *(["pack", "missing", "-o", "out"], ["pack", "directory", "-o", "out"], ["key", "missing/a.key"], ["key", "junk"]),
+    *(
+        ["run", "engine"],
+        ["run", "./directory"],
+        ["log", "engine"],
+        ["log", "../x"],
+        ["switch", "engine", "2"],
+        ["rollback", "engine"],
+        ["send", "junk", "--to", "robot2"],
+    ),
+)
 DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
@@ -59,7 +78,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        with_acts = verb in (("team",), ("board",), ("task",), ("rights",))
+        with_acts = verb in (("team",), ("board",), ("task",), ("rights",), ("program",))
         statuses.append(main.main([*argv, *asked] if with_acts else [*verb, *asked, *rest]))
         said = capsys.readouterr()
         if asked:
@@ -130,6 +149,16 @@ def test_with_drivers_that_are_not_there(
     assert sorted(Path("directory").iterdir()) == []
 
 
+@pytest.mark.parametrize("act", PROGRAMS, ids=" ".join)
+def test_with_programs_that_are_none(
+    act: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("FAILOVER_DRIVERS", "directory")
+    monkeypatch.setenv("FAILOVER_PROGRAMS", str(tmp_path / "programs"))
+    assert told(capsys, "program", *act) == main.FAILED
+    assert sorted(Path("directory").iterdir()) == [] and not Path("out").exists()
+
+
 @pytest.mark.parametrize("content", ["junk", "sparse", "directory"])
 @pytest.mark.parametrize("act", RIGHTS, ids=" ".join)
 def test_with_rights_that_are_none(act: list[str], content: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -148,6 +177,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"ps", "task", "trace", "wait-activation", "rights"}
+    without |= {"ps", "task", "trace", "wait-activation", "rights", "program"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}

@@ -1,0 +1,1 @@
+"""Programs that are sent to robots: packed, signed, admitted, run confined, and switched under load."""

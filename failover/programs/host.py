@@ -1,0 +1,530 @@
+"""Holds the name and the mailbox of one program, while versions of it come and go.
+
+The host is what senders talk to: its sockets, its mailbox with what each sender was answered, its pace. A version is a process of
+its own that gets one message at a time, and says with each answer which state it left. So between two messages the host can put
+another version in its place: the old one has nothing that the host does not have, and senders notice a pause at most.
+
+    message → mailbox → host → version's process → answer + state → kept → the answer leaves
+
+A switch, all between two messages: the old version is paused and says its last state; the new one, which has waited warm, begins
+with it. From then on the new one is on trial (`failover.core.programs.trial`). If it fails, the old one, whose process is still
+there, begins with its state at the switch and carries out the commands since then again, without answers; then the message in
+hand, with one.
+
+A verb that begins with ``_`` is the host's: ``_versions``, ``_switch``, ``_rollback``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from msgspec import UNSET, Struct
+
+from failover.core.messaging.envelope import Envelope, answer, refusal
+from failover.core.messaging.mailbox import Mailbox, Stream
+from failover.core.messaging.pacing import SECOND, Pace, merged
+from failover.core.programs import states, versions
+from failover.core.programs.states import Shelf
+from failover.core.programs.trial import Command, Trial, Verdict
+from failover.drivers.actor import Actor
+from failover.drivers.declare import Declaration, Marked, Verb
+from failover.drivers.server import Peer
+from failover.errors import FailoverError, ProgramError
+from failover.programs.channel import Hello
+from failover.programs.running import Answered, Running, Source
+from failover.programs.sources import Place, before, source_of_directory, source_of_store, version_of
+from failover.programs.store import Kept
+
+ROLLBACK_S: Final = 300
+"""How long the process of a version that was replaced is kept: a rollback within this time takes no start."""
+
+RESTART_NS: Final = SECOND
+"""Between two tries to start a version that has ended by itself."""
+
+ANSWERS_KEPT: Final = 16
+"""Of each sender, on disk: one that calls waits for one."""
+
+LOOK_NS: Final = SECOND
+"""How often the host looks at clocks although no message comes, while something is due."""
+
+log = logging.getLogger("failover.programs")
+
+
+class _Unchecked(Struct, frozen=True):
+    """The version's own process checks arguments."""
+
+
+class Described(Declaration, frozen=True):
+    """A declaration as a version's process told it."""
+
+    told: Mapping[str, Any] = {}
+
+    def schemas(self) -> dict[str, Any]:
+        """As that process made them."""
+        return dict(self.told)
+
+
+def declared(hello: Hello, beside: str) -> Described:
+    """``beside``: "" or the path under which a second version runs, without aliases."""
+    verbs = {
+        name: Verb(name, Marked(one.role, one.coalesce, one.rate_hz), _Unchecked)  # type: ignore[arg-type]
+        for name, one in hello.verbs.items()
+    }
+    aliases = () if beside else hello.aliases
+    return Described(beside or hello.path, aliases, hello.rate_hz, verbs, hello.labels, told=hello.described)
+
+
+class HostActor(Actor):
+    """The mailbox of one program, and the versions that carry out its messages."""
+
+    def __init__(self, place: Place, first: Running, declaration: Declaration, who: str, kept: Kept | None) -> None:
+        super().__init__(object(), declaration, who)
+        self._place = place
+        self._running: Running | None = first
+        self._old: Running | None = None
+        self._old_until_ns = 0
+        self._trial: Trial | None = None
+        self._number = kept.number if kept is not None else 0
+        self._coming: Running | None = None
+        self._is_coming = False
+        self._said = ""
+        self._restart_ns = 0
+        self._gap_ms = 0.0
+        self._state = first.state
+        self._is_changed = True
+        self._starter = ThreadPoolExecutor(1, "starts versions")
+        self.wake: Callable[[], None] = lambda: None
+        self.renew: Callable[[Declaration], None] = lambda _: None
+        if kept is not None:
+            self._mailbox = Mailbox(kept.streams)
+
+    # --- One message ------------------------------------------------------------------------------------------------------
+
+    def handle(self, clock: Callable[[], int]) -> list[Envelope]:
+        """Between two messages: switch, if a version has become warm; judge the one on trial. Then the next message."""
+        self._turn(clock)
+        answers = super().handle(clock)
+        if self._is_changed:
+            self._keep()
+        return answers
+
+    def wait_ns(self, now_ns: int) -> int | None:
+        """Not longer than until something of the versions is due."""
+        waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
+        if self._coming is not None:
+            waits.append(0)
+        if self._trial is not None:
+            due = self._trial.wait_ns(now_ns)
+            waits.append(LOOK_NS if due is None else due)
+        if self._old is not None and self._trial is None:
+            waits.append(max(self._old_until_ns - now_ns, 0))
+        if self._running is None:
+            waits.append(max(self._restart_ns - now_ns, 0))
+        return min(waits, default=None)
+
+    def carried_out(self, run: Sequence[Envelope]) -> Envelope:
+        """The answer of the active version, or of the one before it if that fails on trial."""
+        message = merged(run) if len(run) > 1 else run[0]
+        if orders := {"_versions": self._versions, "_switch": self._switch, "_rollback": self._rollback}.get(message.verb):
+            try:
+                self._check_near(message)
+                return answer(message, orders(message.body if isinstance(message.body, dict) else {}))
+            except FailoverError as error:
+                return refusal(message, "refused", str(error))
+        if message.verb.startswith("_"):
+            return super().carried_out(run)
+        return self._forwarded(message)
+
+    def _check_near(self, message: Envelope) -> None:
+        """Orders are this robot's: only its own user and root reach its sockets."""
+        whose = self.route(message.sender)
+        if message.verb != "_versions" and isinstance(whose, Peer) and whose.team:
+            raise ProgramError(f"give this order on the robot itself: {message.sender} is on another one")
+
+    def called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
+        """A stream's value."""
+        return self._forwarded(msgspec.structs.replace(message, verb=verb.name, body=dict(arguments)))
+
+    def _forwarded(self, message: Envelope) -> Envelope:
+        message = msgspec.structs.replace(message, hops=(), rest={})
+        if self._running is None:
+            return refusal(message, "no_version", f"no version of {self._place.name} runs now: {self._said}")
+        try:
+            found = self._running.call(message)
+            why = found.answer.error.sentence if found.answer.error is not UNSET and found.answer.error.kind == "failed" else ""
+        except FailoverError as error:
+            found, why = None, str(error)
+        if self._trial is not None and (why or found is None):
+            self._fall_back(f"at message {self._trial.messages + 1}, {message.verb}: {why}")
+            return self._forwarded(message)
+        if found is None:
+            self._lost(why)
+            text = f"{message.verb} was not finished: {why}; it may have been carried out"
+            return refusal(message, "failed", text)
+        self._take(message, found)
+        return found.answer
+
+    def _take(self, message: Envelope, found: Answered) -> None:
+        assert self._running is not None
+        verb = self._declaration.verbs.get(message.verb)
+        is_command = verb is None or verb.marked.role == "command"
+        self._is_changed |= is_command or found.state is not self._running.state
+        self._running.state = self._state = found.state
+        if found.trouble and found.trouble != self._said:
+            self._said = found.trouble
+            self._note(f"its state cannot be kept: {found.trouble}")
+        if self._trial is not None:
+            self._trial.handled(Command(message.verb, message.body), changes=is_command)
+
+    def _keep(self) -> None:
+        """State and mailbox to the disk, before an answer leaves."""
+        self._is_changed = False
+        self._number += 1
+        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
+        try:
+            self._place.store.keep(self._declaration.path, Kept(self._number, self.version, self._state, streams))
+        except ProgramError as error:
+            if str(error) != self._said:
+                self._said = str(error)
+                log.warning("%s", error)
+
+    @property
+    def version(self) -> str:
+        """The one that carries out messages; "" while none does."""
+        return self._running.source.manifest.version if self._running is not None else ""
+
+    # --- Between two messages ---------------------------------------------------------------------------------------------
+
+    def _turn(self, clock: Callable[[], int]) -> None:
+        now_ns = clock()
+        if self._running is not None and not self._running.lives:
+            self._ended()
+        if self._running is None and self._coming is None and now_ns >= self._restart_ns:
+            self._restart(now_ns)
+        if self._coming is not None:
+            coming, self._coming = self._coming, None
+            self._switch_to(coming, clock)
+        if self._trial is not None:
+            self._judge(now_ns)
+        if self._old is not None and self._trial is None and now_ns >= self._old_until_ns:
+            self._let_go()
+
+    def _switch_to(self, new: Running, clock: Callable[[], int]) -> None:
+        """The new version takes over, or the old one goes on as if nothing had been."""
+        began_ns = clock()
+        old, version = self._running, new.source.manifest.version
+        try:
+            if old is not None:
+                old.pause()
+                self._state = old.state
+            new.begin(self._state)
+            if old is not None:
+                switched = Kept(self._number, old.source.manifest.version, old.state, {})
+                self._place.store.keep(before(self._declaration.path), switched)
+            self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
+        except FailoverError as error:
+            new.end()
+            self._say(f"{version} could not take over: {error}")
+            if old is not None:
+                self._resume(old, self._state)
+            return
+        self._let_go()
+        self._running, self._old, self._state = new, old, new.state
+        self._switched_with = old.state if old is not None else None
+        self._trial = Trial(new.source.manifest.health, clock())
+        self._gap_ms = (clock() - began_ns) / 1e6
+        self._renew(new)
+        notes = "".join(f"; {note}" for note in new.notes)
+        self._say(f"{version} took over within {self._gap_ms:.1f} ms, on trial{notes}")
+        self._keep()
+
+    def _resume(self, old: Running, state: Any) -> None:
+        """A version that was paused goes on with this state; started anew if its process does not."""
+        try:
+            old.begin(state)
+            self._running = old
+        except FailoverError as error:
+            self._say(f"{old.source.manifest.version} did not go on: {error}; it is started anew")
+            old.end()
+            self._state, self._running = state, None
+            self._last = old.source
+            self._restart(0)
+
+    def _judge(self, now_ns: int) -> None:
+        assert self._trial is not None and self._running is not None
+        verdict = self._trial.verdict(now_ns)
+        if verdict is Verdict.WAIT:
+            return
+        health = self._running.source.manifest.health
+        if verdict is Verdict.ASK:
+            try:
+                found = self._running.call(Envelope(verb=health.query)).answer
+                why = found.error.sentence if found.error is not UNSET else ""
+            except FailoverError as error:
+                why = str(error)
+            if why:
+                self._fall_back(f"its health query {health.query} failed: {why}")
+                return
+        messages, self._trial = self._trial.messages, None
+        self._old_until_ns = now_ns + ROLLBACK_S * SECOND
+        self._record_anyway(lambda shelf: states.put(shelf, states.commit(version_of(shelf, self.version), "healthy")))
+        self._say(f"{self.version} is committed: {messages} messages without a failure")
+
+    def _fall_back(self, why: str) -> None:
+        """The trial has failed: the version before it goes on, with what the new one was told since the switch."""
+        assert self._trial is not None and self._running is not None
+        failed, trial, old = self._running, self._trial, self._old
+        newest, self._trial, self._old = self._state, None, None
+        failed.end()
+        version = failed.source.manifest.version
+        if old is None:
+            self._running = None
+            self._say(f"{version} failed, and no version was active before it: {why}")
+            self._last = failed.source
+            return
+        self._record_anyway(lambda shelf: states.fall_back(shelf, why))
+        if failed.source.manifest.on_rollback == "newest" and self._began_with(old, newest):
+            told = f"with the state of {version}"
+        else:
+            self._resume(old, self._switched_with)
+            told = f"with its state at the switch, and {self._replayed(trial)} commands since then once more"
+        if self._running is not None:
+            self._state = self._running.state
+        self._renew(old)
+        self._say(f"{version} is rolled back: {why}; {old.source.manifest.version} goes on {told}")
+        self._keep()
+
+    def _began_with(self, old: Running, state: Any) -> bool:
+        try:
+            old.begin(state)
+        except FailoverError:
+            return False
+        self._running = old
+        return True
+
+    def _replayed(self, trial: Trial) -> int:
+        """How many commands were carried out again; their answers have left before."""
+        count = 0
+        self._state = self._switched_with
+        for command in trial.replay:
+            if self._running is None:
+                self._restart(0)
+            if self._running is None:
+                break
+            try:
+                found = self._running.call(Envelope(verb=command.verb, body=command.body))
+                self._running.state = self._state = found.state
+                count += 1
+            except FailoverError as error:
+                self._lost(f"at {command.verb}, which is left out: {error}")
+        return count
+
+    def _let_go(self) -> None:
+        old, self._old = self._old, None
+        if old is not None:
+            old.end()
+
+    # --- An end that no person ordered ------------------------------------------------------------------------------------
+
+    def _ended(self) -> None:
+        if self._trial is not None:
+            self._fall_back("its process ended")
+        else:
+            self._lost("its process ended")
+
+    def _lost(self, why: str) -> None:
+        """The active version is gone, not on trial: it is started anew with its last state."""
+        lost, self._running = self._running, None
+        if lost is not None:
+            lost.end()
+            self._last = lost.source
+            self._say(f"{lost.source.manifest.version}: {why}; it is started anew")
+
+    def _restart(self, now_ns: int) -> None:
+        self._restart_ns = now_ns + RESTART_NS
+        try:
+            running = Running(self._last, lambda: self.wake())
+            try:
+                running.begin(self._state)
+            except FailoverError:
+                running.end()
+                raise
+        except FailoverError as error:
+            self._say(f"it cannot be started anew: {error}")
+            return
+        self._running = running
+
+    # --- Orders -----------------------------------------------------------------------------------------------------------
+
+    def _versions(self, _: Mapping[str, Any]) -> Any:
+        """What there is, and what was said last."""
+        shelf = self._place.store.find(self._place.name) if not self._place.directory else None
+        running = self._running
+        said = {
+            "name": self._place.name,
+            "path": self._declaration.path,
+            "active": self.version,
+            "pid": running.pid if running is not None else 0,
+            "on_trial": self._trial is not None,
+            "is_coming": self._is_coming,
+            "said": self._said,
+            "gap_ms": round(self._gap_ms, 3),
+            "enforced": list(running.hello.enforced) if running is not None else [],
+            "not_enforced": list(running.hello.not_enforced) if running is not None else [],
+            "before": self._old.source.manifest.version if self._old is not None else "",
+        }
+        return said | {"versions": msgspec.to_builtins(shelf.versions) if shelf is not None else []}
+
+    def _switch(self, body: Mapping[str, Any]) -> Any:
+        """Begin to start a version; what comes of it, ``_versions`` tells."""
+        version, directory = body.get("version"), body.get("directory")
+        if self._is_coming or self._trial is not None:
+            raise ProgramError(f"{self._place.name} is in the middle of a switch; wait until its trial is over, or roll it back")
+        if isinstance(directory, str) and self._place.directory is not None:
+            source = source_of_directory(Path(directory))
+            if source.manifest.name != self._place.name or source.manifest.path != self._declaration.path:
+                raise ProgramError(
+                    f"{directory} is {source.manifest.name} for {source.manifest.path}, and not {self._place.name}"
+                )
+            self._start(lambda: source)
+            return {"version": source.manifest.version}
+        if not isinstance(version, str) or self._place.directory is not None:
+            raise ProgramError(
+                "say which: a program that runs from a directory is switched to a directory, one of the store to a version"
+            )
+        one = version_of(self._place.store.shelf(self._place.name), version)
+        if versions.order(one.version) == versions.order(self.version or "0") and self._running is not None:
+            raise ProgramError(f"{self._place.name} {version} is active already")
+        if self.version and versions.order(one.version) < versions.order(self.version):
+            raise ProgramError(
+                f"{version} is older than {self.version}, which runs: failover program rollback {self._place.name} goes back"
+            )
+        self._start(lambda: source_of_store(self._place, one.version))
+        return {"version": one.version}
+
+    def _start(self, source: Callable[[], Source]) -> None:
+        self._is_coming, self._said = True, ""
+
+        def started() -> None:
+            try:
+                self._coming = Running(source(), lambda: self.wake())
+            except FailoverError as error:
+                self._say(f"it stays as it was: {error}")
+            except Exception as error:  # the sentence must not be lost in a thread
+                log.exception("a version could not be started")
+                self._say(f"it stays as it was: {type(error).__name__}: {error}")
+            finally:
+                self._is_coming = False
+                self.wake()
+
+        self._starter.submit(started)
+
+    def _rollback(self, body: Mapping[str, Any]) -> Any:
+        """Back to the version before, whose process still waits."""
+        old, new = self._old, self._running
+        if old is None or new is None:
+            raise ProgramError(
+                f"{self._place.name} cannot be rolled back: the version before is kept for {ROLLBACK_S} s after a switch; "
+                "send the older program as a bundle with a higher version"
+            )
+        if self._trial is not None:
+            self._fall_back("a person took it back")
+            return {"active": self.version}
+        try:
+            new.pause()
+        except FailoverError as error:
+            self._note(f"{self.version} did not let its device go: {error}")
+        if not self._began_with(old, new.state):
+            if not body.get("old_state"):
+                self._resume(new, new.state)
+                raise ProgramError(
+                    f"{old.source.manifest.version} cannot read the state of {self.version}; with --old-state it goes "
+                    "on with its own state at the switch, and what came since then is lost"
+                )
+            self._resume(old, self._switched_with)
+        self._record_anyway(lambda shelf: states.fall_back(shelf, "a person took it back"))
+        new.end()
+        self._old, self._state = None, old.state
+        self._renew(old)
+        self._say(f"{new.source.manifest.version} is rolled back by a person; {self.version} goes on")
+        self._keep()
+        return {"active": self.version}
+
+    # --- What others see --------------------------------------------------------------------------------------------------
+
+    _last: Source
+    _switched_with: Any = None
+
+    def _renew(self, running: Running) -> None:
+        """Verbs, aliases and pace are those of this version."""
+        declaration = declared(running.hello, self._declaration.path if self._place.beside else "")
+        if declaration.rate_hz != self._declaration.rate_hz:
+            self._pace = Pace(declaration.rate_hz)
+        self._declaration = declaration
+        self._meant.clear()
+        try:
+            self.renew(declaration)
+        except FailoverError as error:
+            self._note(f"its names were not told: {error}")
+
+    def _record(self, change: Callable[[Shelf], Shelf]) -> None:
+        """Change the shelf, for programs that have one.
+
+        Raises:
+            ProgramError: it cannot be written.
+        """
+        if self._place.directory is None and not self._place.beside:
+            store = self._place.store
+            try:
+                with store.locked():
+                    store.put(change(store.shelf(self._place.name)), is_lasting=False)
+            except OSError as error:
+                raise ProgramError(
+                    f"cannot write the versions of {self._place.name} in {store.place}: {error.strerror}"
+                ) from error
+            self._starter.submit(store.settle, self._place.name)  # the disk is not waited for between two messages
+
+    def _record_anyway(self, change: Callable[[Shelf], Shelf]) -> None:
+        """The same where what was done is done; a disk that is full is told."""
+        try:
+            self._record(change)
+        except ProgramError as error:
+            self._note(str(error))
+
+    def _say(self, what: str) -> None:
+        self._said = what
+        self._note(what)
+
+    def _note(self, what: str) -> None:
+        log.info("%s: %s", self._place.name, what)
+        self._place.store.log(self._place.name, what)
+
+    def close(self) -> None:
+        """End all processes; the state stays."""
+        self._starter.shutdown(wait=True)
+        if self._running is not None and self._running.lives:
+            try:
+                self._running.pause()
+                self._state = self._running.state
+            except FailoverError as error:
+                log.warning("%s", error)
+        self._number += 1
+        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
+        kept = Kept(self._number, self.version, self._state, streams)
+        try:
+            self._place.store.keep(self._declaration.path, kept, is_lasting=True)
+        except ProgramError as error:
+            log.warning("%s", error)
+        for one in (self._running, self._old, self._coming):
+            if one is not None:
+                one.end()
+
+
+def _cut(one: Stream) -> Stream:
+    answers = dict(list(one.answers.items())[-ANSWERS_KEPT:])
+    return Stream(one.boot, one.last, one.reliable, answers)

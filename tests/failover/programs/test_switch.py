@@ -1,0 +1,223 @@
+"""Versions are switched and rolled back under 20 Hz of commands from another process: each is carried out once, in order."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from failover.core.programs.states import State
+from failover.errors import BundleRefusedError, CallRefusedError, ProgramError
+from tests.failover.programs.senders import Lab, engine, switched, until
+
+LEAST = 100
+RATE_HZ = 20
+
+FAILS_THIRD = """
+Engine.calls = getattr(Engine, "calls", 0) + 1
+if Engine.calls == 3:
+    self.numbers.append(-1)
+    raise RuntimeError("the third one")
+"""
+
+
+@contextlib.contextmanager
+def sender() -> Iterator[Callable[[], list[int]]]:
+    """A process that sends 0, 1, 2 … at 20 Hz, `LEAST` at least; called, it ends and tells the answers."""
+    words = [sys.executable, "-m", "tests.failover.programs.senders", "engine", str(RATE_HZ), str(LEAST)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "begun\n"
+
+        def ended() -> list[int]:
+            found: list[int] = json.loads(process.communicate()[0])["answers"]
+            return found
+
+        try:
+            yield ended
+        finally:
+            process.kill()
+
+
+def states_of(lab: Lab) -> dict[str, str]:
+    return {one.version: str(one.state) for one in lab.store.shelf("engine").versions}
+
+
+def test_switches_under_20_hz_miss_double_and_reorder_nothing_and_keep_the_state(lab: Lab) -> None:
+    for version in ("1", "2", "3"):
+        lab.send(version)
+    lab.send("4", engine(body=FAILS_THIRD), seconds=60)
+    with lab.hosting("1"), sender() as answers, lab.proxy() as proxy:
+        for version in ("2", "3"):
+            found = switched(proxy, version)
+            assert found["active"] == version, found
+        found = switched(proxy, "4")
+        assert found["active"] == "3" and "the third one" in str(found["said"]), found
+        assert "2 commands since then once more" in str(found["said"])
+        told = answers()
+        assert len(told) >= LEAST and told == list(range(len(told))), "the sender was told about each command, once"
+        assert proxy.call("read") == told, "each was carried out once, in order, and is in the state"
+    assert states_of(lab) == {"1": "retired", "2": "retired", "3": "active", "4": "rolled back"}
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        (FAILS_THIRD, "the third one"),
+        ("Engine.calls = getattr(Engine, 'calls', 0) + 1\nif Engine.calls == 3: os._exit(3)", "has ended"),
+        (
+            "Engine.calls = getattr(Engine, 'calls', 0) + 1\nif Engine.calls == 3:\n  while True: pass",
+            "did not answer within 1 s",
+        ),
+    ],
+    ids=["raises", "exits", "hangs"],
+)
+@pytest.mark.parametrize("on_rollback", ["replay", "newest"])
+def test_a_version_that_fails_at_its_third_message_is_rolled_back(lab: Lab, body: str, words: str, on_rollback: str) -> None:
+    lab.send("1")
+    lab.send("2", engine(body=body), seconds=60, answer_s=1, on_rollback=on_rollback)
+    with lab.hosting("1") as host, lab.proxy() as proxy:
+        assert [proxy.call("step", number=number) for number in range(3)] == [0, 1, 2]
+        proxy.call("_switch", {"version": "2"})
+        until(proxy, lambda found: found["active"] == "2")
+        assert [proxy.call("step", number=number, timeout=60) for number in range(3, 8)] == [3, 4, 5, 6, 7]
+        assert proxy.call("read") == list(range(8))
+        found = proxy.call("_versions")
+        assert found["active"] == "1" and words in found["said"]
+        assert ("with the state of 2" in found["said"]) == (on_rollback == "newest")
+        assert states_of(lab) == {"1": "active", "2": "rolled back"}
+        assert host.service.record.versions == ("1",)
+
+
+def test_the_new_version_reads_the_old_ones_state_by_its_migration(lab: Lab) -> None:
+    terms = "version=2, migrations={1: lambda state: {'told': [n * 10 for n in state['numbers']]}}"
+    lab.send("1")
+    lab.send("2", engine(kept="told: list[int] = failover.kept(default=[])", numbers="told", terms=terms), seconds=0)
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("step", number=1)
+        assert switched(proxy, "2")["active"] == "2"
+        proxy.call("step", number=2)
+        assert proxy.call("read") == [10, 2]
+        with pytest.raises(CallRefusedError, match="cannot read the state of 2"):
+            proxy.call("_rollback")
+        assert proxy.call("read") == [10, 2], "a rollback that cannot be leaves all as it was"
+        assert proxy.call("_rollback", {"old_state": True}) == {"active": "1"}
+        assert proxy.call("read") == [1]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("raise ImportError('nothing such')", "ImportError: nothing such"),
+        ("Engine = 3", "has no class Engine"),
+        ("import os; os._exit(1)", "has ended"),
+        (engine().replace("Lab/robot1/Engine", "Lab/robot1/Other"), "speaks for Lab/robot1/Other"),
+        (engine(kept="numbers: list[str] = failover.kept(default=[])"), "numbers"),
+        (engine(kept="numbers: list[int] = failover.kept(default=[])\n    def __init__(self): 1 / 0"), "ZeroDivisionError"),
+    ],
+    ids=["import", "class", "exit", "path", "state", "init"],
+)
+def test_a_version_that_cannot_begin_leaves_the_old_one_as_it_was(lab: Lab, text: str, words: str) -> None:
+    lab.send("1")
+    lab.send("2", text)
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("step", number=7)
+        found = switched(proxy, "2")
+        assert found["active"] == "1" and words in str(found["said"]), found
+        assert proxy.call("step", number=8) == 8 and proxy.call("read") == [7, 8]
+    assert states_of(lab) == {"1": "active", "2": "staged"}
+
+
+def test_a_health_query_that_fails_rolls_back_and_one_that_answers_commits(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2", engine(extra="raise RuntimeError('no wings')"), query="fly")
+    lab.send("3", engine(), query="fly", messages=2)
+    with lab.hosting("1"), lab.proxy() as proxy:
+        found = switched(proxy, "2")
+        assert found["active"] == "1" and "no wings" in str(found["said"])
+        proxy.call("_switch", {"version": "3"})
+        assert until(proxy, lambda found: found["active"] == "3")["on_trial"], "it has carried out no message yet"
+        assert [proxy.call("step", number=number) for number in range(2)] == [0, 1]
+        until(proxy, lambda found: not found["on_trial"])
+        shelf = lab.store.shelf("engine")
+        assert shelf.floor == "3" and shelf.active is not None and shelf.active.is_committed
+
+
+def test_mailbox_and_state_outlive_the_host_and_its_version(lab: Lab) -> None:
+    lab.send("1")
+    with lab.hosting() as host, lab.proxy() as proxy:
+        assert [proxy.call("step", number=number) for number in range(3)] == [0, 1, 2]
+        host.actor._running._process.kill()  # type: ignore[union-attr]
+        assert proxy.call("step", number=3, timeout=60) == 3
+        assert proxy.call("read", timeout=60) == [0, 1, 2, 3]
+    with lab.hosting() as host, lab.proxy() as proxy:
+        assert proxy.call("read") == [0, 1, 2, 3]
+
+
+def test_a_host_that_ends_during_a_trial_goes_back(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2", seconds=600)
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("step", number=1)
+        proxy.call("_switch", {"version": "2"})
+        until(proxy, lambda found: found["active"] == "2")
+        proxy.call("step", number=2)
+    with lab.hosting(), lab.proxy() as proxy:
+        assert proxy.call("_versions")["active"] == "1" and proxy.call("read") == [1, 2]
+    assert states_of(lab) == {"1": "active", "2": "rolled back"}
+
+
+def test_two_versions_run_side_by_side_under_two_names(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2", engine(body="number = number * 2"))
+    with lab.hosting("1"), lab.hosting("2", beside=True), lab.proxy() as one, lab.proxy("Lab/robot1/Engine@2") as two:
+        assert one.call("step", number=5) == 5 and two.call("step", number=5) == 10
+        assert one.call("read") == [5] and two.call("read") == [10]
+
+
+def test_the_right_counts_when_a_version_becomes_active_and_not_only_when_it_came(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2")
+    with lab.hosting("1"), lab.proxy() as proxy:
+        (lab.team / "rights.toml").write_text("")
+        found = switched(proxy, "2")
+        assert found["active"] == "1" and "may not program" in str(found["said"]), found
+        lab.trust(until="2020-01-01")
+        assert "expired on 2020-01-01" in str(switched(proxy, "2")["said"])
+    with pytest.raises(BundleRefusedError, match="expired"), lab.hosting():
+        raise AssertionError("it must not start")
+
+
+def test_files_that_were_changed_after_they_came_do_not_run(lab: Lab) -> None:
+    digest = lab.send("1").digest
+    path = lab.store.tree(digest) / "engine.py"
+    path.chmod(0o644)
+    path.write_text("raise SystemExit")
+    with pytest.raises(ProgramError, match="was changed since it was unpacked"), lab.hosting():
+        raise AssertionError("it must not start")
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({}, "say which"),
+        ({"version": "9"}, "is not here, but 1, 2"),
+        ({"version": "x"}, "is no version"),
+        ({"version": "2"}, "active already"),
+        ({"version": "1"}, "is older than 2"),
+        ({"directory": "/"}, "say which"),
+    ],
+)
+def test_an_order_that_cannot_be_is_refused_with_a_sentence(lab: Lab, body: dict[str, str], words: str) -> None:
+    lab.send("1")
+    lab.send("2")
+    with lab.hosting("2"), lab.proxy() as proxy:
+        with pytest.raises(CallRefusedError, match=words):
+            proxy.call("_switch", body)
+        with pytest.raises(CallRefusedError, match="cannot be rolled back"):
+            proxy.call("_rollback")
+        assert proxy.call("_versions")["active"] == "2"
+    assert lab.store.shelf("engine").versions[0].state is State.STAGED
