@@ -5,7 +5,7 @@ Drivers of one user on one robot meet in a directory that only this user may ent
 
 ======================== ============================================================================
 ``Lab.robot1.PWM.lock``  held by the driver's process as long as it lives; holds its pid
-``Lab.robot1.PWM.ipc``   ZeroMQ: messages, each one frame
+``Lab.robot1.PWM.calls`` a stream of messages, each after its size in four bytes
 ``Lab.robot1.PWM.hand``  a stream of JSON objects, as ``nc -U`` writes them
 ``Lab.robot1.PWM.names`` datagrams of its name service
 ======================== ============================================================================

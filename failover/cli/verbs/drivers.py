@@ -15,10 +15,9 @@ from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.clocks import Bounds, ClockPair, Part, parts
 from failover.core.messaging.envelope import MESSAGE_SIZE_MAX, Envelope, Hop
 from failover.core.naming.tree import Place, Reach, Tree, robot_of
-from failover.drivers import sockets
 from failover.drivers.here import Here, here
 from failover.drivers.lookup import lookup, whole_tree
-from failover.drivers.proxy import Proxy, address_of
+from failover.drivers.proxy import Proxy, address_of, way_to
 from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError, RequestError
 
 EXCHANGES: Final = 8
@@ -84,14 +83,13 @@ def _exchanged(here: Here, place: Place, content: bytes, timeout_s: float) -> by
     Raises:
         NoAnswerError: there is none.
     """
-    context = sockets.context()
     timeout_ns = round(timeout_s * 1e9)
+    way = way_to(here, address_of(here, place), place.robot)
     try:
-        way = sockets.connect(context, address_of(here, place), here, place.robot)
-        if sockets.await_sent(way, content, timeout_ns) and (answer := sockets.await_message(way, timeout_ns)) is not None:
+        if way.await_sent(content, timeout_ns) and (answer := way.await_message(timeout_ns)) is not None:
             return answer
     finally:
-        sockets.close(context)
+        way.close()
     raise NoAnswerError(f"{place.record.path} did not answer within {timeout_s:g} s; it may still carry the message out")
 
 

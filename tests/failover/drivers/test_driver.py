@@ -98,6 +98,25 @@ def test_messages_of_one_sender_are_handled_in_order_while_others_send(engine: S
     assert [-value for value in heard if value < 0] == [number / 100 for number in range(1, 101)]
 
 
+def test_a_large_message_and_a_large_answer_come_whole(engine: Serving, here: Here) -> None:
+    from failover.core.messaging.envelope import Envelope, decode, encode
+    from failover.drivers.proxy import way_to
+
+    way = way_to(here, engine.service.record.addresses[0], "robot1")
+    asked = Envelope(to="engine", verb="read", id="1", sender="test", rest={"note": "x" * 900_000})
+    assert way.await_sent(encode(asked), 10**9)
+    answer = way.await_message(LIMIT_S * 10**9)
+    assert answer is not None and decode(answer).ok == {"duty": 0.0}
+    too_large = (1 << 21).to_bytes(4, "big")
+    with socket.socket(socket.AF_UNIX) as raw:
+        raw.settimeout(LIMIT_S)
+        raw.connect(str(here.file(ENGINE, "calls")))
+        raw.sendall(too_large)
+        assert raw.recv(1) == b""  # and the driver goes on
+    assert way.await_sent(encode(asked), 10**9) and way.await_message(LIMIT_S * 10**9) is not None
+    way.close()
+
+
 # --- By hand ---------------------------------------------------------------------------------------------------------
 
 
@@ -189,7 +208,7 @@ def test_drivers_find_each_other_by_the_scan_alone(here: Here) -> None:
         until(lambda: "engine" in str(resolved(arm, "engine")) and resolved(engine, "arm"))
         assert resolved(arm, "engine").record.path == ENGINE
         assert [place.record.path for place in whole_tree(here).under()] == ["Lab/Robotino/Arm", ENGINE]
-    assert list(here.directory.glob("*.names")) == list(here.directory.glob("*.ipc")) == list(here.directory.glob("*.hand")) == []
+    assert [path.name for path in here.directory.iterdir() if path.suffix in (".names", ".calls", ".hand")] == []
 
 
 def resolved(one: Serving, name: str) -> Any:
@@ -250,7 +269,7 @@ def process() -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as one:
         try:
             assert one.stderr is not None
-            assert "takes messages at ipc://" in one.stderr.readline()
+            assert "takes messages at local://" in one.stderr.readline()
             assert "only programs of this user on robot1 reach it" in one.stderr.readline()
             yield one
         finally:
