@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from msgspec import UNSET, Struct
@@ -24,6 +24,9 @@ from failover.core.naming import names
 from failover.core.naming.names import Kind
 from failover.drivers.declare import Declaration, Verb
 from failover.errors import EnvelopeError, NameFormatError
+
+if TYPE_CHECKING:
+    from failover.drivers.keeping import Keeping
 
 PATHS_MAX: Final = 4_096
 """Messages whose way is remembered, for ``failover path``."""
@@ -53,15 +56,17 @@ class Subscriber(Struct):
 class Actor:
     """One driver: its mailbox, its pace, its streams. Every instant is an argument."""
 
-    def __init__(self, instance: object, declaration: Declaration, who: str) -> None:
+    def __init__(self, instance: object, declaration: Declaration, who: str, keeping: Keeping | None = None) -> None:
         """
         Args:
             who: of this process in hops: ``robot1/NAME``.
+            keeping: of a driver that keeps attributes.
         """
         self._instance = instance
         self._declaration = declaration
         self._who = who
-        self._mailbox = Mailbox()
+        self._keeping = keeping
+        self._mailbox = keeping.mailbox if keeping is not None else Mailbox()
         self._pace = Pace(declaration.rate_hz)
         self._paths: OrderedDict[str, tuple[Hop, ...]] = OrderedDict()
         self._meant: dict[str, bool] = {}
@@ -116,7 +121,9 @@ class Actor:
     def wait_ns(self, now_ns: int) -> int | None:
         """How long until something is to be done although nothing comes; 0: at once; None: for ever."""
         waits = [max(sample_ns - now_ns, 0) for sample_ns in self._samples_ns.values()]
-        if (first := self._mailbox.first()) is not None:
+        if self._keeping is not None and (again_ns := self._keeping.wait_ns()) is not None:
+            waits.append(again_ns)
+        if (first := self._mailbox.first()) is not None and not self._mailbox.is_ahead:
             waits.append(self._pace.wait_ns(now_ns) if self._is_paced(first) else 0)
         return min(waits, default=None)
 
@@ -128,11 +135,22 @@ class Actor:
         """Carry out the next message, if there is one and it is its turn; answers that leave now."""
         now_ns = clock()
         first = self._mailbox.first()
-        if first is None or (self._is_paced(first) and self._pace.wait_ns(now_ns)):
-            return []
+        is_turn = first is not None and not (self._is_paced(first) and self._pace.wait_ns(now_ns))
+        if self._keeping is None:
+            if not is_turn:
+                return []
+            self._handle(now_ns, clock)
+            return self._mailbox.committed()
+        if is_turn and not self._mailbox.is_ahead:
+            with self._keeping.message():
+                self._handle(now_ns, clock)
+        handled = self._keeping.safe()
+        return [] if handled is None else self._mailbox.committed(handled)
+
+    def _handle(self, now_ns: int, clock: Callable[[], int]) -> None:
         message = self._mailbox.take(now_ns)
         if message is None:
-            return self._mailbox.committed()
+            return
         run = [message]
         if self._is_paced(message):
             self._pace.begun(now_ns)
@@ -144,7 +162,6 @@ class Actor:
         for replaced in run[:-1]:
             self._done(replaced, _as_merged(replaced, said), left_ns)
         self._done(run[-1], said, left_ns)
-        return self._mailbox.committed()
 
     def _done(self, message: Envelope, said: Envelope, left_ns: int) -> None:
         hops = envelopes.left_hops(message, left_ns)

@@ -29,7 +29,7 @@ from msgspec import Struct
 from failover.core.messaging.pacing import Coalesce
 from failover.core.naming import names
 from failover.errors import DriverError, NameFormatError
-from failover.kept_state.component import DECLARED, RUNNER, kept_of
+from failover.kept_state.component import DECLARED, RUNNER
 
 C = TypeVar("C")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -68,13 +68,15 @@ class Verb(Struct, frozen=True):
 
 
 class Declaration(Struct, frozen=True):
-    """What `driver` was told about a class."""
+    """What `driver` was told about a class. ``version``, ``migrations``: of the kept state, as of `failover.component`."""
 
     path: str
     aliases: tuple[str, ...]
     rate_hz: float | None
     verbs: Mapping[str, Verb]
     labels: Mapping[str, str]
+    version: int = 1
+    migrations: Mapping[int, Callable[[Any], Any]] | None = None
 
     def schemas(self) -> dict[str, Any]:
         """Verb → role, and the JSON schema of its arguments, for the record."""
@@ -126,14 +128,17 @@ def driver(
     alias: str | tuple[str, ...] = (),
     rate_hz: float | None = None,
     labels: Mapping[str, str] | None = None,
+    version: int = 1,
+    migrations: Mapping[int, Callable[[Any], Any]] | None = None,
 ) -> Callable[[type[C]], type[C]]:
-    """Declare a class that speaks for one device; `failover.run` runs it.
+    """Declare a class that speaks for one device; `failover.run` runs it. Attributes that are `failover.kept` survive.
 
     Args:
         path: where the device is in the team's tree of names: ``University/Lab/Robotino/Engines/3/PWM``.
         alias: one free text or several by which it may be called, too.
         rate_hz: the most commands a second that the device takes; None: as many as come.
         labels: whatever others may want to know.
+        version, migrations: of the kept attributes, as of `failover.component`.
 
     Raises:
         DriverError: the class or an argument cannot work.
@@ -149,14 +154,14 @@ def driver(
     def declared(chosen: type[C]) -> type[C]:
         if not isinstance(chosen, type):
             raise DriverError(f"@failover.driver is above {chosen!r}, which is no class")
-        if hasattr(chosen, DECLARED) or kept_of(chosen):
+        if hasattr(chosen, DECLARED):
             raise DriverError(
-                f"{chosen.__name__} keeps attributes (failover.kept), and a driver keeps none yet: what it knows ends with it"
+                f"{chosen.__name__} is a component (failover.component) already: declare a class for each of the two"
             )
         verbs = _verbs(chosen)
         if not verbs:
             raise DriverError(f"{chosen.__name__} has no verb: write @failover.command or @failover.query above a method")
-        setattr(chosen, DRIVER, Declaration(normal, aliases, rate_hz, verbs, dict(labels or {})))
+        setattr(chosen, DRIVER, Declaration(normal, aliases, rate_hz, verbs, dict(labels or {}), version, migrations))
         setattr(chosen, RUNNER, "failover.drivers.server:run")
         return chosen
 

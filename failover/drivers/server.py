@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import msgspec
 from msgspec import Struct
 
 from failover.boards import boottime
@@ -30,9 +31,11 @@ from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
 from failover.errors import EnvelopeError
+from failover.kept_state.component import kept_of
 
 if TYPE_CHECKING:
     from failover.drivers import sockets
+    from failover.drivers.keeping import Keeping
 
 T = TypeVar("T")
 
@@ -122,6 +125,7 @@ class Serving:
         self._numbers = 0
         self._is_over = False
         with contextlib.ExitStack() as stack:
+            self._keeping = self._begin(cls, declaration, stack)
             lock = hold(self.here, declaration.path)
             stack.callback(os.close, lock)
             self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -129,10 +133,23 @@ class Serving:
             self._open(declaration, stack)
             self.service = NameService(self.here, self._record(declaration), terms)
             stack.callback(self.service.close)
-            self.instance = cls()
-            self._actor = Actor(self.instance, declaration, f"{self.here.robot}/{self._name}")
+            self.instance = cls() if self._keeping is None else self._keeping.instance
+            self._actor = Actor(self.instance, declaration, f"{self.here.robot}/{self._name}", self._keeping)
+            if self._keeping is not None:
+                self._wait_for(self._keeping.fileno(), _nothing)  # the loop looks at it in each turn
+                self._keeping.resumed()
             self.service.start()
             self._stack = stack.pop_all()
+
+    def _begin(self, cls: type, declaration: Declaration, stack: contextlib.ExitStack) -> Keeping | None:
+        """The kept state, if there is one: before anything is opened, as a warm driver on a standby waits here."""
+        if not kept_of(cls):
+            return None
+        from failover.drivers.keeping import Keeping
+
+        keeping = Keeping(cls, declaration)
+        stack.callback(keeping.close)
+        return keeping
 
     def _open(self, declaration: Declaration, stack: contextlib.ExitStack) -> None:
         path = declaration.path
@@ -175,12 +192,13 @@ class Serving:
             addresses=tuple(self._addresses),
             aliases=declaration.aliases,
             verbs=declaration.schemas(),
+            epoch=0 if self._keeping is None else self._keeping.epoch,
             labels=dict(declaration.labels),
         )
         if len(pack(record)) <= BODY_SIZE_MAX:
             return record
         verbs: dict[str, Any] = {name: {"role": verb.marked.role} for name, verb in declaration.verbs.items()}
-        return Record(record.path, addresses=record.addresses, aliases=record.aliases, verbs=verbs, labels=record.labels)
+        return msgspec.structs.replace(record, verbs=verbs)
 
     def addresses_told(self) -> list[str]:
         """For the person who started it: where it takes messages, and whether other robots reach it."""
@@ -377,6 +395,10 @@ class Serving:
         typing = self._hands.pop(hand)
         self._close(hand.descriptor)
         typing.connection.close()
+
+
+def _nothing() -> None:
+    """What a descriptor tells that only wakes the loop."""
 
 
 @contextlib.contextmanager

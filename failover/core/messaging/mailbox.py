@@ -32,7 +32,7 @@ import msgspec
 from msgspec import Struct
 
 from failover.core.messaging.envelope import Envelope, refusal
-from failover.errors import MailboxFullError
+from failover.errors import EnvelopeError, MailboxFullError
 
 MAILBOX_MAX: Final = 1_024
 """Messages that wait: a driver of 20 Hz is a minute behind."""
@@ -201,6 +201,22 @@ class Stream(Struct):
     answers: dict[int, Envelope] = {}
 
 
+_pack: Final = msgspec.msgpack.Encoder().encode
+_streams: Final = msgspec.msgpack.Decoder(list[tuple[str, Stream]])
+
+
+def unpacked(content: bytes) -> dict[str, Stream]:
+    """What `Mailbox.packed` has written; b"": nothing.
+
+    Raises:
+        EnvelopeError: it is damaged.
+    """
+    try:
+        return dict(_streams.decode(content)) if content else {}
+    except msgspec.DecodeError as error:
+        raise EnvelopeError(f"the kept mailbox is damaged: {error}") from error
+
+
 class Taken(Struct):
     """Up to where messages of one sender's life were taken into the mailbox; lost with the process. ``held``: came too early."""
 
@@ -227,7 +243,10 @@ class Mailbox:
         self._taken = {sender: Taken(one.boot, one.last, one.reliable) for sender, one in self._streams.items()}
         self._queue: deque[Arrived] = deque()
         self._held = 0
-        self._answers: list[Envelope] = []
+        self._answers: deque[Envelope] = deque()
+        self._packed: dict[str, bytes] = {}
+        self.handled = 0
+        """Messages told `done` so far."""
         self._free = {sender: one.reliable for sender, one in self._streams.items()}
 
     def __len__(self) -> int:
@@ -236,6 +255,18 @@ class Mailbox:
     def kept(self) -> dict[str, Stream]:
         """What must be kept with the effects of the messages that are done."""
         return {sender: Stream(one.boot, one.last, one.reliable, dict(one.answers)) for sender, one in self._streams.items()}
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether so many answers wait for a commit that no more should be handled before."""
+        return len(self._answers) >= MAILBOX_MAX
+
+    def packed(self) -> bytes:
+        """`kept` as bytes; only senders of which something was done since the last time are encoded anew."""
+        for sender, stream in self._streams.items():
+            if sender not in self._packed:
+                self._packed[sender] = _pack((sender, stream))
+        return b"\xdd" + len(self._streams).to_bytes(4, "big") + b"".join(self._packed[sender] for sender in self._streams)
 
     # --- A message arrives ------------------------------------------------------------------------------------------------
 
@@ -321,6 +352,7 @@ class Mailbox:
     def done(self, envelope: Envelope, answer: Envelope) -> None:
         """A message was handled, with this answer; it leaves after the next `committed`."""
         self._answers.append(answer)
+        self.handled += 1
         if not envelope.seq or not envelope.sender:
             return
         stream = self._streams.get(envelope.sender)
@@ -328,22 +360,27 @@ class Mailbox:
             stream = self._streams[envelope.sender] = Stream(envelope.boot, answers={})
             self._free.pop(envelope.sender, None)
         self._streams.move_to_end(envelope.sender)
+        self._packed.pop(envelope.sender, None)
         if envelope.boot == stream.boot:
             stream.last = envelope.seq
             if envelope.reliable:
                 stream.reliable = envelope.seq
+                if not envelope.after:
+                    stream.answers.clear()  # the sender has had them all
                 stream.answers[envelope.seq] = answer
                 if len(stream.answers) > WINDOW:
                     del stream.answers[next(iter(stream.answers))]
         if len(self._streams) > SENDERS_MAX:
             sender, _ = self._streams.popitem(last=False)
             self._free.pop(sender, None)
+            self._packed.pop(sender, None)
             taken = self._taken.pop(sender, None)
             self._held -= len(taken.held) if taken is not None else 0
 
-    def committed(self) -> list[Envelope]:
-        """All that is done is kept: the answers that may leave now."""
-        answers, self._answers = self._answers, []
+    def committed(self, handled: int | None = None) -> list[Envelope]:
+        """All that is done is kept, or so many as were `handled` once: the answers that may leave now."""
+        count = len(self._answers) - (0 if handled is None else self.handled - handled)
+        answers = [self._answers.popleft() for _ in range(max(count, 0))]
         for answer in answers:
             stream = self._streams.get(answer.to)
             if stream is not None and stream.boot == answer.boot and answer.seq in stream.answers:

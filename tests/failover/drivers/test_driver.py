@@ -320,16 +320,6 @@ def test_what_cannot_be_a_driver_is_refused_when_it_is_declared() -> None:
             declared(**arguments)
     with pytest.raises(DriverError, match="has no verb"):
         failover.driver("a/b")(type("Empty", (), {}))
-    with pytest.raises(DriverError, match="keeps none yet"):
-
-        @failover.driver("a/b")
-        class Keeping:
-            duty = failover.kept(default=0.0)
-
-            @failover.query
-            def read(self) -> float:
-                return self.duty
-
     with pytest.raises(DriverError, match="cannot be in a message"):
 
         @failover.driver("a/b")
