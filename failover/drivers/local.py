@@ -125,12 +125,18 @@ def listen(path: Path) -> socket.socket:
     return listening
 
 
+def uid_of(end: socket.socket) -> int:
+    """The user at the other end, as the kernel says."""
+    _, uid, _ = _CREDENTIALS.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return int(uid)
+
+
 class Connection:
     """One program that is connected. ``uid``: its user, as the kernel says."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
-        _, self.uid, _ = _CREDENTIALS.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+        self.uid = uid_of(end)
         self.descriptor = end.fileno()
         self._end = end
         self._framed = Framed()

@@ -24,6 +24,7 @@ import msgspec
 from msgspec import UNSET
 
 from failover.boards import boottime
+from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope, Hop
 from failover.core.messaging.mailbox import MS, RESEND_FIRST_NS, Outbox
@@ -72,6 +73,7 @@ class Proxy:
         """The newest answer, with its hops."""
         program = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python").stem
         self.sender = f"{here.robot}/{program}-{os.getpid()}-{next(_NUMBERS)}"
+        self._by = accounts.name_of(os.geteuid()) if place.robot != here.robot else ""
         self._outbox = Outbox(self.sender, new_boot())
         self._lock = threading.Lock()
         self._skew = boottime.skew_ns()
@@ -113,7 +115,9 @@ class Proxy:
             EnvelopeError: no message can say this body.
             MailboxFullError: too many earlier calls have had no answer.
         """
-        envelope = Envelope(to=self.path, verb=verb, body=self._body(body, fields), reliable=True, deadline_ms=timeout * 1_000)
+        envelope = Envelope(
+            to=self.path, verb=verb, body=self._body(body, fields), by=self._by, reliable=True, deadline_ms=timeout * 1_000
+        )
         with self._lock:
             answer = self._answered(envelope, round(timeout * SECOND_NS))
         self.last = answer
@@ -189,7 +193,9 @@ class Proxy:
         if self.call("_describe")["verbs"].get(name, {}).get("role") != "stream":
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
         way = way_to(self.here, self._address, self.place.robot)
-        asked = Envelope(to=self.path, verb="_subscribe", body={"stream": name}, sender=f"{self.sender}-{next(_NUMBERS)}")
+        asked = Envelope(
+            to=self.path, verb="_subscribe", body={"stream": name}, sender=f"{self.sender}-{next(_NUMBERS)}", by=self._by
+        )
         again_ns = self.now_ns()
         try:
             while True:
@@ -199,7 +205,10 @@ class Proxy:
                 content = way.await_message(max(again_ns - now_ns, MS))
                 again_ns = 0 if way.is_lost else again_ns
                 value = _decoded(content) if content is not None else None
-                if value is None or value.verb != name:
+                if value is None:
+                    continue
+                is_denied = value.error is not UNSET and value.error.kind == "denied"
+                if value.verb != name and not is_denied:
                     continue
                 if value.error is not UNSET:
                     raise CallRefusedError(value.error.sentence, value.error.kind)

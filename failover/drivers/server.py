@@ -27,6 +27,7 @@ from failover.core.naming.tables import BODY_SIZE_MAX
 from failover.core.naming.tree import robot_of
 from failover.drivers import local
 from failover.drivers.actor import Actor, Whose
+from failover.drivers.call_rights import CallRights
 from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
@@ -60,17 +61,19 @@ class Peer(Struct, frozen=True):
 
 
 class Near(Struct, frozen=True):
-    """One of this robot, by the descriptor of its connection."""
+    """One of this robot, by the descriptor of its connection. ``uid``: its user, as the kernel says."""
 
     descriptor: int
     number: int
+    uid: int
 
 
 class Hand(Struct, frozen=True):
-    """One who types into a connection, by its descriptor."""
+    """One who types into a connection, by its descriptor. ``uid``: its user."""
 
     descriptor: int
     number: int
+    uid: int
 
 
 class Typing(Struct):
@@ -119,6 +122,7 @@ class Serving:
         self.here = place or here()
         self._name = stem(declaration.path, self.here.directory)
         self._skew = boottime.skew_ns()
+        self._rights = CallRights(self.here.rules, declaration.path)
         self._hands: dict[Hand, Typing] = {}
         self._near: dict[Near, local.Connection] = {}
         self._readers: dict[int, Callable[[], None]] = {}
@@ -271,7 +275,7 @@ class Serving:
                 return
             self._numbers += 1
             connection = local.Connection(end)
-            near = Near(connection.descriptor, self._numbers)
+            near = Near(connection.descriptor, self._numbers, connection.uid)
             self._near[near] = connection
             self._wait_for(connection.descriptor, functools.partial(self._read_near, near, connection))
 
@@ -293,7 +297,7 @@ class Serving:
         del self._readers[descriptor]
         self._poller.remove(descriptor)
 
-    def _came(self, content: bytes, whose: Whose, robot: str | None) -> None:
+    def _came(self, content: bytes, whose: Near | Hand | Peer, robot: str | None) -> None:
         """One message. ``robot``: which its key proves; None: it came from this robot."""
         now_ns = self.now_ns()
         try:
@@ -307,6 +311,12 @@ class Serving:
                 envelopes.refusal(envelope, "wrong_sender", f"{envelope.sender!r} is no process of {robot}, whose key this is"),
             )
             return
+        uid = None if isinstance(whose, Peer) else whose.uid
+        if not envelope.verb.startswith("_") or envelope.verb == "_subscribe":
+            denied = self._rights.refusal(uid, robot, envelope.by)
+            if denied:
+                self._publish(whose, envelopes.refusal(envelope, "denied", denied))
+                return
         self._send(self._actor.came(envelope, whose, now_ns))
 
     def _send(self, answers: list[Envelope]) -> None:
@@ -341,7 +351,7 @@ class Serving:
                 return
             connection.setblocking(False)
             self._numbers += 1
-            hand = Hand(connection.fileno(), self._numbers)
+            hand = Hand(connection.fileno(), self._numbers, local.uid_of(connection))
             self._hands[hand] = Typing(connection, Typed(), bytearray())
             self._wait_for(hand.descriptor, functools.partial(self._read_hand, hand))
 
