@@ -451,6 +451,14 @@ def send(room: argparse.ArgumentParser) -> None:
     _json(room)
 
 
+def graph(room: argparse.ArgumentParser) -> None:
+    """Of ``failover graph``."""
+    room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
+    room.add_argument("--every-ms", metavar="MS", type=positive, default=2_000, help="with --watch (default: 2000)")
+    room.add_argument("--dot", action="store_true", help="print a graph for Graphviz")
+    _json(room)
+
+
 def path(room: argparse.ArgumentParser) -> None:
     """Of ``failover path``."""
     room.add_argument("id", metavar="ID", help="of the message, as failover call --json prints it")

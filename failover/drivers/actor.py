@@ -2,7 +2,7 @@
 
     came → mailbox → (paced) → method → answer
 
-A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_path`` where a message spent its time here,
+A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_graph`` who has called, ``_path`` where a message spent its time here,
 ``_subscribe`` and ``_unsubscribe`` begin and end a stream.
 """
 
@@ -20,6 +20,7 @@ from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope, Hop, answer, refusal
 from failover.core.messaging.mailbox import SENDERS_MAX, Mailbox
 from failover.core.messaging.pacing import SECOND, Pace, merged
+from failover.core.messaging.traffic import Traffic
 from failover.core.naming import names
 from failover.core.naming.names import Kind
 from failover.drivers.declare import Declaration, Verb
@@ -74,14 +75,16 @@ class Actor:
         self._samples_ns: dict[str, int] = {}
         self._own: Mapping[str, Callable[[Envelope, int], Any]] = {
             "_describe": self._describe,
+            "_graph": self._graph,
             "_path": self._path,
             "_subscribe": self._subscribe,
             "_unsubscribe": self._unsubscribe,
         }
+        self._traffic = Traffic()
         self._routes: OrderedDict[str, Whose] = OrderedDict()
 
-    def came(self, envelope: Envelope, whose: Whose, now_ns: int) -> list[Envelope]:
-        """Take in a message; answers that leave at once."""
+    def came(self, envelope: Envelope, whose: Whose, now_ns: int, size: int = 0) -> list[Envelope]:
+        """Take in a message of so many bytes; answers that leave at once."""
         if not envelope.sender:
             envelope = msgspec.structs.replace(envelope, sender=f"by-hand-{hash(whose) & 0xFFFFFFFF:08x}")
         self._routes[envelope.sender] = whose
@@ -94,6 +97,8 @@ class Actor:
             envelope = envelopes.came(envelope, self._who, now_ns)
         except EnvelopeError as error:
             return [refusal(envelope, "circle", str(error))]
+        if envelope.verb not in self._own:
+            self._traffic.came(envelope.sender, envelope.verb, size, now_ns)
         return self._mailbox.arrived(envelope, now_ns)
 
     def route(self, sender: str) -> Whose | None:
@@ -165,6 +170,9 @@ class Actor:
 
     def _done(self, message: Envelope, said: Envelope, left_ns: int) -> None:
         hops = envelopes.left_hops(message, left_ns)
+        if message.verb not in self._own:
+            took_ns = left_ns - message.hops[-1].came_ns
+            self._traffic.done(message.sender, message.verb, took_ns, left_ns, is_error=said.error is not UNSET)
         if message.id:
             self._paths[message.id] = hops
             if len(self._paths) > PATHS_MAX:
@@ -200,6 +208,9 @@ class Actor:
 
     def _describe(self, _: Envelope, __: int) -> Any:
         return {"path": self._declaration.path, "aliases": list(self._declaration.aliases), "verbs": self._declaration.schemas()}
+
+    def _graph(self, _: Envelope, now_ns: int) -> Any:
+        return self._traffic.rows(now_ns)
 
     def _path(self, message: Envelope, _: int) -> Any:
         """The hops of a message that was carried out; None: this driver does not remember it."""

@@ -317,7 +317,7 @@ class Serving:
             if denied:
                 self._publish(whose, envelopes.refusal(envelope, "denied", denied))
                 return
-        self._send(self._actor.came(envelope, whose, now_ns))
+        self._send(self._actor.came(envelope, whose, now_ns, len(content)))
 
     def _send(self, answers: list[Envelope]) -> None:
         for one in answers:

@@ -1,15 +1,18 @@
-"""names, call, send, path: who answers to which name, and messages to drivers by hand."""
+"""names, call, send, path, graph: who answers to which name, and messages to drivers by hand."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
+import time
 from collections import defaultdict
 from typing import Any, Final
 
 import msgspec
 
+from failover.cli.output import graph as graph_output
 from failover.cli.output import names_tree, render
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.clocks import Bounds, ClockPair, Part, parts
@@ -101,6 +104,40 @@ def _json(text: str, what: str) -> Any:
 
 
 # --- The way of a message --------------------------------------------------------------------------------------------
+
+
+def graph(arguments: argparse.Namespace) -> int:
+    """Who has talked to whom in the last hour; with --watch again and again until Ctrl-C."""
+    place = here()
+    with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
+        while True:
+            edges, silent = _edges(place, whole_tree(place))
+            if arguments.json:
+                render.as_json({"edges": edges, "silent": silent})
+            elif arguments.dot:
+                print(render.spoken(graph_output.dot(edges)), flush=True)
+            else:
+                told = f"; no answer from {', '.join(silent)}" if silent else ""
+                draw(graph_output.COLUMNS, graph_output.rows(edges), f"{len(edges)} edges in the last hour{told}")
+            if not arguments.watch:
+                return 1 if silent else 0
+            time.sleep(arguments.every_ms / 1_000)
+    return 0  # Ctrl-C ended the watch
+
+
+def _edges(here: Here, tree: Tree) -> tuple[list[dict[str, Any]], list[str]]:
+    """All edges, the busiest first; and the drivers that did not tell theirs."""
+    found: list[dict[str, Any]] = []
+    silent: list[str] = []
+    for place in _live(tree):
+        try:
+            with Proxy(here, place) as driver:
+                rows = driver.call("_graph", timeout=ASK_S)
+        except (NoAnswerError, CallRefusedError, DriverError):
+            silent.append(place.record.path)
+            continue
+        found += [{"from": row["from"], "to": place.record.path} | row for row in rows]
+    return sorted(found, key=lambda row: (-row["count"], row["from"], row["to"], row["verb"])), silent
 
 
 def path(arguments: argparse.Namespace) -> int:

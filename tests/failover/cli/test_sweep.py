@@ -32,7 +32,7 @@ TASKS = (
     *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
 )
 RIGHTS = (["list"], ["why", "root", "see", "/x"])
-DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"])
+DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"], ["graph"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
