@@ -2,8 +2,8 @@
 
     came → mailbox → (paced) → method → answer
 
-A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_graph`` who has called, ``_path`` where a message spent its time here,
-``_subscribe`` and ``_unsubscribe`` begin and end a stream.
+A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_graph`` who has called, ``_path`` where a
+message spent its time here, ``_subscribe`` and ``_unsubscribe`` begin and end a stream.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 No thread carries them: a call is one ``send`` and one ``recv`` on each side. The kernel says which user is at the other end.
 
-Source: unix(7), SO_PEERCRED; epoll(7); socket(7), SO_RCVTIMEO.
+Source: unix(7), SO_PEERCRED; epoll(7); socket(7), SO_RCVTIMEO, SO_SNDTIMEO.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ SIZE_SIZE: Final = 4
 MS: Final = 1_000_000
 CONNECT_AGAIN_S: Final = 0.02
 """Between two tries to reach a driver that does not listen."""
+
+SEND_LIMIT_S: Final = 1
+"""How long a driver may take nothing, because it hangs; then the connection is given up, with what was half sent."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 _TIME: Final = struct.Struct("@ll")
@@ -202,6 +205,7 @@ class LocalWay:
     def _open(self) -> socket.socket | None:
         if self._end is None and not self.closed:
             end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIME.pack(SEND_LIMIT_S, 0))
             try:
                 end.connect(self._path)
             except OSError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,11 +22,11 @@ WITHIN_S = 90.0
 
 
 @pytest.fixture
-def here(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Here]:
+def here(tmp_path_factory: pytest.TempPathFactory) -> Here:
     """Where both robots and the test meet: this driver's files are on neither robot alone."""
     directory = tmp_path_factory.mktemp("d") / "m"
     directory.mkdir(mode=0o700)
-    yield Here("field", directory)
+    return Here("field", directory)
 
 
 def reached(here: Here) -> Proxy:

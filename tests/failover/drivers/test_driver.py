@@ -22,6 +22,7 @@ from failover.core.messaging.mailbox import MAILBOX_MAX
 from failover.core.naming.tree import Reach
 from failover.drivers import here as here_module
 from failover.drivers.here import Here, lives, stem
+from failover.drivers.local import LocalWay
 from failover.drivers.lookup import lookup, whole_tree
 from failover.drivers.server import Serving
 from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError
@@ -115,6 +116,17 @@ def test_a_large_message_and_a_large_answer_come_whole(engine: Serving, here: He
         assert raw.recv(1) == b""  # and the driver goes on
     assert way.await_sent(encode(asked), 10**9) and way.await_message(LIMIT_S * 10**9) is not None
     way.close()
+
+
+def test_a_driver_that_hangs_holds_no_caller_longer_than_its_timeout(here: Here) -> None:
+    with socket.socket(socket.AF_UNIX) as hanging:
+        place = here.file("Lab/Hangs", "calls")
+        hanging.bind(str(place))
+        hanging.listen()
+        way = LocalWay(str(place))
+        content = b"x" * (1 << 20)
+        assert not way.await_sent(content, 1_000_000_000) and way.is_lost
+        way.close()
 
 
 # --- By hand ---------------------------------------------------------------------------------------------------------

@@ -70,6 +70,11 @@ class Senders:
                 self.answers[name].append(proxy.call("add", sender=name, number=number, timeout=LIMIT_S))
 
     @property
+    def answered(self) -> int:
+        """How many messages until now."""
+        return sum(map(len, self.answers.values()))
+
+    @property
     def are_done(self) -> bool:
         """Whether all was answered."""
         return not any(thread.is_alive() for thread in self.threads)
@@ -84,8 +89,8 @@ def test_each_message_is_carried_out_once_in_order_although_the_driver_is_killed
     kills = 1
     while not senders.are_done and kills < 5:
         with counter(here, folder):
-            answered = sum(map(len, senders.answers.values()))
-            until(lambda: senders.are_done or sum(map(len, senders.answers.values())) > answered)
+            answered = senders.answered
+            until(lambda before=answered: senders.are_done or senders.answered > before)  # type: ignore[misc]
             time.sleep(dice.random() / 20)  # the instant of death
         kills += 1
     with counter(here, folder):
