@@ -72,6 +72,7 @@ class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from"
         sender: ``from`` on the wire. by: the person for whom it is done.
         boot, seq: the sender's life and the message's number in it, see `failover.core.messaging.mailbox`.
         after: the number of the message that must be handled before. reliable: it is sent until it is answered.
+        had: the sender has all answers up to this number, and will not ask for them again.
         deadline_ms: how long from now on it is worth being handled.
         hops: who passed it on.
         ok, error: of an answer: the result or why there is none.
@@ -87,6 +88,7 @@ class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from"
     boot: int = 0
     seq: int = 0
     after: int = 0
+    had: int = 0
     reliable: bool = False
     deadline_ms: float | None = None
     hops: tuple[Hop, ...] = ()
@@ -317,9 +319,9 @@ def _check_text(text: str) -> None:
 
 
 def _check_numbers(envelope: Envelope) -> None:
-    for number in (envelope.boot, envelope.seq, envelope.after):
+    for number in (envelope.boot, envelope.seq, envelope.after, envelope.had):
         if number < 0:
-            raise EnvelopeError("the message has a negative boot, seq or after")
+            raise EnvelopeError("the message has a negative boot, seq, after or had")
         if number > INTEGER_MAX:
             raise EnvelopeError(f"the message holds the integer {number}: above 2^53 it must be written as text")
     if len(envelope.hops) > HOPS_MAX:

@@ -85,6 +85,7 @@ class Outbox:
         """May have arrived: all that was kept, too, as it may have left after the commit."""
         self._unsent: deque[Waiting] = deque()
         self._free = self._seq
+        self._had = 0
         self._is_connected = True
         self._again_ns: int | None = 0 if self._sent else None
         self._pause_ns = RESEND_FIRST_NS
@@ -115,8 +116,10 @@ class Outbox:
         return envelope
 
     def committed(self) -> None:
-        """All that was posted so far is kept, and may leave."""
+        """All that was posted so far is kept, and may leave; so is which answers have come."""
         self._free = self._seq
+        waiting = (one.envelope.seq for one in (*self._sent, *self._unsent) if one.envelope.reliable)
+        self._had = next(waiting, self._seq + 1) - 1
 
     def connected(self, now_ns: int) -> None:
         """The link stands again: what may not have arrived is sent again, in order, at once."""
@@ -141,14 +144,14 @@ class Outbox:
         if self._again_ns is not None and now_ns >= self._again_ns:
             after = 0
             for one in self._sent:
-                found.append(_as_sent(one, after, now_ns))
+                found.append(_as_sent(one, after, self._had, now_ns))
                 after = one.envelope.seq if one.envelope.reliable else after
             self._sent = deque(one for one in self._sent if one.envelope.reliable)
             self._again_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, RESEND_MOST_NS)
         while self._unsent and self._unsent[0].envelope.seq <= self._free:
             one = self._unsent.popleft()
-            found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, now_ns))
+            found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, self._had, now_ns))
             if one.envelope.reliable:
                 self._sent.append(one)
         if self._again_ns is None and self._sent:
@@ -178,10 +181,10 @@ class Outbox:
         ]
 
 
-def _as_sent(one: Waiting, after: int, now_ns: int) -> Envelope:
+def _as_sent(one: Waiting, after: int, had: int, now_ns: int) -> Envelope:
     """With what is left of its time: the receiver counts it by its own clock."""
     left_ms = None if one.until_ns is None else max(one.until_ns - now_ns, 0) / MS
-    return msgspec.structs.replace(one.envelope, after=after, deadline_ms=left_ms)
+    return msgspec.structs.replace(one.envelope, after=after, had=had, deadline_ms=left_ms)
 
 
 # --- Receiving --------------------------------------------------------------------------------------------------------
@@ -365,8 +368,8 @@ class Mailbox:
             stream.last = envelope.seq
             if envelope.reliable:
                 stream.reliable = envelope.seq
-                if not envelope.after:
-                    stream.answers.clear()  # the sender has had them all
+                for had in [seq for seq in stream.answers if seq <= envelope.had]:
+                    del stream.answers[had]
                 stream.answers[envelope.seq] = answer
                 if len(stream.answers) > WINDOW:
                     del stream.answers[next(iter(stream.answers))]

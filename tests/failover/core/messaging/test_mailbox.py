@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from msgspec import UNSET
 
@@ -207,6 +207,7 @@ def test_ten_thousand_messages_of_ten_senders_over_cuts_kills_of_both_ends_and_t
 @pytest.mark.timeout(600)
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 1 << 32), st.integers(1, 3), st.sampled_from([0.0, 0.1, 0.4]), st.sampled_from([1, 2, 5]))
+@example(63272909, 1, 0.1, 2)  # a sender forgot in its death that it had an answer, and asked for it again
 def test_order_and_once_hold_in_any_run(seed: int, senders: int, loss: float, reliable_of: int) -> None:
     world = World(seed, senders, 60, loss=loss, double=loss, reliable_of=reliable_of)
     world.run(200)
@@ -266,8 +267,8 @@ def test_only_so_many_answers_leave_as_were_handled_at_the_commit_that_is_safe()
 
 def test_answers_that_the_sender_has_had_are_forgotten() -> None:
     mailbox = Mailbox()
-    for number, after in ((1, 0), (2, 1), (3, 0)):
-        mailbox.arrived(Envelope("a", "add", number, sender="s", boot=1, seq=number, after=after, reliable=True), 0)
+    for number, had in ((1, 0), (2, 0), (3, 2)):
+        mailbox.arrived(Envelope("a", "add", number, sender="s", boot=1, seq=number, had=had, reliable=True), 0)
         envelope = mailbox.take(0)
         assert envelope is not None
         mailbox.done(envelope, answer(envelope, number))
