@@ -172,6 +172,7 @@ enum {
     FAILOVER_REFUSED_ = 3,
     FAILOVER_KEEPS_ = 4,
     FAILOVER_SAFE_ = 5,
+    FAILOVER_KEPT_ = 6, /* no robot stands by, this one's disk has it: that helps no caller who waits for a standby */
     FAILOVER_PACKET_SIZE_ = 512,
     FAILOVER_TOLD_ = 1,
     FAILOVER_PENDING_ = 2,
@@ -781,6 +782,8 @@ static inline bool failover_hear_(failover_task_ *task)
         ssize_t size = failover_take_(task->guard, MSG_DONTWAIT, &packet, NULL);
         if (size == -EAGAIN || size == -EINTR)
             return true;
+        if (size == (ssize_t)sizeof packet.safe && packet.head.kind == FAILOVER_KEPT_)
+            continue;
         if (size != (ssize_t)sizeof packet.safe || packet.head.kind != FAILOVER_SAFE_)
             return false;
         uint64_t known = __atomic_load_n(&task->durable, __ATOMIC_RELAXED);

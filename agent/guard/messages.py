@@ -143,6 +143,12 @@ class CommitSafe(Message, frozen=True):
     commit: int
 
 
+class CommitKept(Message, frozen=True):
+    """No robot can stand by, and this robot's disk holds this commit of a program that keeps its state; told to it. No answer."""
+
+    commit: int
+
+
 class LimitOutput(Message, frozen=True):
     """Let so many bytes of each stream wait to be safe at another robot, then have the program wait; 0: any number. No answer."""
 
@@ -280,6 +286,7 @@ Request = (
     | Freeze
     | Thaw
     | CommitSafe
+    | CommitKept
     | LimitOutput
     | Kill
     | Tell

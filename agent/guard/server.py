@@ -33,6 +33,7 @@ import msgspec
 from agent.guard.messages import (
     BeginTask,
     Commit,
+    CommitKept,
     CommitSafe,
     Describe,
     Described,
@@ -104,6 +105,7 @@ class Guard:
             Freeze: lambda request, _: self._act(lambda program: program.freeze(exposed=request.exposed)),
             Thaw: lambda _, __: self._act(lambda program: program.thaw()),
             CommitSafe: self._commit_safe,
+            CommitKept: self._commit_kept,
             LimitOutput: self._limit_output,
             Kill: lambda request, _: self._act(lambda program: program.kill(request.signal)),
             Tell: lambda request, _: self._act(lambda program: program.tell(request.signal, request.value)),
@@ -271,6 +273,10 @@ class Guard:
     def _commit_safe(self, request: CommitSafe, _: tuple[int, ...]) -> None:
         if self._program is not None and self._program.task is not None and self._program.exited is None:
             self._program.task.tell_safe(request.commit)
+
+    def _commit_kept(self, request: CommitKept, _: tuple[int, ...]) -> None:
+        if self._program is not None and self._program.task is not None and self._program.exited is None:
+            self._program.task.tell_kept(request.commit)
 
     def _limit_output(self, request: LimitOutput, _: tuple[int, ...]) -> None:
         if self._program is not None and self._program.pump is not None:

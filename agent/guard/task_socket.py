@@ -35,6 +35,7 @@ from checkpoint.segment.task_messages import (
     Begin,
     FromGuard,
     Hello,
+    Kept,
     Origin,
     Refused,
     Safe,
@@ -104,6 +105,7 @@ class TaskEnd:
         self._beginning: tuple[int, Origin | None] | None = None
         self._segment = -1
         self._newest_told = 0
+        self._newest_kept = 0
 
     def fileno(self) -> int:
         """For the guard's poll: readable means that `heed` has something to do."""
@@ -134,6 +136,11 @@ class TaskEnd:
         """Say that a commit is safe, if a program listens."""
         if self._has_begun and commit > self._newest_told and self._say(Safe(commit)):
             self._newest_told = commit
+
+    def tell_kept(self, commit: int) -> None:
+        """Say that no robot can stand by, and that this robot's disk holds a commit, if a program listens."""
+        if self._has_begun and commit > self._newest_kept and self._say(Kept(commit)):
+            self._newest_kept = commit
 
     def heed(self) -> tuple[Told, ...]:
         """Handle the packets that have come; return the events that the agent should hear of."""

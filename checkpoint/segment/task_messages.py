@@ -40,7 +40,7 @@ _HEAD: Final = struct.Struct("<II")
 _BEGIN: Final = struct.Struct(f"<QQQIIQQ{COMPONENT_SIZE}s{ROBOT_SIZE}s")
 _REFUSED: Final = struct.Struct(f"<{TEXT_SIZE}s")
 _SAFE: Final = struct.Struct("<Q")
-_KINDS: Final = {"Hello": 1, "Begin": 2, "Refused": 3, "Keeps": 4, "Safe": 5}
+_KINDS: Final = {"Hello": 1, "Begin": 2, "Refused": 3, "Keeps": 4, "Safe": 5, "Kept": 6}
 
 
 class Origin(Struct, frozen=True):
@@ -94,8 +94,14 @@ class Safe(Struct, frozen=True):
     commit: int
 
 
+class Kept(Struct, frozen=True):
+    """No robot can stand by now; this robot's own disk holds everything up to this commit of this program's lineage."""
+
+    commit: int
+
+
 FromProgram = Hello | Keeps
-FromGuard = Begin | Refused | Safe
+FromGuard = Begin | Refused | Safe | Kept
 Packet = FromProgram | FromGuard
 
 
@@ -107,7 +113,7 @@ def encode(packet: Packet) -> bytes:
             return head + _begin_body(packet)
         case Refused(text):
             return head + _REFUSED.pack(text.encode(errors="replace")[: TEXT_SIZE - 1].decode(errors="ignore").encode())
-        case Safe(commit):
+        case Safe(commit) | Kept(commit):
             return head + _SAFE.pack(commit)
         case _:
             return head
@@ -199,4 +205,5 @@ _GUARDS: Final[dict[int, tuple[struct.Struct, Callable[..., FromGuard]]]] = {
     _KINDS["Begin"]: (_BEGIN, _begin),
     _KINDS["Refused"]: (_REFUSED, _refused),
     _KINDS["Safe"]: (_SAFE, Safe),
+    _KINDS["Kept"]: (_SAFE, Kept),
 }

@@ -421,6 +421,21 @@ VERBS: Final = (
         "failover.cli.verbs.drivers:send",
     ),
     Verb(
+        "graph",
+        "who talks to which driver: how often, how much, with how many errors, how slowly",
+        """
+        Ask each driver who has called it in the last hour. Messages that came again count again. The time is from the arrival of
+        a message to its answer; p99 is at most half too high. --dot writes a graph for Graphviz. Exit status 1: a driver did not
+        answer.
+
+          failover graph
+          failover graph --watch
+          failover graph --dot | dot -Tsvg > team.svg
+        """,
+        "failover.cli.arguments.drivers:graph",
+        "failover.cli.verbs.drivers:graph",
+    ),
+    Verb(
         "path",
         "where a message to a driver spent its time, hop by hop",
         """

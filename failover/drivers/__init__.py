@@ -2,5 +2,6 @@
 
 `server` runs a driver, `actor` calls its methods; `proxy` is the caller's side; `name_service` and `lookup` find names.
 
-Imports ``failover.core``, ``failover.config``, ``failover.kept_state`` and ``failover.boards``; the agent does not import it.
+Imports ``failover.core``, ``failover.config``, ``failover.client``, ``failover.kept_state`` and ``failover.boards``; the agent
+does not import it.
 """

@@ -2,8 +2,8 @@
 
     came → mailbox → (paced) → method → answer
 
-A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_path`` where a message spent its time here,
-``_subscribe`` and ``_unsubscribe`` begin and end a stream.
+A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_graph`` who has called, ``_path`` where a
+message spent its time here, ``_subscribe`` and ``_unsubscribe`` begin and end a stream.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from msgspec import UNSET, Struct
@@ -20,10 +20,14 @@ from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope, Hop, answer, refusal
 from failover.core.messaging.mailbox import SENDERS_MAX, Mailbox
 from failover.core.messaging.pacing import SECOND, Pace, merged
+from failover.core.messaging.traffic import Traffic
 from failover.core.naming import names
 from failover.core.naming.names import Kind
 from failover.drivers.declare import Declaration, Verb
 from failover.errors import EnvelopeError, NameFormatError
+
+if TYPE_CHECKING:
+    from failover.drivers.keeping import Keeping
 
 PATHS_MAX: Final = 4_096
 """Messages whose way is remembered, for ``failover path``."""
@@ -53,15 +57,17 @@ class Subscriber(Struct):
 class Actor:
     """One driver: its mailbox, its pace, its streams. Every instant is an argument."""
 
-    def __init__(self, instance: object, declaration: Declaration, who: str) -> None:
+    def __init__(self, instance: object, declaration: Declaration, who: str, keeping: Keeping | None = None) -> None:
         """
         Args:
             who: of this process in hops: ``robot1/NAME``.
+            keeping: of a driver that keeps attributes.
         """
         self._instance = instance
         self._declaration = declaration
         self._who = who
-        self._mailbox = Mailbox()
+        self._keeping = keeping
+        self._mailbox = keeping.mailbox if keeping is not None else Mailbox()
         self._pace = Pace(declaration.rate_hz)
         self._paths: OrderedDict[str, tuple[Hop, ...]] = OrderedDict()
         self._meant: dict[str, bool] = {}
@@ -69,14 +75,16 @@ class Actor:
         self._samples_ns: dict[str, int] = {}
         self._own: Mapping[str, Callable[[Envelope, int], Any]] = {
             "_describe": self._describe,
+            "_graph": self._graph,
             "_path": self._path,
             "_subscribe": self._subscribe,
             "_unsubscribe": self._unsubscribe,
         }
+        self._traffic = Traffic()
         self._routes: OrderedDict[str, Whose] = OrderedDict()
 
-    def came(self, envelope: Envelope, whose: Whose, now_ns: int) -> list[Envelope]:
-        """Take in a message; answers that leave at once."""
+    def came(self, envelope: Envelope, whose: Whose, now_ns: int, size: int = 0) -> list[Envelope]:
+        """Take in a message of so many bytes; answers that leave at once."""
         if not envelope.sender:
             envelope = msgspec.structs.replace(envelope, sender=f"by-hand-{hash(whose) & 0xFFFFFFFF:08x}")
         self._routes[envelope.sender] = whose
@@ -89,6 +97,8 @@ class Actor:
             envelope = envelopes.came(envelope, self._who, now_ns)
         except EnvelopeError as error:
             return [refusal(envelope, "circle", str(error))]
+        if envelope.verb not in self._own:
+            self._traffic.came(envelope.sender, envelope.verb, size, now_ns)
         return self._mailbox.arrived(envelope, now_ns)
 
     def route(self, sender: str) -> Whose | None:
@@ -116,7 +126,9 @@ class Actor:
     def wait_ns(self, now_ns: int) -> int | None:
         """How long until something is to be done although nothing comes; 0: at once; None: for ever."""
         waits = [max(sample_ns - now_ns, 0) for sample_ns in self._samples_ns.values()]
-        if (first := self._mailbox.first()) is not None:
+        if self._keeping is not None and (again_ns := self._keeping.wait_ns()) is not None:
+            waits.append(again_ns)
+        if (first := self._mailbox.first()) is not None and not self._mailbox.is_ahead:
             waits.append(self._pace.wait_ns(now_ns) if self._is_paced(first) else 0)
         return min(waits, default=None)
 
@@ -128,11 +140,22 @@ class Actor:
         """Carry out the next message, if there is one and it is its turn; answers that leave now."""
         now_ns = clock()
         first = self._mailbox.first()
-        if first is None or (self._is_paced(first) and self._pace.wait_ns(now_ns)):
-            return []
+        is_turn = first is not None and not (self._is_paced(first) and self._pace.wait_ns(now_ns))
+        if self._keeping is None:
+            if not is_turn:
+                return []
+            self._handle(now_ns, clock)
+            return self._mailbox.committed()
+        if is_turn and not self._mailbox.is_ahead:
+            with self._keeping.message():
+                self._handle(now_ns, clock)
+        handled = self._keeping.safe()
+        return [] if handled is None else self._mailbox.committed(handled)
+
+    def _handle(self, now_ns: int, clock: Callable[[], int]) -> None:
         message = self._mailbox.take(now_ns)
         if message is None:
-            return self._mailbox.committed()
+            return
         run = [message]
         if self._is_paced(message):
             self._pace.begun(now_ns)
@@ -144,10 +167,12 @@ class Actor:
         for replaced in run[:-1]:
             self._done(replaced, _as_merged(replaced, said), left_ns)
         self._done(run[-1], said, left_ns)
-        return self._mailbox.committed()
 
     def _done(self, message: Envelope, said: Envelope, left_ns: int) -> None:
         hops = envelopes.left_hops(message, left_ns)
+        if message.verb not in self._own:
+            took_ns = left_ns - message.hops[-1].came_ns
+            self._traffic.done(message.sender, message.verb, took_ns, left_ns, is_error=said.error is not UNSET)
         if message.id:
             self._paths[message.id] = hops
             if len(self._paths) > PATHS_MAX:
@@ -185,6 +210,9 @@ class Actor:
 
     def _describe(self, _: Envelope, __: int) -> Any:
         return {"path": self._declaration.path, "aliases": list(self._declaration.aliases), "verbs": self._declaration.schemas()}
+
+    def _graph(self, _: Envelope, now_ns: int) -> Any:
+        return self._traffic.rows(now_ns)
 
     def _path(self, message: Envelope, _: int) -> Any:
         """The hops of a message that was carried out; None: this driver does not remember it."""

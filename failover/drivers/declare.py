@@ -68,7 +68,7 @@ class Verb(Struct, frozen=True):
 
 
 class Declaration(Struct, frozen=True):
-    """What `driver` was told about a class."""
+    """What `driver` was told about a class. ``version``, ``migrations``: of the kept state, as of `failover.component`."""
 
     path: str
     aliases: tuple[str, ...]
@@ -131,14 +131,14 @@ def driver(
     version: int = 1,
     migrations: Mapping[int, Callable[[Any], Any]] | None = None,
 ) -> Callable[[type[C]], type[C]]:
-    """Declare a class that speaks for one device; `failover.run` runs it.
+    """Declare a class that speaks for one device; `failover.run` runs it. Attributes that are `failover.kept` survive.
 
     Args:
         path: where the device is in the team's tree of names: ``University/Lab/Robotino/Engines/3/PWM``.
         alias: one free text or several by which it may be called, too.
         rate_hz: the most commands a second that the device takes; None: as many as come.
         labels: whatever others may want to know.
-        version, migrations: of the kept state, as of a `failover.component`; only `failover program run` keeps one.
+        version, migrations: of the kept attributes, as of `failover.component`.
 
     Raises:
         DriverError: the class or an argument cannot work.
@@ -155,7 +155,9 @@ def driver(
         if not isinstance(chosen, type):
             raise DriverError(f"@failover.driver is above {chosen!r}, which is no class")
         if hasattr(chosen, DECLARED):
-            raise DriverError(f"{chosen.__name__} is a component (failover.component), and cannot be a driver too")
+            raise DriverError(
+                f"{chosen.__name__} is a component (failover.component) already: declare a class for each of the two"
+            )
         verbs = _verbs(chosen)
         if not verbs:
             raise DriverError(f"{chosen.__name__} has no verb: write @failover.command or @failover.query above a method")

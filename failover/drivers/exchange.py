@@ -180,7 +180,7 @@ class Door:
         """What other robots have sent."""
         self._gate.serve()
         found: list[bytes] = []
-        while len(found) < TURN_MAX and (message := self._sockets.receive(self._listening, is_team=True)) is not None:
+        while len(found) < TURN_MAX and (message := self._sockets.receive(self._listening)) is not None:
             found.append(message[1])
         return found
 

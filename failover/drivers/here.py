@@ -5,7 +5,7 @@ Drivers of one user on one robot meet in a directory that only this user may ent
 
 ======================== ============================================================================
 ``Lab.robot1.PWM.lock``  held by the driver's process as long as it lives; holds its pid
-``Lab.robot1.PWM.ipc``   ZeroMQ: messages, each one frame
+``Lab.robot1.PWM.calls`` a stream of messages, each after its size in four bytes
 ``Lab.robot1.PWM.hand``  a stream of JSON objects, as ``nc -U`` writes them
 ``Lab.robot1.PWM.names`` datagrams of its name service
 ======================== ============================================================================
@@ -54,6 +54,7 @@ class Here(Struct, frozen=True):
         team: the members and their public keys; None: other robots are not reached.
         secret: this robot's CURVE key, Z85; "" without a team.
         alone: why other robots are not reached, one sentence; "" if they are.
+        rules: the team directory, where rights.toml may lie.
     """
 
     robot: str
@@ -61,6 +62,7 @@ class Here(Struct, frozen=True):
     team: Team | None = None
     secret: str = ""
     alone: str = ""
+    rules: Path = SYSTEM_TEAM
 
     @property
     def public(self) -> str:
@@ -102,7 +104,8 @@ def here() -> Here:
     except (TeamFileError, OSError) as error:
         if os.environ.get(TEAM):
             raise DriverError(f"cannot use the team that {TEAM} names: {error}") from error
-        return Here(os.environ.get(ROBOT) or this_robot(), directory, alone=f"there is no key for other robots: {error}")
+        alone = f"there is no key for other robots: {error}"
+        return Here(os.environ.get(ROBOT) or this_robot(), directory, alone=alone, rules=place)
 
 
 def _of_team(directory: Path, place: Path) -> Here:
@@ -112,7 +115,7 @@ def _of_team(directory: Path, place: Path) -> Here:
         raise TeamFileError(f"{place} has no robot {robot!r}; {ROBOT} says which one this is")
     if not all(one.public_key for one in team.robots.values()):
         raise TeamFileError(f"the team in {place} is one without keys; enrol its robots with keys")
-    return Here(robot, directory, team, team_file.read_secret_key(place, robot))
+    return Here(robot, directory, team, team_file.read_secret_key(place, robot), rules=place)
 
 
 def _robot_of(place: Path) -> str:

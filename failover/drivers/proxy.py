@@ -18,22 +18,26 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from msgspec import UNSET
 
 from failover.boards import boottime
+from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope, Hop
 from failover.core.messaging.mailbox import MS, RESEND_FIRST_NS, Outbox
 from failover.core.naming.tree import Place
-from failover.drivers import sockets
 from failover.drivers.actor import LEASE_NS
 from failover.drivers.here import Here, here, lives
+from failover.drivers.local import SCHEME, LocalWay
 from failover.drivers.lookup import lookup
 from failover.drivers.name_service import new_boot
 from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError
+
+if TYPE_CHECKING:
+    from failover.drivers.sockets import TeamWay
 
 TIMEOUT_S: Final = 5.0
 """How long a call waits unless told otherwise."""
@@ -69,24 +73,24 @@ class Proxy:
         """The newest answer, with its hops."""
         program = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python").stem
         self.sender = f"{here.robot}/{program}-{os.getpid()}-{next(_NUMBERS)}"
+        self._by = accounts.name_of(os.geteuid()) if place.robot != here.robot else ""
         self._outbox = Outbox(self.sender, new_boot())
         self._lock = threading.Lock()
         self._skew = boottime.skew_ns()
-        self._context = sockets.context()
         self._address = address_of(here, place)
-        self._socket = sockets.connect(self._context, self._address, here, place.robot)
+        self._way = way_to(here, self._address, place.robot)
 
     def _connect(self, place: Place) -> None:
         """By another address, if it has one now."""
         address = address_of(self.here, place)
         if address != self._address:
-            self._socket.close(0)
-            self.place, self._address = place, address
-            self._socket = sockets.connect(self._context, address, self.here, place.robot)
+            way = way_to(self.here, address, place.robot)
+            self._way.close()
+            self.place, self._address, self._way = place, address, way
 
     def close(self) -> None:
         """Let the connection go."""
-        sockets.close(self._context)
+        self._way.close()
 
     def __enter__(self) -> Proxy:
         return self
@@ -111,7 +115,9 @@ class Proxy:
             EnvelopeError: no message can say this body.
             MailboxFullError: too many earlier calls have had no answer.
         """
-        envelope = Envelope(to=self.path, verb=verb, body=self._body(body, fields), reliable=True, deadline_ms=timeout * 1_000)
+        envelope = Envelope(
+            to=self.path, verb=verb, body=self._body(body, fields), by=self._by, reliable=True, deadline_ms=timeout * 1_000
+        )
         with self._lock:
             answer = self._answered(envelope, round(timeout * SECOND_NS))
         self.last = answer
@@ -142,13 +148,15 @@ class Proxy:
             if turns and due:
                 self._look_again(until_ns - now_ns)
             for one in due:
-                sockets.await_sent(self._socket, self._encoded(one), min(until_ns - now_ns, RESEND_FIRST_NS))
+                self._way.await_sent(self._encoded(one), min(until_ns - now_ns, RESEND_FIRST_NS))
             turns += 1
             next_ns = self._outbox.next_ns()
-            content = sockets.await_message(self._socket, max(min(until_ns, next_ns or until_ns) - self.now_ns(), 0))
+            content = self._way.await_message(max(min(until_ns, next_ns or until_ns) - now_ns, 0))
             now_ns = self.now_ns()
             answer = _decoded(content) if content is not None else None
             if answer is None:
+                if self._way.is_lost:  # the driver has ended: it is asked anew once it is there again
+                    self._outbox.connected(now_ns)
                 continue
             self._outbox.answered(answer)
             if answer.re == posted.id:
@@ -184,38 +192,52 @@ class Proxy:
         """
         if self.call("_describe")["verbs"].get(name, {}).get("role") != "stream":
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
-        way = sockets.connect(self._context, self._address, self.here, self.place.robot)
-        asked = Envelope(to=self.path, verb="_subscribe", body={"stream": name}, sender=f"{self.sender}-{next(_NUMBERS)}")
+        way = way_to(self.here, self._address, self.place.robot)
+        asked = Envelope(
+            to=self.path, verb="_subscribe", body={"stream": name}, sender=f"{self.sender}-{next(_NUMBERS)}", by=self._by
+        )
         again_ns = self.now_ns()
         try:
             while True:
                 now_ns = self.now_ns()
-                if now_ns >= again_ns and sockets.await_sent(way, envelopes.encode(asked), SECOND_NS):
+                if now_ns >= again_ns and way.await_sent(envelopes.encode(asked), SECOND_NS):
                     again_ns = now_ns + LEASE_NS // 3
-                content = sockets.await_message(way, max(again_ns - now_ns, MS))
+                content = way.await_message(max(again_ns - now_ns, MS))
+                again_ns = 0 if way.is_lost else again_ns
                 value = _decoded(content) if content is not None else None
-                if value is None or value.verb != name:
+                if value is None:
+                    continue
+                is_denied = value.error is not UNSET and value.error.kind == "denied"
+                if value.verb != name and not is_denied:
                     continue
                 if value.error is not UNSET:
                     raise CallRefusedError(value.error.sentence, value.error.kind)
                 yield None if value.ok is UNSET else value.ok
         finally:
-            if not way.closed:  # as the proxy is, perhaps
-                sockets.send(way, envelopes.encode(msgspec.structs.replace(asked, verb="_unsubscribe")))
-                way.close(LINGER_MS)
+            way.send(envelopes.encode(msgspec.structs.replace(asked, verb="_unsubscribe")))
+            way.close(LINGER_MS)
 
 
 LINGER_MS: Final = 100
 """How long the farewell of a stream may take to leave."""
 
 
+def way_to(here: Here, address: str, robot: str) -> LocalWay | TeamWay:
+    """A way to a driver at this address; `DriverError`: the team's keys are not here."""
+    if address.startswith(SCHEME):
+        return LocalWay(address.removeprefix(SCHEME))
+    from failover.drivers.sockets import TeamWay  # ZeroMQ is loaded only by who needs other robots
+
+    return TeamWay(address, here, robot)
+
+
 def address_of(here: Here, place: Place) -> str:
-    """By which address this process reaches a driver: ipc on its own robot, else tcp.
+    """By which address this process reaches a driver: a unix socket on its own robot, else tcp.
 
     Raises:
         DriverError: by none.
     """
-    scheme = "ipc://" if place.robot == here.robot else "tcp://"
+    scheme = SCHEME if place.robot == here.robot else "tcp://"
     found = next((address for address in place.record.addresses if address.startswith(scheme)), "")
     if not found:
         why = here.alone or f"its driver on {place.robot} opened no port: the key of the team could not be read there"

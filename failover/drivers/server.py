@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import msgspec
 from msgspec import Struct
 
 from failover.boards import boottime
+from failover.config.team import Team
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.by_hand import Typed
 from failover.core.messaging.envelope import Envelope, Fault
@@ -22,13 +25,18 @@ from failover.core.naming.records import Record, pack
 from failover.core.naming.scan import Terms
 from failover.core.naming.tables import BODY_SIZE_MAX
 from failover.core.naming.tree import robot_of
-from failover.drivers import sockets
+from failover.drivers import local
 from failover.drivers.actor import Actor, Whose
+from failover.drivers.call_rights import CallRights
 from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
-from failover.errors import DriverError, EnvelopeError
+from failover.errors import EnvelopeError
 from failover.kept_state.component import kept_of
+
+if TYPE_CHECKING:
+    from failover.drivers import sockets
+    from failover.drivers.keeping import Keeping
 
 T = TypeVar("T")
 
@@ -47,17 +55,25 @@ log = logging.getLogger("failover.drivers")
 
 
 class Peer(Struct, frozen=True):
-    """One who has sent by ZeroMQ. ``team``: by tcp."""
+    """One of another robot, by ZeroMQ's name for its connection."""
 
-    team: bool
     identity: bytes
 
 
-class Hand(Struct, frozen=True):
-    """One who types into a connection, by its descriptor."""
+class Near(Struct, frozen=True):
+    """One of this robot, by the descriptor of its connection. ``uid``: its user, as the kernel says."""
 
     descriptor: int
     number: int
+    uid: int
+
+
+class Hand(Struct, frozen=True):
+    """One who types into a connection, by its descriptor. ``uid``: its user."""
+
+    descriptor: int
+    number: int
+    uid: int
 
 
 class Typing(Struct):
@@ -86,11 +102,6 @@ def run(cls: type[T]) -> T:
         DriverError: it cannot take messages.
         NameFormatError: its path belongs to another robot.
     """
-    if kept_of(cls):
-        raise DriverError(
-            f"{cls.__name__} keeps attributes (failover.kept), and a driver keeps none yet: what it knows ends with it; "
-            "failover program run keeps them"
-        )
     serving = Serving(cls)
     with serving, _signals(serving):
         for line in serving.addresses_told():
@@ -111,10 +122,14 @@ class Serving:
         self.here = place or here()
         self._name = stem(declaration.path, self.here.directory)
         self._skew = boottime.skew_ns()
+        self._rights = CallRights(self.here.rules, declaration.path)
         self._hands: dict[Hand, Typing] = {}
+        self._near: dict[Near, local.Connection] = {}
+        self._readers: dict[int, Callable[[], None]] = {}
         self._numbers = 0
         self._is_over = False
         with contextlib.ExitStack() as stack:
+            self._keeping = self._begin(cls, declaration, stack)
             lock = hold(self.here, declaration.path)
             stack.callback(os.close, lock)
             self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -123,42 +138,60 @@ class Serving:
             self.service = NameService(self.here, self.record_of(declaration), terms)
             stack.callback(self.service.close)
             self.instance, self._actor = self._made(cls, declaration, f"{self.here.robot}/{self._name}")
+            if self._keeping is not None:
+                self._wait_for(self._keeping.fileno(), _nothing)  # the loop looks at it in each turn
+                self._keeping.resumed()
             self.service.start()
             self._stack = stack.pop_all()
 
+    def _begin(self, cls: type, declaration: Declaration, stack: contextlib.ExitStack) -> Keeping | None:
+        """The kept state, if there is one: before anything is opened, as a warm driver on a standby waits here."""
+        if not kept_of(cls):
+            return None
+        from failover.drivers.keeping import Keeping
+
+        keeping = Keeping(cls, declaration)
+        stack.callback(keeping.close)
+        return keeping
+
     def _made(self, cls: type, declaration: Declaration, who: str) -> tuple[Any, Actor]:
         """The driver, and what hands it its messages."""
-        instance = cls()
-        return instance, Actor(instance, declaration, who)
+        instance = cls() if self._keeping is None else self._keeping.instance
+        return instance, Actor(instance, declaration, who, self._keeping)
 
     def _open(self, declaration: Declaration, stack: contextlib.ExitStack) -> None:
         path = declaration.path
-        self._context = sockets.context()
-        stack.callback(sockets.close, self._context)
-        self._local = sockets.listen_local(self._context, os.fspath(self.here.file(path, "ipc")))
-        stack.callback(self.here.file(path, "ipc").unlink, missing_ok=True)
-        self._poller = sockets.Poller()
-        self._poller.add(self._local)
-        self._poller.add(self._wake)
+        self._poller = local.Poller()
+        stack.callback(self._poller.close)
+        self._wait_for(self._wake, self._woken)
+        calls, hand = self.here.file(path, "calls"), self.here.file(path, "hand")
+        self._addresses = [f"{local.SCHEME}{calls}"]
         self._team: sockets.Socket | None = None
-        self._gate: sockets.Gate | None = None
-        self._addresses = [f"ipc://{self.here.file(path, 'ipc')}"]
         if self.here.team is not None:
-            robots = {name: robot.public_key for name, robot in self.here.team.robots.items()}
-            self._gate = sockets.Gate(self._context, robots)
-            self._team, address = sockets.listen_team(self._context, self.here)
-            self._addresses.append(address)
-            self._poller.add(self._gate.socket)
-            self._poller.add(self._team)
-        hand = self.here.file(path, "hand")
-        hand.unlink(missing_ok=True)
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
-        stack.callback(self._listener.close)
-        self._listener.bind(os.fspath(hand))
-        stack.callback(hand.unlink, missing_ok=True)
-        self._listener.listen(HANDS_MAX)
-        self._poller.add(self._listener.fileno())
+            self._open_team(self.here.team, stack)
+        for file, accept in ((calls, self._accept_near), (hand, self._accept_hand)):
+            listener = local.listen(file)
+            stack.callback(file.unlink, missing_ok=True)
+            stack.callback(listener.close)
+            self._wait_for(listener.fileno(), functools.partial(accept, listener))
         self._addresses.append(f"unix://{hand}")
+
+    def _open_team(self, team: Team, stack: contextlib.ExitStack) -> None:
+        """ZeroMQ, with its thread, only where other robots may call."""
+        from failover.drivers import sockets
+
+        self._sockets = sockets
+        context = sockets.context()
+        stack.callback(sockets.close, context)
+        self._gate = sockets.Gate(context, {name: robot.public_key for name, robot in team.robots.items()})
+        self._team, address = sockets.listen_team(context, self.here)
+        self._addresses.append(address)
+        for socket_ in (self._gate.socket, self._team):
+            self._wait_for(socket_.fileno(), self._take_team)
+
+    def _wait_for(self, descriptor: int, read: Callable[[], None]) -> None:
+        self._readers[descriptor] = read
+        self._poller.add(descriptor)
 
     def record_of(self, declaration: Declaration) -> Record:
         """With the schemas of its verbs, if a record has room for them; else with their names."""
@@ -167,12 +200,13 @@ class Serving:
             addresses=tuple(self._addresses),
             aliases=declaration.aliases,
             verbs=declaration.schemas(),
+            epoch=0 if self._keeping is None else self._keeping.epoch,
             labels=dict(declaration.labels),
         )
         if len(pack(record)) <= BODY_SIZE_MAX:
             return record
         verbs: dict[str, Any] = {name: {"role": verb.marked.role} for name, verb in declaration.verbs.items()}
-        return Record(record.path, addresses=record.addresses, aliases=record.aliases, verbs=verbs, labels=record.labels)
+        return msgspec.structs.replace(record, verbs=verbs)
 
     def addresses_told(self) -> list[str]:
         """For the person who started it: where it takes messages, and whether other robots reach it."""
@@ -187,6 +221,8 @@ class Serving:
     def __exit__(self, *_: object) -> None:
         for typing in self._hands.values():
             typing.connection.close()
+        for connection in self._near.values():
+            connection.close()
         self._stack.close()
 
     def stop(self) -> None:
@@ -208,29 +244,68 @@ class Serving:
     def serve(self) -> None:
         """Carry out messages until `stop`."""
         while not self._is_over:
-            for ready in self._poller.wait(self._actor.wait_ns(self.now_ns())):
-                if isinstance(ready, int):
-                    self._read(ready)
-                elif self._gate is not None and ready is self._gate.socket:
-                    self._gate.serve()
-                else:
-                    self._take(ready)
+            for ready in self._poller.wait(self._wait_ns()):
+                if (read := self._readers.get(ready)) is not None:  # an earlier one of this turn may have closed it
+                    read()
             self._send(self._actor.handle(self.now_ns))
             self._actor.sample(self._publish, self.now_ns)
 
-    def _take(self, listening: sockets.Socket) -> None:
-        """All messages that have come by ZeroMQ, up to `TURN_MAX`."""
-        is_team = listening is self._team
+    def _wait_ns(self) -> int | None:
+        """How long the next wait may take. A descriptor of ZeroMQ tells of news once, so its sockets are looked at before."""
+        if self._team is not None and (self._sockets.has_message(self._team) or self._sockets.has_message(self._gate.socket)):
+            self._take_team()
+            return 0
+        return self._actor.wait_ns(self.now_ns())
+
+    def _woken(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake)
+
+    def _take_team(self) -> None:
+        """All messages that have come from other robots, up to `TURN_MAX`."""
+        assert self._team is not None
+        if self._sockets.has_message(self._gate.socket):
+            self._gate.serve()
         for _ in range(TURN_MAX):
-            message = sockets.receive(listening, is_team=is_team)
+            message = self._sockets.receive(self._team)
             if message is None:
                 return
             identity, content, robot = message
-            self._came(content, Peer(is_team, identity), robot)
-            if not sockets.has_message(listening):
+            self._came(content, Peer(identity), robot)
+            if not self._sockets.has_message(self._team):
                 return
 
-    def _came(self, content: bytes, whose: Whose, robot: str | None) -> None:
+    def _accept_near(self, listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            end, _ = listener.accept()
+            if len(self._near) >= local.CONNECTIONS_MAX:
+                end.close()
+                return
+            self._numbers += 1
+            connection = local.Connection(end)
+            near = Near(connection.descriptor, self._numbers, connection.uid)
+            self._near[near] = connection
+            self._wait_for(connection.descriptor, functools.partial(self._read_near, near, connection))
+
+    def _read_near(self, near: Near, connection: local.Connection) -> None:
+        if connection.has_unsent:
+            connection.flush()
+            self._poller.add(near.descriptor, writing=connection.has_unsent)
+        found = connection.receive()
+        if found is None:
+            del self._near[near]
+            self._close(near.descriptor)
+            connection.close()
+            return
+        for content in found:
+            self._came(content, near, None)
+
+    def _close(self, descriptor: int) -> None:
+        """It is closed next: the kernel gives its number to another one."""
+        del self._readers[descriptor]
+        self._poller.remove(descriptor)
+
+    def _came(self, content: bytes, whose: Near | Hand | Peer, robot: str | None) -> None:
         """One message. ``robot``: which its key proves; None: it came from this robot."""
         now_ns = self.now_ns()
         try:
@@ -244,7 +319,13 @@ class Serving:
                 envelopes.refusal(envelope, "wrong_sender", f"{envelope.sender!r} is no process of {robot}, whose key this is"),
             )
             return
-        self._send(self._actor.came(envelope, whose, now_ns))
+        uid = None if isinstance(whose, Peer) else whose.uid
+        if not envelope.verb.startswith("_") or envelope.verb == "_subscribe":
+            denied = self._rights.refusal(uid, robot, envelope.by)
+            if denied:
+                self._publish(whose, envelopes.refusal(envelope, "denied", denied))
+                return
+        self._send(self._actor.came(envelope, whose, now_ns, len(content)))
 
     def _send(self, answers: list[Envelope]) -> None:
         for one in answers:
@@ -255,35 +336,35 @@ class Serving:
     def _publish(self, whose: Whose, envelope: Envelope) -> bool:
         """Send to one, if it is there and takes it now: who misses an answer to what matters sends it again."""
         content = envelopes.encode(envelope)
+        if isinstance(whose, Near):
+            connection = self._near.get(whose)
+            if connection is None:
+                return False
+            is_sent = connection.send(content)
+            if connection.has_unsent:
+                self._poller.add(whose.descriptor, writing=True)
+            return is_sent
         if isinstance(whose, Hand):
             return self._write(whose, content + b"\n")
         assert isinstance(whose, Peer)
-        listening = self._team if whose.team else self._local
-        return listening is not None and sockets.answer(listening, whose.identity, content)
+        return self._team is not None and self._sockets.answer(self._team, whose.identity, content)
 
     # --- By hand ----------------------------------------------------------------------------------------------------------
 
-    def _accept(self) -> None:
+    def _accept_hand(self, listener: socket.socket) -> None:
         with contextlib.suppress(OSError):
-            connection, _ = self._listener.accept()
+            connection, _ = listener.accept()
             if len(self._hands) >= HANDS_MAX:
                 connection.close()
                 return
             connection.setblocking(False)
             self._numbers += 1
-            self._hands[Hand(connection.fileno(), self._numbers)] = Typing(connection, Typed(), bytearray())
-            self._poller.add(connection.fileno())
+            hand = Hand(connection.fileno(), self._numbers, local.uid_of(connection))
+            self._hands[hand] = Typing(connection, Typed(), bytearray())
+            self._wait_for(hand.descriptor, functools.partial(self._read_hand, hand))
 
-    def _read(self, descriptor: int) -> None:
-        """What came by a descriptor: a person's connection, what that person typed, or the order to end."""
-        if descriptor == self._listener.fileno():
-            self._accept()
-            return
-        hand = next((one for one in self._hands if one.descriptor == descriptor), None)
-        if hand is None:
-            with contextlib.suppress(BlockingIOError):
-                os.eventfd_read(self._wake)
-            return
+    def _read_hand(self, hand: Hand) -> None:
+        """What a person has typed."""
         typing = self._hands[hand]
         try:
             content = typing.connection.recv(CHUNK) if not typing.is_over else b""
@@ -330,8 +411,12 @@ class Serving:
 
     def _drop(self, hand: Hand) -> None:
         typing = self._hands.pop(hand)
-        self._poller.add(hand.descriptor, reading=False)
+        self._close(hand.descriptor)
         typing.connection.close()
+
+
+def _nothing() -> None:
+    """What a descriptor tells that only wakes the loop."""
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""ZeroMQ for programs: ipc on this robot, tcp between robots, there by CURVE alone. The only ``zmq`` import of ``failover``.
+"""ZeroMQ for programs: messages between robots, by CURVE alone. The only ``zmq`` import of ``failover``.
 
 A server with CURVE and without an answer to ZAP admits any key: `Gate` answers, and admits only the keys of the team file. No
 socket sends ZMTP heartbeats: one that comes while the receive queue is full ends the process (libzmq issue 4767).
@@ -38,22 +38,6 @@ Context = zmq.Context[zmq.Socket[bytes]]
 Socket = zmq.Socket[bytes]
 
 
-class Poller:
-    """Waits for sockets and descriptors."""
-
-    def __init__(self) -> None:
-        self._poller = zmq.Poller()
-
-    def add(self, what: Socket | int, *, reading: bool = True, writing: bool = False) -> None:
-        """From now on it is waited for, until it can be read or written; or for neither."""
-        self._poller.register(what, reading * zmq.POLLIN | writing * zmq.POLLOUT)
-
-    def wait(self, timeout_ns: int | None) -> list[Socket | int]:
-        """Those that can be read or written, once there is one or the time is over."""
-        timeout_ms = None if timeout_ns is None else max(-(-timeout_ns // 1_000_000), 0)
-        return [what for what, _ in self._poller.poll(timeout_ms)]
-
-
 def context() -> Context:
     """One of this process's own; its sockets belong to the thread that makes them."""
     return zmq.Context()
@@ -62,15 +46,6 @@ def context() -> Context:
 def close(context: Context) -> None:
     """Close all sockets of a context; nothing lingers."""
     context.destroy(linger=0)
-
-
-def listen_local(context: Context, path: str) -> Socket:
-    """Take messages of this robot's programs.
-
-    Raises:
-        DriverError: the file cannot be made.
-    """
-    return _bound(_limited(context.socket(zmq.ROUTER)), f"ipc://{path}")
 
 
 def listen_team(context: Context, here: Here, port: int = 0) -> tuple[Socket, str]:
@@ -97,7 +72,7 @@ def connect(context: Context, address: str, here: Here, robot: str, *, queued: i
     """A way to one process.
 
     Args:
-        address: ``ipc://PATH``, or ``tcp://HOST:PORT`` of that robot.
+        address: ``tcp://HOST:PORT`` of that robot.
         queued: so many messages wait while there is no connection; 0: what is sent then is refused.
     """
     socket = _limited(context.socket(zmq.DEALER))
@@ -107,13 +82,12 @@ def connect(context: Context, address: str, here: Here, robot: str, *, queued: i
         socket.setsockopt(zmq.IMMEDIATE, 1)
     socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
-    if address.startswith("tcp://"):
-        if here.team is None or robot not in here.team.robots:
-            socket.close(0)
-            raise DriverError(f"cannot reach {address}: {here.alone or f'{robot} is not in team.toml'}")
-        socket.curve_publickey = here.public.encode()
-        socket.curve_secretkey = here.secret.encode()
-        socket.curve_serverkey = here.team.robots[robot].public_key.encode()
+    if here.team is None or robot not in here.team.robots:
+        socket.close(0)
+        raise DriverError(f"cannot reach {address}: {here.alone or f'{robot} is not in team.toml'}")
+    socket.curve_publickey = here.public.encode()
+    socket.curve_secretkey = here.secret.encode()
+    socket.curve_serverkey = here.team.robots[robot].public_key.encode()
     socket.connect(address)
     return socket
 
@@ -123,18 +97,13 @@ def has_message(socket: Socket) -> bool:
     return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
 
-def receive(socket: Socket, *, is_team: bool) -> tuple[bytes, bytes, str | None] | None:
+def receive(socket: Socket) -> tuple[bytes, bytes, str] | None:
     """The next message of a listening socket: (whose, content, robot that its key proves); None: there is none.
 
     A message of several parts is dropped: nothing of ours sends one.
     """
     while True:
         try:
-            if not is_team:
-                parts = socket.recv_multipart(zmq.NOBLOCK)
-                if len(parts) == 2:
-                    return parts[0], parts[1], None
-                continue
             frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)  # only frames say whose key it was
         except zmq.Again:
             return None
@@ -167,20 +136,50 @@ def send(socket: Socket, content: bytes) -> bool:
     return True
 
 
-def await_message(socket: Socket, timeout_ns: int) -> bytes | None:
-    """What comes by a way made with `connect`; None: nothing within the time."""
-    socket.setsockopt(zmq.RCVTIMEO, max(-(-timeout_ns // 1_000_000), 0))
-    try:
-        return socket.recv()
-    except zmq.Again:
-        return None
+class TeamWay:
+    """A way to a driver of another robot, with a context of its own."""
 
+    is_lost: Final = False
+    """ZeroMQ connects again by itself."""
 
-def await_sent(socket: Socket, content: bytes, timeout_ns: int) -> bool:
-    """Send as soon as there is a connection; False: there was none within the time."""
-    if send(socket, content):
-        return True
-    return bool(socket.poll(max(-(-timeout_ns // 1_000_000), 0), zmq.POLLOUT)) and send(socket, content)
+    def __init__(self, address: str, here: Here, robot: str) -> None:
+        """
+        Raises:
+            DriverError: the team's keys are not here.
+        """
+        self._context = context()
+        try:
+            self._socket = connect(self._context, address, here, robot)
+        except DriverError:
+            close(self._context)
+            raise
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was let go."""
+        return self._socket.closed
+
+    def send(self, content: bytes) -> bool:
+        """Send at once; False: there is no connection, or its queue is full."""
+        return send(self._socket, content)
+
+    def await_sent(self, content: bytes, timeout_ns: int) -> bool:
+        """Send as soon as there is a connection; False: there was none within the time."""
+        if self.send(content):
+            return True
+        return bool(self._socket.poll(max(-(-timeout_ns // 1_000_000), 0), zmq.POLLOUT)) and self.send(content)
+
+    def await_message(self, timeout_ns: int) -> bytes | None:
+        """What comes; None: nothing within the time."""
+        self._socket.setsockopt(zmq.RCVTIMEO, max(-(-timeout_ns // 1_000_000), 0))
+        try:
+            return self._socket.recv()
+        except zmq.Again:
+            return None
+
+    def close(self, linger_ms: int = 0) -> None:
+        """Let it go, after so many ms in which what was sent may leave."""
+        self._context.destroy(linger=linger_ms)
 
 
 class Gate:

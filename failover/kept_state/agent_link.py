@@ -33,6 +33,7 @@ from checkpoint.segment.task_messages import (
     FromGuard,
     Hello,
     Keeps,
+    Kept,
     Refused,
     Safe,
     encode,
@@ -48,6 +49,9 @@ LOOK_S: Final = 1.0
 """How long a thread holds the socket: another may wait with less patience."""
 DESCRIPTORS_MAX: Final = 2
 """Counters, and a segment."""
+
+EVERY: Final = (1 << 64) - 1
+"""Greater than the number of any commit."""
 
 UNTOLD: Final = "cannot keep a state under the agent: its guard does not say how to begin"
 
@@ -84,6 +88,8 @@ class Guarded:
         self._told_segment = 0
         self.durable = 0
         """Number of the newest commit that a standby holds."""
+        self.kept = 0
+        """The same on this robot's disk, told while no robot could stand by."""
         try:
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it has hung up; it may have said why
                 end.send(encode(Hello()), socket.MSG_NOSIGNAL)
@@ -194,6 +200,27 @@ class Guarded:
         close_all(descriptors)
         if isinstance(message, Safe):
             self.durable = max(self.durable, message.commit)
+        elif isinstance(message, Kept):
+            self.kept = max(self.kept, message.commit)
+
+    def fileno(self) -> int:
+        """Readable: `hear` has something to take in; or the guard has gone."""
+        return self._end.fileno()
+
+    def hear(self) -> int:
+        """Take in what the guard has said, without a wait; the number of the newest commit that a standby holds.
+
+        `EVERY` while no robot can stand by: the agent writes to this robot's disk now and then, and to wait for that helps
+        little.
+
+        Raises:
+            NotCommittedError: the guard has gone.
+        """
+        with self._hearing:
+            before = (-1, -1)
+            while before != (before := (self.durable, self.kept)):
+                self._hear(0)
+        return EVERY if self.kept > self.durable else self.durable
 
     def close(self) -> None:
         """Let go of the socket."""

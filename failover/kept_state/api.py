@@ -120,6 +120,23 @@ class Task:
             self._open_transaction = None
         self._commit()
 
+    @property
+    def is_missing(self) -> bool:
+        """Whether the last commit was not made, because readers held all its memory: commit again."""
+        return self._is_missing
+
+    def fileno(self) -> int:
+        """Can be read when `safe` may have something new."""
+        return self._keeping.fileno()
+
+    def safe(self) -> int:
+        """The number of the newest commit that is safe, without a wait; above all while no robot can stand by.
+
+        Raises:
+            NotCommittedError: no later one can become safe.
+        """
+        return self._keeping.hear()
+
     def wait_committed(self, timeout: float | None = None) -> None:
         """Return when the newest commit is safe.
 

@@ -185,8 +185,12 @@ class Versioned(Protocol):
         ...
 
 
-def schema_of(cls: type, declaration: Versioned, name: str) -> Schema:
-    """The schema of everything that a class keeps: one, so that an object in two attributes stays one."""
+def schema_of(cls: type, declaration: Versioned, name: str, more: Mapping[str, Field] | None = None) -> Schema:
+    """The schema of everything that a class keeps: one, so that an object in two attributes stays one.
+
+    Args:
+        more: what is kept besides its attributes.
+    """
     try:
         hints = typing.get_type_hints(cls, include_extras=True)
     except NameError as error:
@@ -205,7 +209,7 @@ def schema_of(cls: type, declaration: Versioned, name: str) -> Schema:
         )
         for key, one in kept_of(cls).items()
     }
-    return Schema.of_fields(fields, name=name, version=declaration.version, migrations=declaration.migrations)
+    return Schema.of_fields(fields | dict(more or {}), name=name, version=declaration.version, migrations=declaration.migrations)
 
 
 class Component(Protocol):
@@ -249,14 +253,15 @@ def run(cls: type[Any]) -> Any:
     task = open_task(declaration.name, lambda name: schema_of(cls, declaration, name), begin)
     PROCESS.keep(task)
     try:
-        instance = _instance(cls, task)
-        run_steps(task, instance.step, _on_resume(instance, task.resumed), declaration.period_ns)
+        instance = instance_of(cls, task)
+        run_steps(task, instance.step, on_resume_of(instance, task.resumed), declaration.period_ns)
     finally:
         PROCESS.release()
     return instance
 
 
-def _instance(cls: type[R], task: Task) -> R:
+def instance_of(cls: type[C], task: Task) -> C:
+    """The object with its kept attributes, which are the task's value from now on."""
     instance = cls.__new__(cls)
     values = task.value
     vars(instance).update(values)
@@ -267,6 +272,7 @@ def _instance(cls: type[R], task: Task) -> R:
     return instance
 
 
-def _on_resume(instance: object, resumed: Resumed | None) -> Callable[[], object] | None:
+def on_resume_of(instance: object, resumed: Resumed | None) -> Callable[[], object] | None:
+    """Its ``on_resume`` with where the state came from, if there are both."""
     called = getattr(instance, "on_resume", None)
     return None if called is None or resumed is None else lambda: called(resumed)

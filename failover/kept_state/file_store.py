@@ -169,6 +169,7 @@ class Recorder:
         self._hurry = threading.Event()
         self._written = threading.Condition()
         self._is_closing = False
+        self._told = -1
         self._thread = threading.Thread(target=self._record, name="failover-recorder", daemon=True)
         self._pid = os.getpid()
 
@@ -178,6 +179,21 @@ class Recorder:
             self._fresh.set()
             if self._thread.ident is None:
                 self._thread.start()
+
+    def fileno(self) -> int:
+        """Can be read after a write, once; `hear` reads it."""
+        if self._told < 0:
+            self._told = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        return self._told
+
+    def hear(self) -> int:
+        """The number of the newest commit that is safe; the thread makes haste until the newest is."""
+        if self._told >= 0:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._told)
+        if self.durable < self._state.number:
+            self._hurry.set()
+        return self.durable
 
     def wait(self, number: int, timeout: float | None) -> None:
         """Return when commit ``number`` is safe.
@@ -209,6 +225,9 @@ class Recorder:
         if self._session is not None:
             self._session.close()
         self._file.close()
+        if self._told >= 0:
+            os.close(self._told)
+            self._told = -1
 
     def _record(self) -> None:
         while not (self._is_closing and self.durable >= self._state.number):
@@ -240,6 +259,8 @@ class Recorder:
         with self._written:
             self.durable, self.trouble = durable, ""
             self._written.notify_all()
+        if self._told >= 0:
+            os.eventfd_write(self._told, 1)
         return True
 
     def _tidy(self) -> bool:

@@ -338,15 +338,15 @@ class Component:
         """The snapshot of ``position`` is a checkpoint: deltas start there, and the output up to there is committed.
 
         Args:
-            is_safe: a standby holds it; a program that waits for its commit is told.
+            is_safe: a standby holds it; a program that waits for its commit is told; else, that this robot has it.
         """
         totals = self._totals.pop(position, None)
         if totals is not None:
             self.logs.commit(totals, is_safe=is_safe)
         self.limit_output(self.engine == PTRACE or not is_safe)
         self.keeper.tell(keeper_messages.Acknowledge(position))
-        if (commit := self._commits.pop(position, 0)) and is_safe:
-            self._guard.tell(messages.CommitSafe(commit))
+        if commit := self._commits.pop(position, 0):
+            self._guard.tell(messages.CommitSafe(commit) if is_safe else messages.CommitKept(commit))
 
     def limit_output(self, limited: bool) -> None:
         """Bound how much of held output may wait, or do not.

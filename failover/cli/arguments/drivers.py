@@ -1,11 +1,11 @@
-"""names, call, send, path: drivers, and messages to them."""
+"""names, call, send, path, graph: drivers, and messages to them."""
 
 from __future__ import annotations
 
 import argparse
 from typing import Final
 
-from failover.cli.arguments.shared import add_json
+from failover.cli.arguments.shared import add_json, positive
 
 SECONDS_MAX: Final = 86_400.0
 
@@ -30,6 +30,14 @@ def send(room: argparse.ArgumentParser) -> None:
     _name_of_driver(room)
     room.add_argument("message", metavar="JSON", help="a message, as ENVELOPE.md says; - reads it from standard input")
     _timeout(room)
+    add_json(room)
+
+
+def graph(room: argparse.ArgumentParser) -> None:
+    """Of ``failover graph``."""
+    room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
+    room.add_argument("--every-ms", metavar="MS", type=positive, default=2_000, help="with --watch (default: 2000)")
+    room.add_argument("--dot", action="store_true", help="print a graph for Graphviz")
     add_json(room)
 
 

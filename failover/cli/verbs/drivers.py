@@ -1,24 +1,26 @@
-"""names, call, send, path: who answers to which name, and messages to drivers by hand."""
+"""names, call, send, path, graph: who answers to which name, and messages to drivers by hand."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
+import time
 from collections import defaultdict
 from typing import Any, Final
 
 import msgspec
 
+from failover.cli.output import graph as graph_output
 from failover.cli.output import names_tree, render
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.clocks import Bounds, ClockPair, Part, parts
 from failover.core.messaging.envelope import MESSAGE_SIZE_MAX, Envelope, Hop
 from failover.core.naming.tree import Place, Reach, Tree, robot_of
-from failover.drivers import sockets
 from failover.drivers.here import Here, here
 from failover.drivers.lookup import lookup, whole_tree
-from failover.drivers.proxy import Proxy, address_of
+from failover.drivers.proxy import Proxy, address_of, way_to
 from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError, RequestError
 
 EXCHANGES: Final = 8
@@ -84,14 +86,13 @@ def _exchanged(here: Here, place: Place, content: bytes, timeout_s: float) -> by
     Raises:
         NoAnswerError: there is none.
     """
-    context = sockets.context()
     timeout_ns = round(timeout_s * 1e9)
+    way = way_to(here, address_of(here, place), place.robot)
     try:
-        way = sockets.connect(context, address_of(here, place), here, place.robot)
-        if sockets.await_sent(way, content, timeout_ns) and (answer := sockets.await_message(way, timeout_ns)) is not None:
+        if way.await_sent(content, timeout_ns) and (answer := way.await_message(timeout_ns)) is not None:
             return answer
     finally:
-        sockets.close(context)
+        way.close()
     raise NoAnswerError(f"{place.record.path} did not answer within {timeout_s:g} s; it may still carry the message out")
 
 
@@ -103,6 +104,40 @@ def _json(text: str, what: str) -> Any:
 
 
 # --- The way of a message --------------------------------------------------------------------------------------------
+
+
+def graph(arguments: argparse.Namespace) -> int:
+    """Who has talked to whom in the last hour; with --watch again and again until Ctrl-C."""
+    place = here()
+    with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
+        while True:
+            edges, silent = _edges(place, whole_tree(place))
+            if arguments.json:
+                render.as_json({"edges": edges, "silent": silent})
+            elif arguments.dot:
+                print(render.spoken(graph_output.dot(edges)), flush=True)
+            else:
+                told = f"; no answer from {', '.join(silent)}" if silent else ""
+                draw(graph_output.COLUMNS, graph_output.rows(edges), f"{len(edges)} edges in the last hour{told}")
+            if not arguments.watch:
+                return 1 if silent else 0
+            time.sleep(arguments.every_ms / 1_000)
+    return 0  # Ctrl-C ended the watch
+
+
+def _edges(here: Here, tree: Tree) -> tuple[list[dict[str, Any]], list[str]]:
+    """All edges, the busiest first; and the drivers that did not tell theirs."""
+    found: list[dict[str, Any]] = []
+    silent: list[str] = []
+    for place in _live(tree):
+        try:
+            with Proxy(here, place) as driver:
+                rows = driver.call("_graph", timeout=ASK_S)
+        except (NoAnswerError, CallRefusedError, DriverError):
+            silent.append(place.record.path)
+            continue
+        found += [{"from": row["from"], "to": place.record.path} | row for row in rows]
+    return sorted(found, key=lambda row: (-row["count"], row["from"], row["to"], row["verb"])), silent
 
 
 def path(arguments: argparse.Namespace) -> int:

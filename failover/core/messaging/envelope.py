@@ -72,6 +72,7 @@ class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from"
         sender: ``from`` on the wire. by: the person for whom it is done.
         boot, seq: the sender's life and the message's number in it, see `failover.core.messaging.mailbox`.
         after: the number of the message that must be handled before. reliable: it is sent until it is answered.
+        had: the sender has all answers up to this number, and will not ask for them again.
         deadline_ms: how long from now on it is worth being handled.
         hops: who passed it on.
         ok, error: of an answer: the result or why there is none.
@@ -87,6 +88,7 @@ class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from"
     boot: int = 0
     seq: int = 0
     after: int = 0
+    had: int = 0
     reliable: bool = False
     deadline_ms: float | None = None
     hops: tuple[Hop, ...] = ()
@@ -136,11 +138,10 @@ def _own(content: bytes) -> Envelope | None:
             return None
     except (msgspec.MsgspecError, UnicodeError, ValueError, RecursionError):
         return None  # why, the other way says
-    held: list[Any] = [envelope.boot, envelope.seq, envelope.after]
-    for hop in envelope.hops:
-        held += (hop.came, hop.left)
-    held += [one for one in (envelope.body, envelope.ok) if one is not UNSET]
-    check(held)
+    if envelope.body is not UNSET and not _is_flat(envelope.body):
+        check([envelope.body])
+    if envelope.ok is not UNSET and not _is_flat(envelope.ok):
+        check([envelope.ok])
     _check_numbers(envelope)
     return envelope
 
@@ -251,12 +252,33 @@ def _containers(value: object) -> list[Any]:
     return found
 
 
+def _is_flat(value: object) -> bool:
+    """Whether `check` would find nothing in it, by a short look: most bodies are a few numbers."""
+    if type(value) is not dict:
+        return value is None or value is True or value is False
+    for key, one in value.items():
+        kind = type(one)
+        if kind is float:
+            if one - one != 0:  # neither finite
+                return False
+        elif kind is int:
+            if not -INTEGER_MAX <= one <= INTEGER_MAX:
+                return False
+        elif kind is not bool and one is not None:
+            return False
+        if type(key) is not str or not key.isascii():
+            return False
+    return len(value) < ELEMENTS_MAX
+
+
 def check(fields: object) -> None:
     """Refuse what is too deep, too much, or not the same number in every language.
 
     Raises:
         EnvelopeError: says which.
     """
+    if _is_flat(fields):
+        return
     level: list[object] = [fields]
     count = 0
     for _ in range(DEPTH_MAX + 1):
@@ -297,15 +319,21 @@ def _check_text(text: str) -> None:
 
 
 def _check_numbers(envelope: Envelope) -> None:
-    if min(envelope.boot, envelope.seq, envelope.after) < 0:
-        raise EnvelopeError("the message has a negative boot, seq or after")
+    for number in (envelope.boot, envelope.seq, envelope.after, envelope.had):
+        if number < 0:
+            raise EnvelopeError("the message has a negative boot, seq, after or had")
+        if number > INTEGER_MAX:
+            raise EnvelopeError(f"the message holds the integer {number}: above 2^53 it must be written as text")
     if len(envelope.hops) > HOPS_MAX:
         raise EnvelopeError(
             f"the message was passed on {len(envelope.hops)} times, {HOPS_MAX} are the most: names lead in a circle"
         )
     for hop in envelope.hops:
         for stamp in (hop.came, hop.left):
-            if isinstance(stamp, str) and not (stamp.isascii() and stamp.isdigit() and len(stamp) < 20):
+            if isinstance(stamp, int):
+                if not -INTEGER_MAX <= stamp <= INTEGER_MAX:
+                    raise EnvelopeError(f"the message holds the integer {stamp}: above 2^53 it must be written as text")
+            elif isinstance(stamp, str) and not (stamp.isascii() and stamp.isdigit() and len(stamp) < 20):
                 raise EnvelopeError(f"the message has the stamp {stamp[:40]!r}: write nanoseconds, from 2^53 on as text")
 
 

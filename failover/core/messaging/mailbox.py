@@ -32,7 +32,7 @@ import msgspec
 from msgspec import Struct
 
 from failover.core.messaging.envelope import Envelope, refusal
-from failover.errors import MailboxFullError
+from failover.errors import EnvelopeError, MailboxFullError
 
 MAILBOX_MAX: Final = 1_024
 """Messages that wait: a driver of 20 Hz is a minute behind."""
@@ -85,6 +85,7 @@ class Outbox:
         """May have arrived: all that was kept, too, as it may have left after the commit."""
         self._unsent: deque[Waiting] = deque()
         self._free = self._seq
+        self._had = 0
         self._is_connected = True
         self._again_ns: int | None = 0 if self._sent else None
         self._pause_ns = RESEND_FIRST_NS
@@ -115,8 +116,10 @@ class Outbox:
         return envelope
 
     def committed(self) -> None:
-        """All that was posted so far is kept, and may leave."""
+        """All that was posted so far is kept, and may leave; so is which answers have come."""
         self._free = self._seq
+        waiting = (one.envelope.seq for one in (*self._sent, *self._unsent) if one.envelope.reliable)
+        self._had = next(waiting, self._seq + 1) - 1
 
     def connected(self, now_ns: int) -> None:
         """The link stands again: what may not have arrived is sent again, in order, at once."""
@@ -141,14 +144,14 @@ class Outbox:
         if self._again_ns is not None and now_ns >= self._again_ns:
             after = 0
             for one in self._sent:
-                found.append(_as_sent(one, after, now_ns))
+                found.append(_as_sent(one, after, self._had, now_ns))
                 after = one.envelope.seq if one.envelope.reliable else after
             self._sent = deque(one for one in self._sent if one.envelope.reliable)
             self._again_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, RESEND_MOST_NS)
         while self._unsent and self._unsent[0].envelope.seq <= self._free:
             one = self._unsent.popleft()
-            found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, now_ns))
+            found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, self._had, now_ns))
             if one.envelope.reliable:
                 self._sent.append(one)
         if self._again_ns is None and self._sent:
@@ -178,10 +181,10 @@ class Outbox:
         ]
 
 
-def _as_sent(one: Waiting, after: int, now_ns: int) -> Envelope:
+def _as_sent(one: Waiting, after: int, had: int, now_ns: int) -> Envelope:
     """With what is left of its time: the receiver counts it by its own clock."""
     left_ms = None if one.until_ns is None else max(one.until_ns - now_ns, 0) / MS
-    return msgspec.structs.replace(one.envelope, after=after, deadline_ms=left_ms)
+    return msgspec.structs.replace(one.envelope, after=after, had=had, deadline_ms=left_ms)
 
 
 # --- Receiving --------------------------------------------------------------------------------------------------------
@@ -199,6 +202,22 @@ class Stream(Struct):
     last: int = 0
     reliable: int = 0
     answers: dict[int, Envelope] = {}
+
+
+_pack: Final = msgspec.msgpack.Encoder().encode
+_streams: Final = msgspec.msgpack.Decoder(list[tuple[str, Stream]])
+
+
+def unpacked(content: bytes) -> dict[str, Stream]:
+    """What `Mailbox.packed` has written; b"": nothing.
+
+    Raises:
+        EnvelopeError: it is damaged.
+    """
+    try:
+        return dict(_streams.decode(content)) if content else {}
+    except msgspec.DecodeError as error:
+        raise EnvelopeError(f"the kept mailbox is damaged: {error}") from error
 
 
 class Taken(Struct):
@@ -227,7 +246,10 @@ class Mailbox:
         self._taken = {sender: Taken(one.boot, one.last, one.reliable) for sender, one in self._streams.items()}
         self._queue: deque[Arrived] = deque()
         self._held = 0
-        self._answers: list[Envelope] = []
+        self._answers: deque[Envelope] = deque()
+        self._packed: dict[str, bytes] = {}
+        self.handled = 0
+        """Messages told `done` so far."""
         self._free = {sender: one.reliable for sender, one in self._streams.items()}
 
     def __len__(self) -> int:
@@ -236,6 +258,18 @@ class Mailbox:
     def kept(self) -> dict[str, Stream]:
         """What must be kept with the effects of the messages that are done."""
         return {sender: Stream(one.boot, one.last, one.reliable, dict(one.answers)) for sender, one in self._streams.items()}
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether so many answers wait for a commit that no more should be handled before."""
+        return len(self._answers) >= MAILBOX_MAX
+
+    def packed(self) -> bytes:
+        """`kept` as bytes; only senders of which something was done since the last time are encoded anew."""
+        for sender, stream in self._streams.items():
+            if sender not in self._packed:
+                self._packed[sender] = _pack((sender, stream))
+        return b"\xdd" + len(self._streams).to_bytes(4, "big") + b"".join(self._packed[sender] for sender in self._streams)
 
     # --- A message arrives ------------------------------------------------------------------------------------------------
 
@@ -321,6 +355,7 @@ class Mailbox:
     def done(self, envelope: Envelope, answer: Envelope) -> None:
         """A message was handled, with this answer; it leaves after the next `committed`."""
         self._answers.append(answer)
+        self.handled += 1
         if not envelope.seq or not envelope.sender:
             return
         stream = self._streams.get(envelope.sender)
@@ -328,22 +363,27 @@ class Mailbox:
             stream = self._streams[envelope.sender] = Stream(envelope.boot, answers={})
             self._free.pop(envelope.sender, None)
         self._streams.move_to_end(envelope.sender)
+        self._packed.pop(envelope.sender, None)
         if envelope.boot == stream.boot:
             stream.last = envelope.seq
             if envelope.reliable:
                 stream.reliable = envelope.seq
+                for had in [seq for seq in stream.answers if seq <= envelope.had]:
+                    del stream.answers[had]
                 stream.answers[envelope.seq] = answer
                 if len(stream.answers) > WINDOW:
                     del stream.answers[next(iter(stream.answers))]
         if len(self._streams) > SENDERS_MAX:
             sender, _ = self._streams.popitem(last=False)
             self._free.pop(sender, None)
+            self._packed.pop(sender, None)
             taken = self._taken.pop(sender, None)
             self._held -= len(taken.held) if taken is not None else 0
 
-    def committed(self) -> list[Envelope]:
-        """All that is done is kept: the answers that may leave now."""
-        answers, self._answers = self._answers, []
+    def committed(self, handled: int | None = None) -> list[Envelope]:
+        """All that is done is kept, or so many as were `handled` once: the answers that may leave now."""
+        count = len(self._answers) - (0 if handled is None else self.handled - handled)
+        answers = [self._answers.popleft() for _ in range(max(count, 0))]
         for answer in answers:
             stream = self._streams.get(answer.to)
             if stream is not None and stream.boot == answer.boot and answer.seq in stream.answers:

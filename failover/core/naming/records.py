@@ -26,7 +26,7 @@ class Record(Struct, frozen=True, omit_defaults=True):
 
     Attributes:
         path: in normal form, see `failover.core.naming.names`.
-        addresses: where it takes messages: ``tcp://IP:port``, ``ipc://PATH``; the nearest first.
+        addresses: where it takes messages: ``tcp://IP:port``, ``local://PATH``; the nearest first.
         aliases: free texts by which it may be called, too.
         verbs: name → what it takes and returns, as a JSON schema; {} for not said.
         versions: of its program, the active one first.

@@ -21,6 +21,7 @@ from checkpoint.segment.task_messages import (
     FromGuard,
     Hello,
     Keeps,
+    Kept,
     Origin,
     Refused,
     Safe,
@@ -127,6 +128,9 @@ def test_only_what_is_newer_is_told_to_be_safe_and_only_to_who_has_begun(end: Ta
         for commit in (2, 2, 1, 5):
             end.tell_safe(commit)
         assert [heard(program)[0] for _ in range(2)] == [Safe(2), Safe(5)]
+        for commit in (6, 6, 7):
+            end.tell_kept(commit)
+        assert [heard(program)[0] for _ in range(2)] == [Kept(6), Kept(7)]
 
 
 def test_what_did_not_fit_is_told_the_next_time(end: TaskEnd) -> None:

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from checkpoint.errors import TaskPacketError
 from checkpoint.segment import task_messages
-from checkpoint.segment.task_messages import REASONS, Begin, FromGuard, Hello, Keeps, Origin, Packet, Refused, Safe
+from checkpoint.segment.task_messages import REASONS, Begin, FromGuard, Hello, Keeps, Kept, Origin, Packet, Refused, Safe
 from failover.core.types import Resumption
 
 DOCUMENT = (Path(task_messages.__file__).parent / "TASK.md").read_text()
 BEGIN = Begin("/lab/heater", 3, (100, 101))
 RESUMED = Begin("/lab/heater", 4, (102, 103), Origin("robot1", 129, "taken over", 250_000_000))
-FROM_GUARD: tuple[FromGuard, ...] = (BEGIN, RESUMED, Refused("another process keeps it"), Safe(42))
+FROM_GUARD: tuple[FromGuard, ...] = (BEGIN, RESUMED, Refused("another process keeps it"), Safe(42), Kept(43))
 FROM_PROGRAM = (Hello(), Keeps())
 HEAD = [(0, 4), (4, 4)]
 
@@ -62,6 +62,7 @@ def test_every_field_means_what_the_document_says() -> None:
     assert in_fields(RESUMED) == [2, 1, 4, 102, 103, 2, 0, 129, 250_000_000, begun, b"robot1".ljust(64, b"\0")]
     assert in_fields(Refused("no")) == [3, 1, b"no".ljust(504, b"\0")]
     assert in_fields(Safe(42)) == [5, 1, 42]
+    assert in_fields(Kept(42)) == [6, 1, 42]
     told = re.search(r"why it goes on from a state: 0 it does not, it begins; (.*) \|", DOCUMENT)
     assert told is not None
     assert told[1] == "; ".join(f"{number} {why}" for number, why in enumerate(REASONS, 1))

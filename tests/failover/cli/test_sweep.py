@@ -51,7 +51,7 @@ PROGRAMS = (
         ["send", "junk", "--to", "robot2"],
     ),
 )
-DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"])
+DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"], ["graph"])
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],

@@ -22,6 +22,7 @@ from failover.core.messaging.mailbox import MAILBOX_MAX
 from failover.core.naming.tree import Reach
 from failover.drivers import here as here_module
 from failover.drivers.here import Here, lives, stem
+from failover.drivers.local import LocalWay
 from failover.drivers.lookup import lookup, whole_tree
 from failover.drivers.server import Serving
 from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError
@@ -96,6 +97,36 @@ def test_messages_of_one_sender_are_handled_in_order_while_others_send(engine: S
     heard = engine.instance.heard
     assert [value for value in heard if value > 0] == [number / 100 for number in range(1, 101)]
     assert [-value for value in heard if value < 0] == [number / 100 for number in range(1, 101)]
+
+
+def test_a_large_message_and_a_large_answer_come_whole(engine: Serving, here: Here) -> None:
+    from failover.core.messaging.envelope import Envelope, decode, encode
+    from failover.drivers.proxy import way_to
+
+    way = way_to(here, engine.service.record.addresses[0], "robot1")
+    asked = Envelope(to="engine", verb="read", id="1", sender="test", rest={"note": "x" * 900_000})
+    assert way.await_sent(encode(asked), 10**9)
+    answer = way.await_message(LIMIT_S * 10**9)
+    assert answer is not None and decode(answer).ok == {"duty": 0.0}
+    too_large = (1 << 21).to_bytes(4, "big")
+    with socket.socket(socket.AF_UNIX) as raw:
+        raw.settimeout(LIMIT_S)
+        raw.connect(str(here.file(ENGINE, "calls")))
+        raw.sendall(too_large)
+        assert raw.recv(1) == b""  # and the driver goes on
+    assert way.await_sent(encode(asked), 10**9) and way.await_message(LIMIT_S * 10**9) is not None
+    way.close()
+
+
+def test_a_driver_that_hangs_holds_no_caller_longer_than_its_timeout(here: Here) -> None:
+    with socket.socket(socket.AF_UNIX) as hanging:
+        place = here.file("Lab/Hangs", "calls")
+        hanging.bind(str(place))
+        hanging.listen()
+        way = LocalWay(str(place))
+        content = b"x" * (1 << 20)
+        assert not way.await_sent(content, 1_000_000_000) and way.is_lost
+        way.close()
 
 
 # --- By hand ---------------------------------------------------------------------------------------------------------
@@ -189,7 +220,7 @@ def test_drivers_find_each_other_by_the_scan_alone(here: Here) -> None:
         until(lambda: "engine" in str(resolved(arm, "engine")) and resolved(engine, "arm"))
         assert resolved(arm, "engine").record.path == ENGINE
         assert [place.record.path for place in whole_tree(here).under()] == ["Lab/Robotino/Arm", ENGINE]
-    assert list(here.directory.glob("*.names")) == list(here.directory.glob("*.ipc")) == list(here.directory.glob("*.hand")) == []
+    assert [path.name for path in here.directory.iterdir() if path.suffix in (".names", ".calls", ".hand")] == []
 
 
 def resolved(one: Serving, name: str) -> Any:
@@ -250,7 +281,7 @@ def process() -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as one:
         try:
             assert one.stderr is not None
-            assert "takes messages at ipc://" in one.stderr.readline()
+            assert "takes messages at local://" in one.stderr.readline()
             assert "only programs of this user on robot1 reach it" in one.stderr.readline()
             yield one
         finally:
@@ -301,17 +332,6 @@ def test_what_cannot_be_a_driver_is_refused_when_it_is_declared() -> None:
             declared(**arguments)
     with pytest.raises(DriverError, match="has no verb"):
         failover.driver("a/b")(type("Empty", (), {}))
-
-    @failover.driver("a/b")
-    class Keeping:
-        duty = failover.kept(default=0.0)
-
-        @failover.query
-        def read(self) -> float:
-            return self.duty
-
-    with pytest.raises(DriverError, match="keeps none yet"):
-        failover.run(Keeping)
 
     with pytest.raises(DriverError, match="cannot be in a message"):
 

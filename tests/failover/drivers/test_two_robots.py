@@ -79,15 +79,14 @@ def test_a_name_in_another_robots_subtree_is_refused(lab: Lab) -> None:
 
 def asked(here: Here, address: str, robot: str, envelope: Envelope) -> Envelope | None:
     """The answer to one message, if there is one soon."""
-    context = sockets.context()
+    way = sockets.TeamWay(address, here, robot)
     try:
-        way = sockets.connect(context, address, here, robot)
-        if not sockets.await_sent(way, encode(envelope), 2_000_000_000):
+        if not way.await_sent(encode(envelope), 2_000_000_000):
             return None
-        content = sockets.await_message(way, 2_000_000_000)
+        content = way.await_message(2_000_000_000)
         return None if content is None else decode(content)
     finally:
-        sockets.close(context)
+        way.close()
 
 
 def address_of(one: Serving) -> str:
@@ -108,11 +107,9 @@ def test_a_key_that_is_not_in_the_team_is_not_answered(lab: Lab) -> None:
         assert asked(stranger, address_of(engine), "robot1", READ) is None
         until(lambda: engine._gate.refused)
         door = "tcp://{}:{}".format(*host_and_port(lab.team, "robot1"))
-        context = sockets.context()
-        try:
-            assert not sockets.await_sent(sockets.connect(context, door, stranger, "robot1"), b"x", 1_000_000_000)
-        finally:
-            sockets.close(context)
+        way = sockets.TeamWay(door, stranger, "robot1")
+        assert not way.await_sent(b"x", 1_000_000_000)
+        way.close()
 
 
 def msgspec_replace(robot: Any, public: str) -> Any:
@@ -128,7 +125,7 @@ def test_a_robot_cannot_speak_for_another_one(lab: Lab) -> None:
 
 def test_without_a_key_no_port_is_open(here: Here) -> None:
     with serving(Engine, here) as engine:
-        assert [address.partition(":")[0] for address in engine.service.record.addresses] == ["ipc", "unix"]
+        assert [address.partition(":")[0] for address in engine.service.record.addresses] == ["local", "unix"]
         assert engine._team is None and not engine.service._exchange.is_door
         assert engine.addresses_told()[1] == "only programs of this user on robot1 reach it: this test has no team"
 
