@@ -220,6 +220,7 @@ class Described(Message, frozen=True):
         blocked: why output is held back, "" if it is not.
         engine: as it was asked for.
         task_pid: of the process that keeps the state, 0 while there is none; keeps: it has made a commit.
+        hears_kept: this guard knows `CommitKept`; a guard from before an upgrade hangs up on it, and does not say this.
     """
 
     component: str
@@ -239,6 +240,7 @@ class Described(Message, frozen=True):
     engine: str = PTRACE
     task_pid: int = 0
     keeps: bool = False
+    hears_kept: bool = False
 
 
 class Refused(Message, frozen=True):

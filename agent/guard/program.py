@@ -409,6 +409,7 @@ class GuardedProgram(Struct):
             engine=self.engine,
             task_pid=self.task.pid if self.task is not None else 0,
             keeps=self.task is not None and self.task.keeps,
+            hears_kept=True,
         )
 
     def _check_alive(self, what: str) -> None:

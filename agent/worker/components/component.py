@@ -150,6 +150,7 @@ class Component:
         self._lease_until_ns = 0
         self._held = False
         self._output_limited: bool | None = None
+        self._hears_kept = True
         self.guest: Guest | None = None
         guard.heard = self._heard
         guard.ended = self._guard_lost
@@ -345,7 +346,7 @@ class Component:
             self.logs.commit(totals, is_safe=is_safe)
         self.limit_output(self.engine == PTRACE or not is_safe)
         self.keeper.tell(keeper_messages.Acknowledge(position))
-        if commit := self._commits.pop(position, 0):
+        if (commit := self._commits.pop(position, 0)) and (is_safe or self._hears_kept):
             self._guard.tell(messages.CommitSafe(commit) if is_safe else messages.CommitKept(commit))
 
     def limit_output(self, limited: bool) -> None:
@@ -458,6 +459,7 @@ class Component:
         self.limit_output(self.engine == PTRACE)
         if isinstance(born, Described):
             self.engine_wanted, self.task_pid, self.keeps = born.engine, born.task_pid, born.keeps
+            self._hears_kept = born.hears_kept
 
     def _take_streams(self, streams: tuple[int, ...]) -> None:
         """These are its streams' descriptors from now on; those before are closed."""

@@ -10,13 +10,16 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Final
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from agent.errors import GuardError
+from agent.guard.messages import CommitKept, CommitSafe, Describe, Described
 from agent.worker.components import launch, process_pool
 from agent.worker.components.component import Captured, Component
 from agent.worker.components.launch import Program, RestoreOptions
@@ -190,6 +193,36 @@ def test_a_commit_is_safe_for_its_program_when_it_was_acknowledged_and_not_befor
             assert output(component) == b"committed\n"
             await component.acknowledge(captured.position)
             await until(lambda: output(component) == b"committed\nsafe\n", "the program to hear of it")
+
+    live(tmp_path, story)
+
+
+@pytest.mark.parametrize("hears", [True, False], ids=["a guard of today", "a guard from before the upgrade"])
+def test_only_a_guard_that_knows_the_message_is_told_that_this_robot_keeps_a_commit(
+    hears: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A guard that does not know it hangs up, which looks like the end of its program."""
+
+    async def story(places: Places) -> None:
+        first = await started(places, STEPS)
+        await until(lambda: first.keeps, "the agent to hear of its commit")
+        first.close()
+        async with gone_afterwards(await launch.reconnect(guard_sockets(places)[0], places)) as component:
+            if not hears:
+                described, streams = await component.ask_guard(Describe())
+                said = msgspec.to_builtins(described)
+                del said["hears_kept"]
+                component.take(msgspec.convert(said, Described), streams)
+            told: list[object] = []
+            with monkeypatch.context() as patched:
+                patched.setattr(component._guard, "tell", told.append)
+                for sequence, is_safe in ((1, True), (2, False)):
+                    capture = partial(component.capture, base=True, generation=1, sequence=sequence, epoch=3)
+                    captured = await at_last(capture)
+                    os.close(captured.snapshot)
+                    await component.acknowledge(captured.position, is_safe=is_safe)
+            commits = [type(one) for one in told if isinstance(one, CommitSafe | CommitKept)]
+            assert commits == [CommitSafe, *[CommitKept] * hears]
 
     live(tmp_path, story)
 
