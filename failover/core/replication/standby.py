@@ -24,7 +24,7 @@ from failover.core.events import (
     UnderWay,
 )
 from failover.core.membership import Peer
-from failover.core.schedule.slack import LAG_PERIODS
+from failover.core.schedule.slack import LAG_NS_MAX, LAG_PERIODS
 from failover.core.types import ENDED, HISTORY_MAX, MS, PEERS_MAX, Config, OnUnsupported, State
 from failover.core.wire.messages import NEEDS_BASE, Entry
 from failover.core.wire.names import weight
@@ -82,7 +82,7 @@ def capture(component: Component, turn: Turn, final: bool = False) -> None:
         base = base or entry.position != component.parent or bool(entry.flags & NEEDS_BASE)
     component.sequence += 1
     component.flight = Flight(turn.now_ns, turn.now_ns + turn.config.ship_ms * MS, to, final=final)
-    lag_ns = 0 if final else LAG_PERIODS * _period_ns(component, turn, component.flight)
+    lag_ns = 0 if final else min(LAG_PERIODS * _period_ns(component, turn, component.flight), LAG_NS_MAX)
     turn.order(acts.Capture(component.name, component.epoch, base, component.generation, component.sequence, final, lag_ns))
 
 

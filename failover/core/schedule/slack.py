@@ -27,6 +27,9 @@ MARGIN_NS: Final = 200_000
 
 LAG_PERIODS: Final = 5
 """A capture waits for a window that holds it for so many periods of its component's snapshots: no checkpoint grows much older."""
+LAG_NS_MAX: Final = 1_000_000_000
+"""But no longer than this: orders on the component wait behind its capture. A wait ends after twice this time, before the keeper
+that sleeps in it is taken for one that hangs (`agent.worker.components.stall_watchdog`)."""
 
 FREEZES_KEPT: Final = 64
 FREEZE_RESERVE: Final = 1.2

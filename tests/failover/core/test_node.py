@@ -81,6 +81,14 @@ def test_one_capture_is_in_flight_at_a_time() -> None:
     assert not any(only(node.step(Tick(), at * MS), acts.Capture) for at in range(2, 5_000, 20))
 
 
+@pytest.mark.parametrize(("period_ms", "lag_ms"), [(100, 500), (60_000, 1_000)])
+def test_a_capture_waits_for_its_window_for_five_periods_and_never_for_longer_than_a_second(period_ms: int, lag_ms: int) -> None:
+    """Orders on its component wait behind it."""
+    node = Node(replace(ALONE, alone_period_ms=period_ms), 1, VoteRecord(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture) and capture.lag_ns == lag_ms * MS
+
+
 def test_alone_a_capture_counts_from_this_robots_own_store() -> None:
     node = Node(ALONE, 1, VoteRecord(), 0)
     (capture,) = only(running(node), acts.Capture)

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable
 import pytest
 
 from agent.worker.components import stall_watchdog
-from agent.worker.components.stall_watchdog import STEPS_MAX, Watchman
+from agent.worker.components.stall_watchdog import STEP_S, STEPS_MAX, Watchman
+from failover.core.schedule.slack import LAG_NS_MAX
 
 PATIENCE_S = 30.0
 LOOKS = 3 * STEPS_MAX
@@ -97,3 +98,8 @@ def test_a_process_that_was_stopped_is_really_ended() -> None:
     finally:
         process.kill()
         process.wait()
+
+
+def test_a_keeper_that_waits_for_a_window_answers_before_it_is_taken_for_one_that_hangs() -> None:
+    """It sleeps meanwhile, and may use no tick of its processor."""
+    assert 2 * LAG_NS_MAX < STEPS_MAX * STEP_S * 1e9
