@@ -5,6 +5,7 @@ A capture that is ready to freeze its component asks `Wait.choose`, again after 
     window holds the freeze                              → CAPTURE
     else, and the wait is shorter than ``lag_ns``        → WAIT
     else, right after an activation has ended            → SQUEEZE   counted, told: it delays the next activation
+    else, the next one is due already and has not begun  → SQUEEZE   its task is late, or held: no window is near
     else, and the wait is longer than 2 × ``lag_ns``     → SQUEEZE   no activation ends any more, or none begins
     else                                                 → WAIT
 
@@ -32,10 +33,11 @@ LAG_NS_MAX: Final = 1_000_000_000
 that sleeps in it is taken for one that hangs (`agent.worker.components.stall_watchdog`)."""
 
 FREEZES_KEPT: Final = 64
+FREEZES_TELLING: Final = 8
 FREEZE_RESERVE: Final = 1.2
 FREEZE_NS_MIN: Final = 300_000
-"""A freeze is expected to take as long as 99 % of the last ones (the longest of 64 does not count), and a fifth more; at least so
-long."""
+"""A freeze is expected to take as long as the last 64, and a fifth more; at least so long. From eight on the longest of them does
+not count: it came of a busy machine, and would spoil the next captures."""
 FREEZE_NS_AT_FIRST: Final = 1_000_000
 """Before any was measured."""
 
@@ -104,7 +106,7 @@ class Freezes:
         """How long the next one may take."""
         if not self._kept:
             return FREEZE_NS_AT_FIRST
-        outliers = len(self._kept) // FREEZES_KEPT
+        outliers = 1 if len(self._kept) >= FREEZES_TELLING else 0
         return max(int(sorted(self._kept)[-1 - outliers] * FREEZE_RESERVE), FREEZE_NS_MIN)
 
 
@@ -141,7 +143,9 @@ class Wait:
                 return Choice.CAPTURE
         if waited_ns < self.lag_ns:
             return Choice.WAIT
-        if waited_ns >= 2 * self.lag_ns or (found is not None and _is_fresh(found, now_ns)):
+        if waited_ns >= 2 * self.lag_ns:
+            return Choice.SQUEEZE
+        if found is not None and (_is_fresh(found, now_ns) or _is_overdue(found, now_ns)):
             return Choice.SQUEEZE
         return Choice.WAIT
 
@@ -152,7 +156,12 @@ class Wait:
 
 def _is_fresh(found: Window, now_ns: int) -> bool:
     """Whether an activation has just ended, and the next one is not due yet."""
-    return 0 <= now_ns - found.begin_ns <= FRESH_NS and (found.end_ns is None or now_ns < found.end_ns + MARGIN_NS)
+    return 0 <= now_ns - found.begin_ns <= FRESH_NS and not _is_overdue(found, now_ns)
+
+
+def _is_overdue(found: Window, now_ns: int) -> bool:
+    """Whether none is under way although one is due: its task is late, or held."""
+    return found.end_ns is not None and now_ns >= found.end_ns + MARGIN_NS
 
 
 def remark(task: str, period_ns: int, slack_ns: int, freeze_ns: int, every_ns: int) -> str:

@@ -10,6 +10,7 @@ from failover.core.schedule.slack import (
     FREEZE_NS_AT_FIRST,
     FREEZE_NS_MIN,
     FREEZES_KEPT,
+    FREEZES_TELLING,
     FRESH_NS,
     MARGIN_NS,
     Choice,
@@ -50,9 +51,10 @@ def test_only_a_capture_that_fits_ends_the_wait_early_and_none_waits_for_ever(
     if waited_ns >= 2 * lag_ns:
         assert choice is not Choice.WAIT
     elif choice is Choice.SQUEEZE:
-        last_ns = max((task.ended_ns for task in seen), default=0)
+        now_ns, last_ns = asked_ns + waited_ns, max((task.ended_ns for task in seen), default=0)
         assert not any(task.is_running for task in seen)
-        assert 0 <= asked_ns + waited_ns - last_ns <= FRESH_NS
+        is_overdue = any(task.due_ns is not None and task.due_ns <= now_ns for task in seen)
+        assert is_overdue or 0 <= now_ns - last_ns <= FRESH_NS
 
 
 @given(tasks, freezes, instants, lags)
@@ -92,6 +94,15 @@ def test_a_capture_that_never_fits_waits_and_then_begins_right_after_an_end(now_
     assert wait.slack_ns == 8 * MS - MARGIN_NS
 
 
+def test_a_task_that_is_held_or_late_costs_a_capture_no_second_lag() -> None:
+    """None of its activations ends soon, and no window is near."""
+    wait, held = Wait(0, LAG, 1 * MS), TaskSeen(False, 1 * MS, 50 * MS)
+    assert wait.choose([held], LAG - 1) is Choice.WAIT
+    assert wait.choose([held], LAG) is Choice.SQUEEZE
+    assert wait.choose([held, TaskSeen(True, 0, 40 * MS)], LAG) is Choice.WAIT, "the end of the other one is worth waiting for"
+    assert wait.choose([TaskSeen(False, 1 * MS, LAG + 1)], LAG) is Choice.WAIT, "it begins soon, and ends"
+
+
 def test_a_freeze_is_expected_to_take_as_long_as_all_but_the_longest_of_many() -> None:
     freezes = Freezes()
     assert freezes.expected_ns == FREEZE_NS_AT_FIRST
@@ -107,6 +118,16 @@ def test_a_freeze_is_expected_to_take_as_long_as_all_but_the_longest_of_many() -
     for _ in range(FREEZES_KEPT):
         freezes.note(400_000)
     assert freezes.expected_ns == 480_000
+
+
+def test_one_long_freeze_does_not_spoil_the_captures_after_it() -> None:
+    freezes = Freezes()
+    freezes.note(80 * MS)
+    for _ in range(FREEZES_TELLING - 2):
+        freezes.note(MS)
+    assert freezes.expected_ns == 96 * MS, "too few to tell"
+    freezes.note(MS)
+    assert freezes.expected_ns == 1_200_000
 
 
 def test_the_sentence_tells_state_delay_and_cure() -> None:
