@@ -28,7 +28,7 @@ from failover.boards.fence import FENCE
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout
 from failover.core.schedule.activation import State
-from failover.core.schedule.layout import ROW_LOCKS, SETTLED_FIELD
+from failover.core.schedule.layout import CPU_LOCKS, ROW_LOCKS, SETTLED_FIELD
 from failover.core.schedule.slack import Choice, Freezes, TaskSeen, Wait
 from failover.core.schedule.terms import CPUS_MAX, TASKS_MAX, Kind
 from failover.errors import FailoverError
@@ -41,8 +41,6 @@ BUSY_NS: Final = 200_000
 """Between two tries while another keeper's program stands still on a processor of ours."""
 READINGS: Final = 8
 """Of a row whose activation just begins or ends."""
-CPU_LOCKS: Final = 1 << 42
-"""Bytes of the file: byte i is locked while a program of processor i stands still."""
 
 UNKNOWN: Final = (State.IDLE, State.DONE)
 """States without a next activation that could be foreseen."""
@@ -111,7 +109,7 @@ class SlackGate:
         task, period_ns = self._first_due(file)
         self._outcome = Slack(
             *(task, period_ns, self._opened_ns, ended_ns, self._opened_ns - wait.asked_ns),
-            *(slack_ns, wait.freeze_ns, self._is_squeezed),
+            *(slack_ns, wait.freeze_ns, self._is_squeezed and stood_still),
         )
         self._opened_ns = 0
 

@@ -34,6 +34,13 @@ with failover.scheduled(sys.argv[1], period=1000, cpus=tuple(map(int, sys.argv[2
     print(flush=True)
     sys.stdin.read()
 """
+BUSY = """
+import sys, failover
+with failover.scheduled("busy", period=0.2) as task:
+    for tick in task:
+        print(flush=True)
+        sys.stdin.read()
+"""
 IDLE = "import sys; print(flush=True); sys.stdin.read()"
 POSING = """
 import fcntl, os, sys
@@ -71,11 +78,11 @@ def process(program: str, place: Path, *words: str) -> Iterator[subprocess.Popen
         child.kill()
 
 
-def captured(gate: SlackGate, pid: int, lag_ns: int = LAG_NS) -> slack_gate.Slack | None:
+def captured(gate: SlackGate, pid: int, lag_ns: int = LAG_NS, *, stood_still: bool = True) -> slack_gate.Slack | None:
     gate.begin(lag_ns)
     while not gate.opens((pid,)):
         pass
-    gate.closes(stood_still=True)
+    gate.closes(stood_still=stood_still)
     return gate.outcome
 
 
@@ -93,6 +100,14 @@ def test_captures_begin_between_two_activations(steady: subprocess.Popen[str]) -
         begun, ended = steady.stdout.readline().split()
         activations.append((int(begun), int(ended)))
     assert not [one for one in began for begun, ended in activations if begun <= one < ended]
+
+
+@pytest.mark.parametrize("stood_still", [True, False])
+def test_only_a_program_that_stood_still_was_delayed(place: Path, stood_still: bool) -> None:
+    """One that commits its state goes on while its commit is read."""
+    with process(BUSY, place) as child:
+        found = captured(slack_gate.gate(), child.pid, lag_ns=1_000_000, stood_still=stood_still)
+    assert found is not None and found.is_squeezed is stood_still
 
 
 def test_the_wait_for_an_end_leaves_no_flag_behind(steady: subprocess.Popen[str], place: Path) -> None:

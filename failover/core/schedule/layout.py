@@ -65,7 +65,9 @@ AT_NEXT: Final = 2
 
 TABLE_LOCK: Final = 1 << 62
 ROW_LOCKS: Final = 1 << 41
-"""Bytes of the file that stand for something when they are locked: the table changes; row i is run by a process."""
+CPU_LOCKS: Final = 1 << 42
+"""Bytes of the file that stand for something when they are locked: the table changes; row i is run by a process; a program whose
+task runs on processor i stands still for a capture."""
 
 HEADER: Final = struct.Struct("<8sIIQIIQ16sQ64s")
 ROWS_AT: Final = 4096

@@ -169,13 +169,14 @@ def remark(task: str, period_ns: int, slack_ns: int, freeze_ns: int, every_ns: i
 
     Args:
         period_ns: of the task; 0: it has none.
+        slack_ns: 0: no window was seen, and no period is known to help.
         freeze_ns: as it is expected.
         every_ns: from one capture to the next.
     """
     short_ns = max(freeze_ns - slack_ns, 0)
     delayed = f"captures delay {task} by {_milliseconds(short_ns)} ms every {every_ns / MS:.0f} ms"
     state = f"slack {_milliseconds(slack_ns)} ms, freeze {_milliseconds(freeze_ns)} ms: {delayed}"
-    return f"{state}; a period of {math.ceil((period_ns + short_ns) / MS)} ms would do" if period_ns else state
+    return f"{state}; a period of {math.ceil((period_ns + short_ns) / MS)} ms would do" if period_ns and slack_ns else state
 
 
 def _milliseconds(duration_ns: int) -> str:

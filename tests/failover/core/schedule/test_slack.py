@@ -135,6 +135,8 @@ def test_the_sentence_tells_state_delay_and_cure() -> None:
         "slack 0.4 ms, freeze 0.9 ms: captures delay mapper by 0.5 ms every 500 ms; a period of 60 ms would do"
     )
     assert remark("once", 0, 400_000, 900_000, 500 * MS).endswith("captures delay once by 0.5 ms every 500 ms")
+    without = remark("busy", 59_200_000, 0, 900_000, 500 * MS)
+    assert without.endswith("captures delay busy by 0.9 ms every 500 ms"), "no window was seen: no period is known to help"
 
 
 def test_the_window_is_from_the_last_end_to_the_first_due() -> None:
