@@ -64,6 +64,8 @@ BUDGET_PASS_LIMIT: Final = 12
 """The same where the rest shall fit a budget."""
 CATCHING_UP: Final = 0.8
 """The share of the earlier pass: a pass that copies more than this share does not catch up."""
+SHED_SHARE: Final = 2
+"""A copy of which less than one part in so many still counts is replaced by that part."""
 VDSO: Final = "[vdso]"
 UNACKNOWLEDGED_LIMIT: Final = 64
 """Scans that are remembered one by one. Beyond, the oldest two become one, and the older position can be acknowledged no more: a
@@ -72,6 +74,13 @@ standby whose disk is full for a week must not make every freeze longer."""
 
 SharedPlaces = frozenset[tuple[int, int, int, int]]
 """Parts of shared memory: device and inode number of the object, first and last offset of the part."""
+
+
+def _part_of(copy: Copy, wanted: Words) -> Copy:
+    """Some of its pages, in memory of their own."""
+    chosen = page_set.covered(wanted, page_set.addresses_of(copy.pages, abi.PAGE_SIZE))
+    rows = np.frombuffer(copy.content, dtype=np.uint8, count=len(chosen) * abi.PAGE_SIZE).reshape(-1, abi.PAGE_SIZE)
+    return Copy(wanted, rows[chosen].reshape(-1).data)
 
 
 def _place_of(line: MapsLine) -> tuple[int, int, int, int]:
@@ -108,6 +117,18 @@ class RunningCopy(Struct):
     def spoil(self, scan: Scan) -> None:
         """Forget the pages that a scan has named."""
         self.valid = page_set.difference(page_set.difference(self.valid, scan.written), scan.cleared)
+
+    def shed(self) -> None:
+        """Let go of what newer copies and scans have made useless: else memory grows with each pass, and there may be many."""
+        kept, left = [], self.valid
+        for copy in reversed(self.copies):
+            useful = page_set.intersection(copy.pages, left)
+            left = page_set.difference(left, copy.pages)
+            if SHED_SHARE * page_set.total_size(useful) > page_set.total_size(copy.pages):
+                kept.append(copy)
+            elif len(useful):
+                kept.append(_part_of(copy, useful))
+        self.copies = kept[::-1]
 
 
 class FreezeBuffer:
@@ -248,6 +269,7 @@ class MemoryCapture:
             if not self._is_behind(copied, enough or (LARGE_COUNT if turn or base else WORTH_COUNT), base=base):
                 break
             self._catch_up(copied)
+            copied.shed()
             missing = self._missing(copied, base=base)
             self._read_into(copied, missing)
             self._refresh_if_moved()

@@ -281,6 +281,50 @@ def test_a_freeze_copies_only_what_was_written_since_the_last_pass(
     assert 50 <= session.frozen_size // 4096 <= 50 + own
 
 
+class LateGate:
+    """Opens after so many questions; before each the program writes."""
+
+    def __init__(self, count: int, passing: Callable[[], None]) -> None:
+        self._count, self._passing = count, passing
+
+    def opens(self, pids: tuple[int, ...]) -> bool:
+        self._count -= 1
+        if self._count:
+            self._passing()
+        return not self._count
+
+    def closes(self, *, stood_still: bool) -> None:
+        """As of a gate that keeps no account."""
+
+
+@pytest.mark.write_protection
+def test_a_capture_that_waits_long_keeps_one_copy_of_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program writes all of its arena in each slice of the wait."""
+    told, sizes, take = 0, [], MemoryCapture.take
+
+    def write() -> None:
+        nonlocal told
+        told += 8192
+        (tmp_path / "next").write_text(str(told))
+        (tmp_path / "next").replace(tmp_path / "orders")
+        program.wait_for_line(str(told))
+
+    def measured(self: MemoryCapture, copied: RunningCopy, **named: Any) -> Any:
+        sizes.append(sum(len(copy.content) for copy in copied.copies))
+        return take(self, copied, **named)
+
+    monkeypatch.setattr(MemoryCapture, "take", measured)
+    with (
+        ended(start([sys.executable, "-S", "-c", OBEDIENT, tmp_path, "0.001"], tmp_path)) as program,
+        protected(program) as session,
+    ):
+        program.wait_for_line("ready")
+        snapshot = session.capture(CaptureOrder(sequence=1, gate=LateGate(6, write)))
+        program.kill()
+    assert len(snapshot.contents) >= 32 << 20
+    assert sizes and max(sizes) < 3 * 32 << 20, "one copy of the arena, and the first one with the rest of the program"
+
+
 @pytest.mark.write_protection
 def test_a_small_delta_is_copied_while_the_program_runs(tmp_path: Path) -> None:
     """What was written a while ago does not wait for the freeze, as little as it is."""
