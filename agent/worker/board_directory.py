@@ -124,13 +124,19 @@ class _Files:
             group=self._group,
         )
         first = first_number(self._ranks[robot])
-        try:
-            make(items={**items, **dict(enumerate(kept, first))})
-        except BoardError as error:
-            if not kept:
-                raise
-            log.warning("items that programs had added with keep = true are not added again: %s", error)
-            make(items=items)
+        left_out: list[str] = []
+        while True:
+            added = kept[: len(kept) - len(left_out)]
+            try:
+                make(items={**items, **dict(enumerate(added, first))})
+            except BoardError as error:
+                if not added:
+                    raise
+                why, left_out = error, [added[-1].name, *left_out]
+            else:
+                break
+        if left_out:
+            log.warning("items that programs had added with keep = true are not added again: %s: %s", ", ".join(left_out), why)
 
     def have_schedule(self, robot: str) -> None:
         """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""

@@ -26,6 +26,8 @@ from failover.core.board.layout import ADDED, KEPT
 from failover.errors import FailoverError
 
 FILE_NAME: Final = "board.toml"
+BEFORE_NAME: Final = "board.toml.before"
+"""As the file was before the agent, after its start, left items out for the first time: they had no room, or were not read."""
 LOOK_S: Final = 1.0
 HEADING: Final = (
     "# Items that programs of this robot added with keep = true. The agent writes this file, and reads it after a reboot.\n\n"
@@ -79,6 +81,18 @@ def found_in(place: Path) -> tuple[Item, ...]:
     return tuple(items)
 
 
+def _names(items: tuple[Item, ...]) -> set[str]:
+    return {item.name for item in items}
+
+
+def _keep_before(state: Path) -> None:
+    """Keep the file as it is beside the one that will be written."""
+    before = state / BEFORE_NAME
+    before.unlink(missing_ok=True)
+    with contextlib.suppress(FileNotFoundError):  # there is none yet
+        os.link(state / FILE_NAME, before)
+
+
 class Keeper:
     """Writes the file whenever other items are to be kept."""
 
@@ -86,6 +100,8 @@ class Keeper:
         self._place, self._state = place, state
         self._kept = read(state)
         self._generations: tuple[bytes, ...] = ()
+        self._has_written = False
+        self._told = ""
 
     async def watch(self) -> None:
         """Look once a second, for as long as the agent lives."""
@@ -100,11 +116,16 @@ class Keeper:
         try:
             items = found_in(self._place)
             if items != self._kept:
+                if not self._has_written and not (self._kept and _names(self._kept) <= _names(items)):
+                    _keep_before(self._state)
                 write(self._state, items)
+                self._has_written = True
         except (FailoverError, OSError) as error:
-            log.warning("items to be kept over a reboot are not written to %s: %s", self._state / FILE_NAME, error)
+            if str(error) != self._told:
+                self._told = str(error)
+                log.warning("items to be kept over a reboot are not written to %s: %s", self._state / FILE_NAME, error)
         else:
-            self._kept, self._generations = items, generations
+            self._kept, self._generations, self._told = items, generations, ""
 
     def _now(self) -> tuple[bytes, ...]:
         found = []

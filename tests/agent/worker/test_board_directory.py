@@ -264,7 +264,7 @@ def test_items_added_with_keep_are_there_after_a_reboot_and_others_are_not(
         assert board.item("diary").source().record.size == 100
 
 
-def test_a_list_of_kept_items_that_cannot_be_read_or_has_no_room_does_not_keep_the_board_away(folder: Path, found: None) -> None:
+def test_a_list_of_kept_items_that_cannot_be_read_does_not_keep_the_board_away(folder: Path, found: None) -> None:
     settings = loaded(folder, BALL)
     for text in ("[board", "board = 1", "[board.items.x]\ntype = 'f9'\n", "[board.items.x]\nsizes = 1\n"):
         (folder / "state" / kept_items.FILE_NAME).write_text(text)
@@ -274,11 +274,53 @@ def test_a_list_of_kept_items_that_cannot_be_read_or_has_no_room_does_not_keep_t
     board_directory.provide(settings)
     with failover.board() as board:
         assert len(board.names()) == 2 + len(large)
-    place = board_directory.place_of(settings)
-    shutil.rmtree(place)
-    board_directory.provide(loaded(folder, BALL.replace("size = 100", "size = 60000\nbanks = 8")))
+
+
+def test_kept_items_that_find_no_room_stay_on_the_disk_and_the_others_are_added(
+    folder: Path, found: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    large = tuple(Item(f"large{number}", size=60_000, shared=False, banks=8, keep=True) for number in range(34))
+    kept_items.write(folder / "state", large)
+    place = board_directory.provide(loaded(folder, BALL.replace("size = 100", "size = 60000\nbanks = 8")))
+    assert place is not None
     with failover.board() as board:
-        assert board.names() == ["ball", "notes"]
+        added = set(board.names()) - {"ball", "notes"}
+    assert added == {item.name for item in large[: len(added)]} and len(large) - len(added) == 1
+    assert "large33" in caplog.text and "large32" not in caplog.text
+    keeper = Keeper(place, folder / "state")
+    keeper.look()
+    assert kept_items.read(folder / "state") == large[:-1]
+    (folder / "state" / kept_items.BEFORE_NAME).rename(folder / "state" / kept_items.FILE_NAME)
+    assert kept_items.read(folder / "state") == large
+    with failover.board() as board:
+        board.remove("large0")
+    keeper.look()
+    assert not (folder / "state" / kept_items.BEFORE_NAME).exists(), "the agent has written the file itself since its start"
+
+
+def test_a_list_of_kept_items_that_cannot_be_read_is_not_lost_when_it_is_written_anew(folder: Path, found: None) -> None:
+    (folder / "state" / kept_items.FILE_NAME).write_text("[board")
+    place = board_directory.provide(loaded(folder, BALL))
+    assert place is not None
+    with failover.board() as board:
+        board.add(Item("goal", size=8, keep=True))
+    Keeper(place, folder / "state").look()
+    assert [item.name for item in kept_items.read(folder / "state")] == ["goal"]
+    assert (folder / "state" / kept_items.BEFORE_NAME).read_text() == "[board"
+
+
+def test_a_list_that_cannot_be_written_is_told_once(folder: Path, found: None, caplog: pytest.LogCaptureFixture) -> None:
+    place = board_directory.provide(loaded(folder, BALL))
+    assert place is not None
+    with failover.board() as board:
+        board.add(Item("goal", size=8, keep=True))
+    keeper = Keeper(place, folder / "missing")
+    for _ in range(3):
+        keeper.look()
+    assert caplog.text.count("are not written") == 1
+    (folder / "missing").mkdir()
+    keeper.look()
+    assert [item.name for item in kept_items.read(folder / "missing")] == ["goal"]
 
 
 def test_a_peers_file_that_is_full_of_removed_items_is_made_anew(folder: Path) -> None:
