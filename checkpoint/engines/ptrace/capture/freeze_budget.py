@@ -62,6 +62,10 @@ class FreezeBudget:
         """A capture begins, of several freezes if need be."""
         self._begun_ns = self._clock()
 
+    def waited(self, duration_s: float) -> None:
+        """The capture was ready meanwhile, and waited for the program's tasks: that makes it no long one."""
+        self._begun_ns += int(duration_s * 1e9)
+
     @property
     def is_long(self) -> bool:
         """Whether the capture has taken so long that it ends with the next freeze."""

@@ -266,25 +266,25 @@ class PtraceSession:
         Args:
             may_stay: the pages of a single process need not be read.
         """
-        deadline = 0.0
         self._standstill.longest_us = 0
         began = time.monotonic()
+        waited = 0.0
         copied: RunningCopy | None = None
         given_up = 0
         self._budget.begin_capture()
         while True:
             try:
-                self._tree.admit(held=self._standstill.is_held)
-                if self._surroundings.detached is not None:
-                    covered = self._detached.find((self._first, *self._tree.processes()))
-                    self._surroundings = replace(self._surroundings, detached=covered)
-                if base and (others := self._tree.processes()):
-                    self._refuse(memory_limits.refuse_capture((self.pid, *(process.pid for process in others))))
+                self._admit(base=base)
                 may_stay = may_stay and not self._tree.processes()
                 copied = None if may_stay else self._copied_running(order, copied, base=base)
                 if copied is not None and not self._standstill.is_held:
-                    copied = self._ready(order, copied, base=base)
-                deadline = deadline or time.monotonic() + MOVED_S  # the wait for the gate does not count
+                    asked = time.monotonic()
+                    try:
+                        copied = self._ready(order, copied, base=base)
+                    finally:  # no wait for the gate counts as time in which the capture did not succeed
+                        passed = time.monotonic() - asked
+                        waited += passed
+                        self._budget.waited(passed)
                 self._budget.begin(is_free=order.hold, is_last=given_up == FREEZES_MAX - 1)
                 frozen = self._frozen_look(copied, base=base, order=order)
                 if not order.hold:
@@ -294,7 +294,7 @@ class PtraceSession:
                 return frozen
             except MovedError as moved:
                 let_go(moved)  # its frames hold what was copied
-                is_late = time.monotonic() > (deadline or began + MOVED_S)
+                is_late = time.monotonic() > began + waited + MOVED_S
                 is_last = is_late and not may_stay  # one that took it for a single process is never the last
                 self._is_single, may_stay = self._is_single and not may_stay, False
                 if is_last:
@@ -305,6 +305,15 @@ class PtraceSession:
                 given_up += 1
                 if given_up == FREEZES_MAX:
                     raise self._over_budget(given_up) from late
+
+    def _admit(self, *, base: bool) -> None:
+        """Enter the processes that have come, while they run: to enter one takes longer than all else of a freeze."""
+        self._tree.admit(held=self._standstill.is_held)
+        if self._surroundings.detached is not None:
+            covered = self._detached.find((self._first, *self._tree.processes()))
+            self._surroundings = replace(self._surroundings, detached=covered)
+        if base and (others := self._tree.processes()):
+            self._refuse(memory_limits.refuse_capture((self.pid, *(process.pid for process in others))))
 
     def _over_budget(self, given_up: int) -> CaptureError:
         """The message when no freeze of a capture fits the budget."""
@@ -339,6 +348,7 @@ class PtraceSession:
                 process.rehearse()
             if order.gate is None or order.gate.opens(tuple(process.pid for process in processes)):
                 return copied
+            self._admit(base=base)
             copied = self._copied_running(order, copied, base=base)
 
     def _enough(self) -> int:
