@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -45,10 +44,10 @@ class Robots:
     boards: tuple[Board, Board]
 
     def is_robot(self, index: int) -> None:
-        """From now on this machine is that robot."""
-        with contextlib.suppress(FileNotFoundError):
-            self.path.unlink()
-        self.path.symlink_to(self.places[index])
+        """From now on this machine is that robot; in one step, as a program that finds no board makes one of its own."""
+        fresh = self.path.with_name("board.new")
+        fresh.symlink_to(self.places[index])
+        fresh.replace(self.path)
 
 
 @pytest.fixture
