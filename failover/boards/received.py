@@ -18,7 +18,7 @@ from failover.boards import futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
-from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
+from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US, UNBOUNDED_NS
 from failover.core.board.banks import EPOCH_SHIFT, first_of_epoch, storing
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import ADDED, Record, Wanted
@@ -177,7 +177,7 @@ class ReceivedItems:
         bounds: dict[int, int] = {}
         for record in self._records.values():
             if record.period not in bounds:
-                bounds[record.period] = compute(record.period)
+                bounds[record.period] = min(compute(record.period), UNBOUNDED_NS)
             self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = bounds[record.period]
 
 

@@ -55,6 +55,9 @@ ITEM_SIZE_MAX: Final = 64 << 10
 AGE_US_MAX: Final = (1 << 32) - 1
 """An age of an hour and more: told as this."""
 
+LEFT_US_MAX: Final = (1 << 53) - 1
+"""285 years after a start: as nanoseconds it fits 63 bits."""
+
 MAGIC: Final = b"fF"
 MAGIC_BEFORE: Final = b"fB"
 """Of the heartbeats of older releases: a robot that still sends them is not understood, and it lives."""
@@ -159,7 +162,7 @@ class Body(Struct, frozen=True, array_like=True, gc=False):
     slots: Said | None = None
     beat: Beat | None = None
     items: tuple[Portion, ...] = ()
-    left_us: Annotated[int, Meta(ge=0)] = 0
+    left_us: Annotated[int, Meta(ge=0, le=LEFT_US_MAX)] = 0
     casts: tuple[bytes, ...] = NO_CASTS
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.main_loop import urgent_items
+from agent.main_loop import board_link, urgent_items
 from agent.main_loop.board_link import UNREADABLE, BoardLink
 from agent.main_loop.own_items import LOOK_NS
 from agent.system import clock
@@ -30,6 +30,7 @@ from failover.core.board.items import Item
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.roster import roster
+from failover.core.frames.terms import Said
 from failover.core.wire.messages import Beat, Echo
 from failover.errors import NeverWrittenError
 
@@ -223,6 +224,23 @@ def test_a_robot_that_lost_its_board_counts_its_puts_anew(pair: tuple[Robot, Rob
     second.hears(again.says())
     assert second.program.item("ball").get("robot1").value["x"] == 9.0
     again.close()
+
+
+def test_a_robot_whose_clock_shows_anything_ends_no_other_agent(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_link, "BOUNDS_TOLD_NS", -1)
+    first, second = pair
+    for _ in range(2):
+        second.hears(first.says())
+        first.hears(second.says())
+    for left_us in (2**64 - 1, 0, 2**53 - 1, 0):
+        echo = ((1, second.lane.counter, 0),) if left_us else ()
+        made, _ = first.lane.seal(None, (), left_us * 1_000, Said(ROUND_NS // 1_000, 0, 0, (), echo))
+        heard = second.lane.open(made[0].datagrams[0], clock.now_ns())
+        if isinstance(heard, Heard):
+            second.link.take(heard, clock.now_ns())
+    second.hears(first.says())
 
 
 def test_what_does_not_belong_here_is_counted(pair: tuple[Robot, Robot]) -> None:

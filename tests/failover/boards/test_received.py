@@ -47,6 +47,15 @@ def test_a_frame_brings_a_value_with_its_age_and_an_upper_bound(place: Path) -> 
         assert state.state == "run" and state.age_ns is not None and state.age_ns <= now() - came
 
 
+def test_a_bound_beyond_all_sense_is_none(place: Path) -> None:
+    with failover.board() as board:
+        ball = board.add(BALL)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: BALL}))
+        received.bound(lambda period: 1 << 65)
+        assert put(received, 7, 1, ONE)
+        assert not ball.get("robot2").stale
+
+
 @pytest.mark.parametrize(
     ("item", "number", "value"), [(8, 2, TWO), (7, 2, TWO + b"x"), (7, 2, TWO[:4]), (7, 1, TWO), (7, 0, TWO)]
 )

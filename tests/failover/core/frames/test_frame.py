@@ -15,6 +15,7 @@ from failover.core.frames.frame import (
     FRAME_SIZE_MAX,
     HEADER,
     ITEM_SIZE_MAX,
+    LEFT_US_MAX,
     PARTS_MAX,
     SEAL_SIZE,
     Part,
@@ -279,6 +280,12 @@ def test_ages_up_to_the_greatest_pass(age_us: int) -> None:
     found = receiver().open(sealed(items=(Portion(1023, age_us, (1 << 64) - 1, b"x"),)))
     assert isinstance(found, Part)
     assert found.items[0].age_us == age_us
+
+
+@pytest.mark.parametrize("left_us", [LEFT_US_MAX + 1, (1 << 64) - 1])
+def test_an_instant_that_no_clock_shows_is_refused(left_us: int) -> None:
+    assert receiver().open(resealed(frame._encode((SAID, BEAT, (BALL,), left_us)))) == Refused(Reason.MALFORMED, "robot1")
+    assert isinstance(receiver().open(resealed(frame._encode((SAID, BEAT, (BALL,), LEFT_US_MAX)))), Part)
 
 
 @pytest.mark.parametrize(
