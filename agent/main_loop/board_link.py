@@ -184,9 +184,9 @@ class BoardLink:
         """Put what a frame brought into the file of its sender."""
         part = heard.part
         peer = self._peers.get(part.sender)
-        if peer is None or not part.alike:
-            return
-        if part.boot != peer.boot:
+        if peer is None or not part.alike or part.boot < peer.boot:
+            return  # of an earlier life: a frame that was recorded on a medium of which nothing came in this life
+        if part.boot > peer.boot:
             peer.boot = part.boot
             peer.items.begin_life()
             self._announcements.begin_life(part.sender)

@@ -34,6 +34,12 @@ UNSTEADY_FACTOR = 2
 UNREAD_NS = 10_000 * MS
 """A sign of a member that cannot be authenticated proves for so long that its robot lives: its agent connects every 2 s."""
 
+LATE_BEATS = 64
+"""A beat that is older than the newest one by so many is of another day: as many as one medium's window of counters lets come.
+
+Each medium has a window of its own, so a recorded frame of a medium that this robot never heard is authentic, and new there.
+"""
+
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
 
@@ -53,7 +59,7 @@ class Peer(Struct):
     """All that one peer has told us.
 
     Attributes:
-        heard_ns: instant of its last beat (before the first: of our own birth).
+        heard_ns: when its newest beat came (before the first: of our own birth); an older one that comes later proves no life.
         since_ns: when its present life was heard first.
         echoed: counter of the newest beat of our present life that it lets us act on, 0 for none; ``asked_ns``: when it left.
         heard_us_ns: when the newest beat of ours left that it has heard.
@@ -100,22 +106,24 @@ class Peer(Struct):
 
     def take(self, beat: Beat, own: tuple[str, int], link: str, now_ns: int, rule: int = 0) -> tuple[Entry, ...]:
         """Note a beat; returns the entries that are news. ``own``: our name and boot count; ``rule``: ours, 0 for any."""
-        if beat.boot < self.boot:
+        if beat.boot < self.boot or (beat.boot == self.boot and beat.counter + LATE_BEATS <= self.counter):
             return ()
         if beat.boot > self.boot:
             self.boot, self.counter, self.echoed, self.heard_us, self.settled = beat.boot, 0, 0, 0, 0
             self.entries.clear()
             self.since_ns = now_ns
-        self.heard_ns = max(self.heard_ns, now_ns)
-        self.unread_ns, self.unread_why = 0, ""
         self.links[link] = now_ns
+        is_newest = beat.counter > self.counter
+        if is_newest:
+            self.counter, self.heard_ns = beat.counter, max(self.heard_ns, now_ns)
+            self.unread_ns, self.unread_why = 0, ""
         self.at_odds = beat.rule if 0 not in (rule, beat.rule) and beat.rule != rule else 0
         if self.at_odds:
             self.entries.clear()
             return ()
         self._echoes(beat, own)
-        if beat.counter > self.counter:
-            self.counter, self.settled, self.total, self.load = beat.counter, beat.settled, beat.total, beat.load
+        if is_newest:
+            self.settled, self.total, self.load = beat.settled, beat.total, beat.load
         return tuple([entry for entry in beat.entries if self._news(entry, beat.counter)]) if beat.entries else ()
 
     def timed(self, late_ns: int) -> None:
@@ -258,7 +266,7 @@ class Membership:
         if self._deaf(peer, now_ns):
             return Echo(peer.robot, peer.boot, -peer.counter)
         peer.told_ns = now_ns
-        return Echo(peer.robot, peer.boot, peer.counter)
+        return Echo(peer.robot, peer.boot, 0 if peer.at_odds else peer.counter)
 
     def steady(self, now_ns: int) -> bool:
         """Whether each living peer was heard in the last two thirds of a loyalty: none is about to be taken for dead."""

@@ -226,6 +226,25 @@ def test_a_robot_that_lost_its_board_counts_its_puts_anew(pair: tuple[Robot, Rob
     again.close()
 
 
+def test_a_frame_of_an_earlier_life_of_a_robot_changes_nothing(pair: tuple[Robot, Robot]) -> None:
+    first, second = pair
+    item, there = first.program.item("ball"), second.program.item("ball")
+    item.put({"x": 1.0, "y": 0.0})
+    recorded = first.says()
+    item.put({"x": 2.0, "y": 0.0})
+    first.link.close()
+    again = Robot("robot1", boot=2)
+    second.hears(again.says())
+    other_medium = Robot("robot2", boot=2)
+    opened = other_medium.lane.open(recorded[0], clock.now_ns())
+    assert isinstance(opened, Heard)
+    second.link.take(opened, clock.now_ns())
+    second.hears(again.says())
+    assert (there.get("robot1").value["x"], there.get("robot1").number) == (2.0, 1)
+    other_medium.close()
+    again.close()
+
+
 def test_a_robot_whose_clock_shows_anything_ends_no_other_agent(
     pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
+
 from failover.core.election.consent import STATES
 from failover.core.events import Received, Tick
-from failover.core.membership import UNSTEADY_BEATS, Membership
+from failover.core.membership import LATE_BEATS, UNSTEADY_BEATS, Membership
 from failover.core.node import Node
 from failover.core.types import MS, Config, State, VoteRecord
-from failover.core.wire.messages import Beat, Entry
+from failover.core.wire.messages import RULES, Beat, Echo, Entry
 
 PAIR = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100)
 LOYALTY_MS = PAIR.loyalty_ns // MS
@@ -62,6 +64,45 @@ def test_our_own_lateness_is_not_the_peers() -> None:
     team.forgive(50 * MS, 80 * MS)
     team.hear(beat(3), "eth0", 80 * MS)
     assert patience_ms(team) == LOYALTY_MS
+
+
+@pytest.mark.parametrize("rule", [0, 1, 2])
+def test_a_beat_that_is_not_the_newest_keeps_no_dead_robot_alive(rule: int) -> None:
+    """As frames do that were recorded on a medium of which this robot heard nothing: their counters are new there."""
+    team = Membership(PAIR, 1, 0)
+    for number, counter in enumerate((*range(1, 101), *range(1, 101)), start=1):
+        team.hear(Beat("robot2", 1, counter, rule=rule), "eth0", 10 * min(number, 100 + counter) * MS)
+    assert team.loyal_until_ns("robot2") == 1_000 * MS + PAIR.loyalty_ns
+    assert not team.alive("robot2", 1_000 * MS + PAIR.loyalty_ns)
+    team.hear(Beat("robot2", 2, 1, rule=rule), "eth0", 2_010 * MS)
+    assert team.alive("robot2", 2_010 * MS), "another life of it is news"
+
+
+def test_a_copy_of_a_recent_beat_proves_its_link_and_an_old_one_nothing() -> None:
+    team = heard(*range(10, 1_010, 10))
+    entry = Entry("/lab/x", STATES.index(State.PRIMARY), 1, "robot2")
+    old, recent = (Beat("robot2", 1, counter, 1, 1, 1, (), (entry,)) for counter in (100 - LATE_BEATS, 101 - LATE_BEATS))
+    assert team.hear(old, "wlan0", 1_010 * MS) == ()
+    assert set(team.peers["robot2"].links) == {"eth0"}
+    assert team.hear(recent, "wlan0", 1_010 * MS) == (entry,)
+    assert team.peers["robot2"].links == {"eth0": 1_000 * MS, "wlan0": 1_010 * MS}
+
+
+def test_a_peer_by_another_rule_is_told_of_no_beat_of_its_own() -> None:
+    team = Membership(PAIR, 1, 0)
+    other = next(number for number, rule in enumerate(RULES) if number and rule != PAIR.rule)
+    team.hear(Beat("robot2", 1, 7, rule=other), "eth0", 10 * MS)
+    assert team.at_odds(10 * MS) == ("robot2",)
+    assert team.echoes(10 * MS) == (Echo("robot2", 1, 0),)
+
+
+def test_an_older_beat_does_not_take_back_that_a_robot_cannot_be_authenticated() -> None:
+    team = heard(10, 20)
+    team.unreadable("robot2", "", 1_000 * MS)
+    team.hear(beat(2), "wlan0", 1_010 * MS)
+    assert team.unread("robot2", 1_020 * MS)
+    team.hear(beat(3), "wlan0", 1_030 * MS)
+    assert not team.unread("robot2", 1_040 * MS)
 
 
 def test_a_step_is_due_the_instant_a_peer_counts_as_dead() -> None:
