@@ -9,11 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from failover.core.frames.frame import KEYS_PER_SENDER, Reason, Refused
+from failover.core.frames.frame import KEYS_PER_SENDER, MAGIC, VERSION, Reason, Refused
 from failover.core.frames.lane import FrameLane, Heard
 
 MEDIA_MAX: Final = 8
 """Media with slots: more links than a robot has."""
+
+OURS: Final = MAGIC + bytes([VERSION])
+"""How a frame of this version begins."""
 
 _MEDIUM: Final = slice(6, 8)
 
@@ -71,8 +74,11 @@ class FrameLanes:
         lane = self._lanes.get(medium)
         if lane is None:
             if medium > MEDIA_MAX:
-                return Refused(Reason.NOT_OURS)
-            lane = self.lane(medium)
+                if datagram.startswith(OURS):
+                    return Refused(Reason.NOT_OURS)
+                lane = self._lanes[0]  # in another version, these bytes mean another thing: say of it what it is
+            else:
+                lane = self.lane(medium)
         return lane.open(datagram, came_ns)
 
     def all(self) -> tuple[FrameLane, ...]:

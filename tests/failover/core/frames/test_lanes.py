@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from failover.core.frames.frame import Portion, Reason, Refused
+import pytest
+
+from failover.core.frames.frame import MAGIC, MAGIC_BEFORE, VERSION, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.lanes import MEDIA_MAX, FrameLanes, medium_of
 from failover.core.frames.roster import roster
@@ -49,6 +51,13 @@ def test_a_frame_under_the_number_of_another_medium_is_no_authentic_one() -> Non
     frame = datagram(first, 0)
     moved = second.open(frame[:6] + b"\1\0" + frame[8:], 2_000)
     assert isinstance(moved, Refused) and moved.reason is Reason.FORGED
+
+
+@pytest.mark.parametrize("medium", [b"\0\0", b"\1\0", b"\x09\0", b"\xa5\xff"])
+@pytest.mark.parametrize("begin", [MAGIC_BEFORE + b"\4\0", MAGIC + bytes([VERSION + 1, 0])])
+def test_a_heartbeat_of_another_release_is_told_from_what_is_no_frame_whatever_bytes_it_has(begin: bytes, medium: bytes) -> None:
+    second = lanes("robot2", "robot1")
+    assert second.open(begin + b"??" + medium + bytes(range(200)), 2_000) == Refused(Reason.VERSION)
 
 
 def test_a_number_beyond_all_media_makes_no_lane() -> None:
