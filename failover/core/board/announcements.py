@@ -44,6 +44,9 @@ PAGE_SIZE: Final = 800
 DECLARATION_SIZE_MAX: Final = 8 << 10
 """Bytes of one declaration that is told: eight datagrams. A struct of 4 KiB whose fields have short names is shorter."""
 
+CONTENT_SIZE_MAX: Final = PAGE_SIZE + DECLARATION_SIZE_MAX
+"""Bytes of a page that is read: no robot tells a longer one."""
+
 TOO_LONG: Final = "items added here with a declaration too long to be told"
 NOT_POSSIBLE: Final = "items added by other robots that no board can have"
 
@@ -246,6 +249,9 @@ class Learned:
         """
         if put <= self._newest:
             return ()  # an older page on a slower way
+        if len(content) > CONTENT_SIZE_MAX:
+            self.refused[NOT_POSSIBLE] += 1
+            return ()
         try:
             page = _page(content)
             items = [(_declared(item), item) for item in page.items]

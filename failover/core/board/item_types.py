@@ -82,34 +82,41 @@ Type: TypeAlias = Number | Text | Array | Record | Opaque
 
 def size_of(kind: Type) -> int:
     """Bytes of a value, its padding included; of contents without a layout the most bytes."""
-    if isinstance(kind, Number):
-        return 1 if kind.code == "bool" else int(kind.code[1])
-    if isinstance(kind, Array):
-        return kind.count * size_of(kind.of)
-    if isinstance(kind, Record):
-        name, last = kind.fields[-1]
-        return aligned(offsets_of(kind)[name] + size_of(last), alignment_of(kind))
-    return kind.size
+    return _extent(kind)[0]
 
 
 def alignment_of(kind: Type) -> int:
     """The number of which a value's address is a multiple."""
-    if isinstance(kind, Number):
-        return size_of(kind)
-    if isinstance(kind, Array):
-        return alignment_of(kind.of)
-    if isinstance(kind, Record):
-        return max(alignment_of(field) for _, field in kind.fields)
-    return 1
+    return _extent(kind)[1]
 
 
 def offsets_of(record: Record) -> dict[str, int]:
     """Name of a field → bytes from the struct's beginning to it."""
-    offsets, end = {}, 0
+    return _placed(record)[0]
+
+
+def _extent(kind: Type) -> tuple[int, int]:
+    """Size and alignment of a value, by one look at each part: other robots announce types, and a deep one must cost little."""
+    if isinstance(kind, Number):
+        size = 1 if kind.code == "bool" else int(kind.code[1])
+        return size, size
+    if isinstance(kind, Array):
+        size, alignment = _extent(kind.of)
+        return kind.count * size, alignment
+    if isinstance(kind, Record):
+        _, end, alignment = _placed(kind)
+        return aligned(end, alignment), alignment
+    return kind.size, 1
+
+
+def _placed(record: Record) -> tuple[dict[str, int], int, int]:
+    """Where each field begins, where the last one ends, and the alignment of the struct."""
+    offsets, end, most = {}, 0, 1
     for name, kind in record.fields:
-        offsets[name] = aligned(end, alignment_of(kind))
-        end = offsets[name] + size_of(kind)
-    return offsets
+        size, alignment = _extent(kind)
+        offsets[name] = aligned(end, alignment)
+        end, most = offsets[name] + size, max(most, alignment)
+    return offsets, end, most
 
 
 def aligned(offset: int, alignment: int) -> int:

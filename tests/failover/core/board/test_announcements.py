@@ -12,6 +12,7 @@ from msgspec.structs import astuple
 from failover.core.board import layout
 from failover.core.board.announcements import (
     ASK_ROUNDS,
+    CONTENT_SIZE_MAX,
     NOT_POSSIBLE,
     PAGE_SIZE,
     TIMES,
@@ -206,3 +207,13 @@ def test_a_record_told_and_read_is_the_declaration() -> None:
     number = FIRST + 7
     assert item_of(Record(*astuple(wanted_of(item, number, layout.ADDED)), 0, 0, 0)) == item
     assert len(told(wanted_of(item, number))) < 60
+
+
+def test_a_page_that_is_longer_than_any_that_a_robot_tells_is_not_read() -> None:
+    learned = Learned(RANK, ())
+    declared = [told(record(FIRST + number, f"item{number}")) for number in range(ITEMS_MAX)]
+    count = next(count for count in range(ITEMS_MAX) if sum(map(len, declared[:count])) > CONTENT_SIZE_MAX)
+    whole = _encode(Page(0, FIRST, FIRST + count, tuple(declared[:count])))
+    assert learned.take(1, whole) == ()
+    assert learned.refused == {NOT_POSSIBLE: 1}
+    assert len(learned.take(2, _encode(Page(0, FIRST, FIRST + 9, tuple(declared[:9]))))) == 9

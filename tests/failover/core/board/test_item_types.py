@@ -5,7 +5,9 @@ from __future__ import annotations
 import random
 import shutil
 import subprocess
+import sys
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -160,3 +162,27 @@ def test_a_mistake_in_a_type_says_where_and_what_was_expected(written: Any, said
     with pytest.raises(ItemError) as caught:
         of_table(written)
     assert said in str(caught.value)
+
+
+def calls_to_parse(depth: int) -> int:
+    """Of Python functions, for structs that lie so deep in each other."""
+    text, calls = "u1", 0
+    for _ in range(depth):
+        text = f"{{a:u1,b:{text}}}"
+
+    def count(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    before = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        parse(text)
+    finally:
+        sys.setprofile(before)
+    return calls
+
+
+def test_a_type_twice_as_deep_costs_twice_as_much() -> None:
+    """Other robots announce types: a cost that doubles with each struct inside another would hold the main loop up."""
+    assert calls_to_parse(DEPTH_MAX) < 3 * calls_to_parse(DEPTH_MAX // 2)
