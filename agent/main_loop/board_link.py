@@ -27,6 +27,7 @@ from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
+from failover.core.node import URGENT_GAP_NS
 from failover.errors import BoardError, OvertakenError
 
 UNREADABLE: Final = "own items that could not be read"
@@ -77,6 +78,7 @@ class BoardLink:
         self._looked: dict[int, int] = {}
         self._buckets: dict[int, Bucket] = {}
         self.wakes = UrgentItems(own, self._own)
+        self._urgent_ns = 0
         self._peers = {name: _Peer(items) for name, items in peers.items()}
         self._announcements = Announcements(own.header.rank, peers)
         self._primaries = primaries
@@ -133,9 +135,16 @@ class BoardLink:
         for one in turns:
             one.hold(items)
 
+    def urgent_due_ns(self, sent_ns: int) -> int:
+        """When to look for urgent items that are put now: a moment after the last frame, and after the last look.
+
+        A program that puts one all the time makes no frames beyond what `Bucket` allows; it costs the loop a look each moment.
+        """
+        return max(sent_ns, self._urgent_ns) + URGENT_GAP_NS
+
     def urgent(self, now_ns: int) -> list[Portion]:
         """Urgent items that were put since they last went, as often as `Bucket` allows it."""
-        urgent = self._own.urgent
+        urgent, self._urgent_ns = self._own.urgent, now_ns
         try:
             self._looked = numbers = self._own.numbers(urgent)
         except OSError:
@@ -148,8 +157,9 @@ class BoardLink:
         """What `urgent` gave is on its way: the thread that waits for puts may go on."""
         self.wakes.seen_to(self._looked)
 
-    def leave_for_slot(self) -> None:
+    def leave_for_slot(self, now_ns: int) -> None:
         """Urgent items that were put wait for this robot's slot; the thread that waits for puts may go on."""
+        self._urgent_ns = now_ns
         try:
             self._looked = self._own.numbers(self._own.urgent)
         except OSError:

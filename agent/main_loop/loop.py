@@ -54,7 +54,7 @@ from failover.core.events import Event, Received, Tick
 from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
 from failover.core.frames.lanes import FrameLanes, medium_of
-from failover.core.node import URGENT_GAP_NS, Node
+from failover.core.node import Node
 from failover.core.wire.messages import Beat
 from failover.errors import FailoverError
 
@@ -245,7 +245,7 @@ class MainLoop:
                 self._ending = True
             elif self._board is not None and descriptor == self._board.wakes.fileno():
                 self._board.wakes.heed()
-                self._urgent_ns = self._sent_ns + URGENT_GAP_NS
+                self._urgent_ns = self._board.urgent_due_ns(self._sent_ns)
         if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
             self._send_urgent()
         if self._media.is_slotted:
@@ -496,7 +496,7 @@ class MainLoop:
         if self._board is None:
             return
         if not self._media.at_once:
-            self._board.leave_for_slot()
+            self._board.leave_for_slot(clock.now_ns())
             return
         now_ns = clock.now_ns()
         items = self._board.urgent(now_ns)

@@ -6,6 +6,7 @@ eventfd. A wake-up may be lost, so it looks at the items ten times a second, too
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
@@ -21,6 +22,9 @@ from failover.errors import BoardError
 LOOK_S: Final = 0.1
 IDLE_LOOK_S: Final = 1.0
 """Where there is no urgent item: the loop says when there is one."""
+
+WAKE_AGAIN_S: Final = 0.001
+"""Between two wake-ups of a thread that is to end; the main loop waits for it, and a heartbeat is due every few of these."""
 
 WAITS_FOR_ANY: Final = b"\x01"
 ANY_FIELD: Final = layout.WAITERS_FIELD + 1
@@ -50,8 +54,9 @@ class UrgentItems:
         futex.wake(self._file.address(layout.CHANGED_AT))
 
     def heed(self) -> None:
-        """What was signalled is being seen to."""
-        os.eventfd_read(self._event)
+        """What was signalled is being seen to; nothing, if it has been already."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._event)
 
     def seen_to(self, numbers: Mapping[int, int]) -> None:
         """The loop has looked at the items, whose newest puts had these numbers, and what it sends is on its way."""
@@ -64,9 +69,10 @@ class UrgentItems:
         if self._ends.is_set():
             return
         self._ends.set()
-        self.seen_to({})
-        futex.wake(self._file.address(layout.CHANGED_AT))
-        self._thread.join()
+        while self._thread.is_alive():  # it may have been about to sleep when it was woken
+            self.seen_to({})
+            self.look_again()
+            self._thread.join(WAKE_AGAIN_S)
         os.close(self._event)
 
     def _run(self) -> None:

@@ -7,6 +7,7 @@ import select
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -31,6 +32,7 @@ from failover.core.frames.frame import Portion
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.roster import roster
 from failover.core.frames.terms import Said
+from failover.core.node import URGENT_GAP_NS
 from failover.core.wire.messages import Beat, Echo
 from failover.errors import NeverWrittenError
 
@@ -323,6 +325,56 @@ def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_of
         first.link.went(portions)
         sent += len(portions)
     assert sent <= URGENT_PER_S
+
+
+def test_a_thread_that_is_about_to_sleep_ends_without_sleeping(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, _ = pair
+    at_the_door, woken = threading.Event(), threading.Event()
+    was_woken: list[bool] = []
+    wait, wake = futex.wait, futex.wake
+
+    def waits(address: int, value: int, timeout_s: float) -> bool:
+        at_the_door.set()
+        woken.wait(60)
+        was_woken.append(wait(address, value, timeout_s))
+        return was_woken[-1]
+
+    def wakes(address: int) -> None:
+        wake(address)
+        woken.set()
+
+    monkeypatch.setattr(urgent_items, "IDLE_LOOK_S", 5.0)
+    monkeypatch.setattr(urgent_items.futex, "wait", waits)
+    first.link.wakes.look_again()
+    assert at_the_door.wait(60)
+    monkeypatch.setattr(urgent_items.futex, "wake", wakes)
+    first.link.wakes.close()
+    assert was_woken == [True]
+
+
+def test_what_was_seen_to_already_is_no_error(pair: tuple[Robot, Robot]) -> None:
+    first, _ = pair
+    first.link.wakes.heed()
+    first.link.wakes.heed()
+
+
+def test_a_program_that_puts_an_urgent_item_all_the_time_does_not_keep_the_loop_busy(pair: tuple[Robot, Robot]) -> None:
+    first, _ = pair
+    item = first.program.item("alarm", bytes)
+    first.link.due(0, clock.now_ns())  # the table is read
+    sent_ns = now_ns = clock.now_ns()
+    looks = 0
+    while now_ns < sent_ns + 100 * URGENT_GAP_NS:
+        item.put(b"!")
+        portions = first.link.urgent(now_ns)
+        first.link.went(portions)
+        looks += 1
+        now_ns = max(now_ns + 1_000, first.link.urgent_due_ns(sent_ns))
+    assert URGENT_PER_S < looks <= 100
+    first.link.leave_for_slot(now_ns)
+    assert first.link.urgent_due_ns(sent_ns) == now_ns + URGENT_GAP_NS
 
 
 def test_a_put_wakes_the_loop_once_and_one_that_came_while_it_sent_wakes_it_again(
