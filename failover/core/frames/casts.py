@@ -97,6 +97,12 @@ class Casts:
             if left_ns is not None and left_ns > self._proved_ns.get((rank, ours), 0):
                 self._proved_ns[rank, ours] = left_ns
 
+    def forget(self, place: int) -> None:
+        """Over our link ``place`` frames are cast in another way from now on: who heard the way before may not hear this one."""
+        self._left[place].clear()
+        for rank, ours in [one for one in self._proved_ns if one[1] == place]:
+            del self._proved_ns[rank, ours]
+
     def hears(self, rank: int, place: int, since_ns: int) -> bool:
         """Whether the member has said that it heard a cast over our link ``place`` that left since then."""
         return self._proved_ns.get((rank, place), 0) >= since_ns

@@ -139,7 +139,7 @@ class Casting:
         """Once a round: how many robots we hear, and how many of those hear us; whether frames are cast in another way now."""
         self._rounds += 1
         if self._is_auto and self.now is not Cast.MULTICAST and self._rounds >= RETRY_ROUNDS:
-            self.now, self._unheard, self._rounds = Cast.MULTICAST, 0, 0
+            self.now, self.why, self._unheard, self._rounds = Cast.MULTICAST, "", 0, 0
             return True
         self._unheard = self._unheard + 1 if heard and not hears_us else 0
         return self._unheard >= UNHEARD_ROUNDS and self._fall_back(f"{heard} robots are heard, and none has heard a {self.now}")

@@ -28,6 +28,21 @@ def test_a_member_that_says_that_it_heard_the_newest_cast_hears_it() -> None:
     assert not first.hears(2, 0, 1), "of the other member nothing is known"
 
 
+def test_after_another_way_to_cast_was_chosen_members_must_say_anew_that_they_hear_it() -> None:
+    first, second = casts(0), casts(1)
+    for place in (0, 1):
+        first.left(place, 100, 1_000 * MS)
+        second.heard(place, 0, boot=1, counter=100)
+    first.told(1, second.says())
+    first.forget(0)
+    first.told(1, second.says())
+    assert (first.hears(1, 0, 1), first.hears(1, 1, 1)) == (False, True), "what left before is none of this way"
+    first.left(0, 101, 1_020 * MS)
+    second.heard(0, 0, boot=1, counter=101)
+    first.told(1, second.says())
+    assert first.hears(1, 0, 1_020 * MS)
+
+
 def test_what_a_member_heard_long_ago_proves_nothing() -> None:
     first, second = casts(0), casts(1)
     second.heard(0, 0, boot=1, counter=1)

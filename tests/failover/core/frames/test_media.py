@@ -114,4 +114,4 @@ def test_a_way_that_did_not_work_is_tried_again_after_a_while() -> None:
         casting.round_over(3, 0)
     assert casting.now is Cast.UNICAST
     assert [casting.round_over(3, 0) for _ in range(RETRY_ROUNDS)].index(True) == RETRY_ROUNDS - 1
-    assert casting.now is Cast.MULTICAST
+    assert (casting.now, casting.why) == (Cast.MULTICAST, "")
