@@ -478,11 +478,13 @@ class MainLoop:
         """
         now_ns = clock.now_ns()
         self._beat = beat
-        if self._board is None or not self._media.at_once or now_ns - self._round_ns <= self._outbox.beat_ns // 2:
+        if self._board is None or now_ns - self._round_ns <= self._outbox.beat_ns // 2 or not self._media.paces(now_ns):
             self._send_frame(beat, (), now_ns)
             return
         self._begin_round(self._board, now_ns)
         items = self._board.due(self._round, now_ns)
+        if not self._media.at_once:
+            items += self._urgent_besides(self._board, items, now_ns)
         self._board.placed(items, self._send_frame(beat, items, now_ns))
 
     def _begin_round(self, board: BoardLink, now_ns: int) -> None:
@@ -529,10 +531,14 @@ class MainLoop:
             self._begin_round(self._board, now_ns)
         items = self._board.due(self._round, now_ns, link.number, link.turned)
         if not self._media.at_once:
-            numbers = {item.number for item in items}
-            items += [item for item in self._board.urgent(now_ns) if item.number not in numbers]
+            items += self._urgent_besides(self._board, items, now_ns)
         link.turned = self._round
         self._board.placed(items, self._media.send_in_slot(link, beat, items, self._round), link.number)
+
+    def _urgent_besides(self, board: BoardLink, items: Sequence[Portion], now_ns: int) -> list[Portion]:
+        """Urgent items that waited for this frame, besides those that are due."""
+        numbers = {item.number for item in items}
+        return [item for item in board.urgent(now_ns) if item.number not in numbers]
 
     def _act(self, act: Act) -> None:
         self._worker.order(act)

@@ -130,6 +130,7 @@ class Media:
         link.period_ns = config.t_tup_ms * MS if has_slots else self._beat_ns
         link.why = self._hindrance(link, config)
         link.casting = None if link.why else Casting(Cast(config.cast))
+        self._forget_proofs(link)
         if link.casting is not None:
             log.info("frames are cast over %s: %s", link.now.name, link.casting.now)
 
@@ -218,8 +219,17 @@ class Media:
         return max(stretched_ns(link.period_ns, len(self._roster)) for link in self._slotted)
 
     def is_first(self, link: Link) -> bool:
-        """Whether this is the first link with slots: the pace of the board where all have slots."""
-        return link is self._slotted[0]
+        """Whether this is the first link on which this robot has a slot: the pace of the board where all links have slots."""
+        return link is next((one for one in self._slotted if one.has_slot), None)
+
+    def paces(self, now_ns: int) -> bool:
+        """Whether a frame that leaves at once begins a round of the board: one over a link that never has slots.
+
+        Or, where all have them and this robot has a slot on none, any frame: primaries, states and items go on.
+        """
+        if self.at_once:
+            return True
+        return not any(link.has_slot for link in self._slotted) and any(self._goes_at_once(link, now_ns) for link in self._links)
 
     def wakes_ns(self) -> int | None:
         """When `due` is to be asked next; None without slots."""
@@ -273,14 +283,14 @@ class Media:
             for sealed in made:
                 for peer in sealed.to:
                     self._beats.unicast(peer, link.place, sealed.datagrams)
-            if link.casting is not None:
-                link.casting.round_over(0, 0)
+            if link.casting is not None and link.casting.round_over(0, 0):
+                self._cast_otherwise(link)
             return
         since_ns = now_ns - round(RECENT_PERIODS * period_ns) - patience_ns
         for sealed in made if any(one.to for one in made) else []:
             refusal = self._beats.cast(link.place, link.casting.now, sealed.datagrams)
             if refusal and link.casting.failed(refusal):
-                log.warning("frames go by %s over %s: %s", link.casting.now, link.now.name, refusal)
+                self._cast_otherwise(link)
             for counter in range(lane.counter - len(sealed.datagrams) + 1, lane.counter + 1):
                 casts.left(link.place, counter, now_ns)
             ranks, reached = self._roster.ranks, link.reached
@@ -296,7 +306,25 @@ class Media:
         present = [peer for peer in to if peer in link.reached and now_ns - link.heard_ns.get(peer, 0) < HEARD_NS]
         hearing = sum(peer not in link.by_unicast for peer in present)
         if link.casting.round_over(len(present), hearing):
-            log.warning("frames go by %s over %s: %s", link.casting.now, link.now.name, link.casting.why)
+            self._cast_otherwise(link)
+
+    def _cast_otherwise(self, link: Link) -> None:
+        """Frames are cast in another way now: until members say that they hear it they get unicast besides."""
+        assert link.casting is not None
+        why = link.casting.why or "it is tried again"
+        log.log(
+            logging.WARNING if link.casting.why else logging.INFO,
+            "frames go by %s over %s: %s",
+            link.casting.now,
+            link.now.name,
+            why,
+        )
+        self._forget_proofs(link)
+
+    def _forget_proofs(self, link: Link) -> None:
+        for lane in filter(None, (self._lanes.lane(0), link.lane)):
+            if lane.casts is not None and link.place < LINKS_MAX:
+                lane.casts.forget(link.place)
 
     # --- For people ---
 
