@@ -74,9 +74,9 @@ class BoardLink:
         self._turns: dict[int, Turns] = {}
         self.dropped: Counter[str] = Counter()
         self._own = OwnItems(own)
-        self._gone: dict[int, int] = {}
+        self._gone: dict[tuple[int, int], int] = {}
         self._looked: dict[int, int] = {}
-        self._buckets: dict[int, Bucket] = {}
+        self._buckets: dict[tuple[int, int], Bucket] = {}
         self.wakes = UrgentItems(own, self._own)
         self._urgent_ns = 0
         self._peers = {name: _Peer(items) for name, items in peers.items()}
@@ -142,16 +142,19 @@ class BoardLink:
         """
         return max(sent_ns, self._urgent_ns) + URGENT_GAP_NS
 
-    def urgent(self, now_ns: int) -> list[Portion]:
-        """Urgent items that were put since they last went, as often as `Bucket` allows it."""
-        urgent, self._urgent_ns = self._own.urgent, now_ns
+    def urgent(self, now_ns: int, medium: int = 0) -> list[Portion]:
+        """Urgent items that were put since they last went over this medium, as often as `Bucket` allows it there."""
+        urgent = self._own.urgent
         try:
-            self._looked = numbers = self._own.numbers(urgent)
+            numbers = self._own.numbers(urgent)
         except OSError:
             self.dropped[UNREADABLE] += 1
             return []
-        put = [(one, numbers[one.id]) for one in urgent if numbers[one.id] > self._gone.get(one.id, 0)]
-        return self._portions([one for one in put if self._buckets.setdefault(one[0].id, Bucket()).take(now_ns)], now_ns)
+        if medium == 0:
+            self._looked, self._urgent_ns = numbers, now_ns
+        put = [(one, numbers[one.id]) for one in urgent if numbers[one.id] > self._gone.get((medium, one.id), 0)]
+        may = [one for one in put if self._buckets.setdefault((medium, one[0].id), Bucket()).take(now_ns)]
+        return self._portions(may, now_ns)
 
     def seen_to(self) -> None:
         """What `urgent` gave is on its way: the thread that waits for puts may go on."""
@@ -169,11 +172,11 @@ class BoardLink:
     def placed(self, portions: Sequence[Portion], count: int, medium: int = 0) -> None:
         """The first ``count`` of what was due found room in the frame."""
         self._turns_of(medium).left(portion.number for portion in portions[count:] if portion.number < RESERVED)
-        self.went(portions[:count])
+        self.went(portions[:count], medium)
 
-    def went(self, portions: Sequence[Portion]) -> None:
-        """These are on their way: what is urgent of them need not go again."""
-        self._gone.update((portion.number, portion.put) for portion in portions)
+    def went(self, portions: Sequence[Portion], medium: int = 0) -> None:
+        """These are on their way over this medium: what is urgent of them need not go there again."""
+        self._gone.update(((medium, portion.number), portion.put) for portion in portions)
 
     def _portions(self, newest: Iterable[tuple[Record, int]], now_ns: int) -> list[Portion]:
         """Of items with the numbers of their newest puts."""

@@ -530,15 +530,14 @@ class MainLoop:
         if not self._media.at_once and self._media.is_first(link):
             self._begin_round(self._board, now_ns)
         items = self._board.due(self._round, now_ns, link.number, link.turned)
-        if not self._media.at_once:
-            items += self._urgent_besides(self._board, items, now_ns)
+        items += self._urgent_besides(self._board, items, now_ns, link.number)
         link.turned = self._round
         self._board.placed(items, self._media.send_in_slot(link, beat, items, self._round), link.number)
 
-    def _urgent_besides(self, board: BoardLink, items: Sequence[Portion], now_ns: int) -> list[Portion]:
+    def _urgent_besides(self, board: BoardLink, items: Sequence[Portion], now_ns: int, medium: int = 0) -> list[Portion]:
         """Urgent items that waited for this frame, besides those that are due."""
         numbers = {item.number for item in items}
-        return [item for item in board.urgent(now_ns) if item.number not in numbers]
+        return [item for item in board.urgent(now_ns, medium) if item.number not in numbers]
 
     def _act(self, act: Act) -> None:
         self._worker.order(act)

@@ -327,6 +327,25 @@ def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_of
     assert sent <= URGENT_PER_S
 
 
+def test_an_urgent_item_that_left_over_one_medium_goes_over_each_other_one_too(pair: tuple[Robot, Robot]) -> None:
+    first, _ = pair
+    first.link.due(0, clock.now_ns())  # the table is read
+    first.program.item("alarm", bytes).put(b"!")
+    now_ns = clock.now_ns()
+    for medium in (0, 1, 2):
+        (urgent,) = first.link.urgent(now_ns, medium)
+        first.link.placed([urgent], 1, medium)
+        assert first.link.urgent(now_ns, medium) == []
+    taken = 0
+    for _ in range(2 * URGENT_PER_S):
+        first.program.item("alarm", bytes).put(b"!")
+        portions = first.link.urgent(now_ns, 1)
+        first.link.went(portions, 1)
+        taken += len(portions)
+    assert taken == URGENT_PER_S - 1
+    assert len(first.link.urgent(now_ns, 0)) == 1, "the radio's limit is not the cable's"
+
+
 def test_a_thread_that_is_about_to_sleep_ends_without_sleeping(
     pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
