@@ -8,6 +8,7 @@ from which nothing comes gets its frames by unicast, too.
 
 from __future__ import annotations
 
+import struct
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -22,8 +23,6 @@ COUNTER_SIZE: Final = 2
 """Bytes of a counter: its low half suffices, for only the newest ones are looked up."""
 
 _LOW: Final = (1 << 8 * COUNTER_SIZE) - 1
-_HALF: Final = 1 << 8 * COUNTER_SIZE - 1
-"""Counters that differ by less than this many are in their order."""
 
 
 class Casts:
@@ -35,13 +34,15 @@ class Casts:
     """
 
     def __init__(self, me: int, members: int, ways: Mapping[int, Sequence[tuple[int, int]]]) -> None:
-        self._me, self._size = me, COUNTER_SIZE * members
+        self._me, self._members, self._size = me, members, COUNTER_SIZE * members
+        self._low_halves = struct.Struct(f"<{members}H")
         self._ways = ways
-        self._heard: list[bytearray] = []
+        self._heard: list[list[int]] = []
         self._lives: dict[int, int] = {}
         self._said: tuple[bytes, ...] | None = ()
         self._left: tuple[OrderedDict[int, int], ...] = tuple(OrderedDict() for _ in range(LINKS_MAX))
         self._proved_ns: dict[tuple[int, int], int] = {}
+        self._claims: dict[tuple[int, int], int] = {}
 
     # --- What we hear ---
 
@@ -52,30 +53,21 @@ class Casts:
         if boot > self._lives.get(rank, 0):
             self._lives[rank] = boot
             for counters in self._heard:
-                self._note(counters, rank, 0)
+                counters[rank] = 0
         while len(self._heard) <= place:
-            self._heard.append(bytearray(self._size))
-        self._newest(place, rank, counter)
+            self._heard.append([0] * self._members)
+        if counter > self._heard[place][rank]:
+            self._heard[place][rank] = counter
+            self._said = None
 
     def heard_again(self, place: int, rank: int, counter: int) -> None:
         """A copy of a part that had come already came by cast over our link ``place``."""
         self.heard(place, rank, self._lives.get(rank, 0), counter)
 
-    def _newest(self, place: int, rank: int, counter: int) -> None:
-        """Note the counter, unless it is of an earlier part than the one that is noted."""
-        counters = self._heard[place]
-        noted = int.from_bytes(counters[COUNTER_SIZE * rank : COUNTER_SIZE * (rank + 1)], "little")
-        if not noted or (counter - noted) & _LOW < _HALF:
-            self._note(counters, rank, counter & _LOW)
-            self._said = None
-
-    def _note(self, counters: bytearray, rank: int, counter: int) -> None:
-        counters[COUNTER_SIZE * rank : COUNTER_SIZE * (rank + 1)] = counter.to_bytes(COUNTER_SIZE, "little")
-
     def says(self) -> tuple[bytes, ...]:
         """For a frame of ours: for each of our links the low half of the counter of each rank's newest cast; 0: none."""
         if self._said is None:
-            self._said = tuple(map(bytes, self._heard))
+            self._said = tuple(self._low_halves.pack(*[counter & _LOW for counter in counters]) for counters in self._heard)
         return self._said
 
     # --- Who hears us ---
@@ -88,14 +80,21 @@ class Casts:
             left.popitem(last=False)
 
     def told(self, rank: int, casts: Sequence[bytes]) -> None:
-        """A member's frame said what it heard. Of whatever was not cast lately it proves nothing; never raises."""
+        """A member's frame said what it heard. Of whatever was not cast lately it proves nothing; never raises.
+
+        One that hears no casts any more repeats the last one that it heard, of which a later part has the low half, too.
+        """
         at = COUNTER_SIZE * self._me
         for ours, theirs in self._ways.get(rank, ()):
             if ours >= LINKS_MAX or theirs >= len(casts) or len(casts[theirs]) != self._size:
                 continue
-            left_ns = self._left[ours].get(int.from_bytes(casts[theirs][at : at + COUNTER_SIZE], "little"))
-            if left_ns is not None and left_ns > self._proved_ns.get((rank, ours), 0):
-                self._proved_ns[rank, ours] = left_ns
+            claim, way = int.from_bytes(casts[theirs][at : at + COUNTER_SIZE], "little"), (rank, ours)
+            if claim in (0, self._claims.get(way)):
+                continue
+            self._claims[way] = claim
+            left_ns = self._left[ours].get(claim)
+            if left_ns is not None and left_ns > self._proved_ns.get(way, 0):
+                self._proved_ns[way] = left_ns
 
     def forget(self, place: int) -> None:
         """Over our link ``place`` frames are cast in another way from now on: who heard the way before may not hear this one."""

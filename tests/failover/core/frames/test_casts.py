@@ -60,6 +60,31 @@ def test_the_newest_cast_counts_whatever_comes_late() -> None:
     assert second.says()[0][:2] == (2).to_bytes(2, "little"), "its low half"
 
 
+@pytest.mark.parametrize("silent", [32_768, 40_000, 65_536])
+def test_a_cast_after_a_long_silence_is_a_later_one(silent: int) -> None:
+    second = casts(1)
+    second.heard(0, 0, boot=1, counter=100)
+    second.heard(0, 0, boot=1, counter=100 + silent + 1)
+    assert second.says()[0][:2] == ((101 + silent) % 65_536).to_bytes(2, "little")
+
+
+@pytest.mark.parametrize("heard", [100, 0])
+def test_a_member_that_hears_no_casts_any_more_is_never_taken_for_one_that_does(heard: int) -> None:
+    """It repeats the last one that it heard, if any; one part of 65,536 has that low half, too."""
+    first, second = casts(0), casts(1)
+    first.left(0, 100, 1_000 * MS)
+    if heard:
+        second.heard(0, 0, boot=1, counter=heard)
+    else:
+        second.heard(0, 2, boot=1, counter=7)
+    first.told(1, second.says())
+    for counter in range(65_400, 65_700):
+        now_ns = (1_000 + counter) * MS
+        first.left(0, counter, now_ns)
+        first.told(1, second.says())
+        assert not first.hears(1, 0, now_ns)
+
+
 def test_another_life_of_a_member_begins_with_nothing_heard() -> None:
     second = casts(1)
     second.heard(0, 0, boot=1, counter=500)
