@@ -39,22 +39,33 @@ class Announcements:
         self._announcer = Announcer(rank)
         self._files = peers
         self._learned = {name: Learned(items.file.header.rank, items.added()) for name, items in peers.items()}
-        self._put = 0
+        self._put = self._round = 0
+        self._lacking: tuple[int, ...] = ()
+        self._asked: set[int] = set()
 
     def hold(self, records: Iterable[Record]) -> None:
         """This robot's items that it sends, as its table is now."""
         self._announcer.hold(record for record in records if record.flags & ADDED)
 
-    def due(self, round_: int) -> list[Portion]:
+    def due(self, round_: int, medium: int = 0) -> list[Portion]:
         """What to tell in the frame of this round, before its items: a value whose item is told in the same frame is not lost."""
         found = []
-        page = self._announcer.due(round_)
+        page = self._announcer.due(round_, medium)
         if page is not None:
             found.append(self._portion(PAGE, page))
-        ranks = [self._files[name].file.header.rank for name, learned in self._learned.items() if learned.is_to_ask()]
-        if ranks:
-            found.append(self._portion(QUESTION, question(ranks)))
+        if round_ != self._round:
+            self._round = round_
+            self._look()
+        if self._lacking and medium not in self._asked:
+            self._asked.add(medium)
+            found.append(self._portion(QUESTION, question(self._lacking)))
         return found
+
+    def _look(self) -> None:
+        """Once a round: whose tables lack a part. The question goes once over each medium: the robot may hear but one of them."""
+        ranks = tuple([self._files[name].file.header.rank for name, learned in self._learned.items() if learned.is_to_ask()])
+        if ranks:
+            self._lacking, self._asked = ranks, set()
 
     def _portion(self, number: int, content: bytes) -> Portion:
         self._put += 1

@@ -114,7 +114,7 @@ class BoardLink:
                 self._hold(*self._turns.values())
                 self._announcements.hold(self._own.records.values())
                 self.wakes.look_again()
-            told = self._announcements.due(round_)
+            told = self._announcements.due(round_, medium)
             due = self._turns_of(medium).due(round_, since)
             if not due:
                 return told

@@ -17,7 +17,7 @@ from typing import Annotated, Final
 
 import msgspec
 import xxhash
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from checkpoint.errors import UNDECODABLE
 from failover.core.board.item_types import Opaque, parse
@@ -149,15 +149,26 @@ def asks(content: bytes, rank: int) -> bool:
         return False
 
 
+class _Medium(Struct):
+    """What is still to be told over one medium.
+
+    Attributes:
+        times: number of an item that changed → frames that are to tell it.
+        sweep: where the whole table goes on, if it was asked for.
+    """
+
+    times: dict[int, int] = field(default_factory=dict)
+    sweep: int | None = None
+
+
 class Announcer:
-    """Tells this robot's table: at most one page in each frame."""
+    """Tells this robot's table: at most one page in each frame. Over each medium all of it: a member may hear but one."""
 
     def __init__(self, rank: int) -> None:
         self._first = first_number(rank)
         self._items: dict[int, bytes] = {}
         self._word = 0
-        self._times: dict[int, int] = {}
-        self._sweep: int | None = None
+        self._media = {0: _Medium()}
         self._is_new = True
         self._too_long: set[int] = set()
 
@@ -177,23 +188,26 @@ class Announcer:
         changed = [number for number in items.keys() | self._items.keys() if items.get(number) != self._items.get(number)]
         self._items, self._word = items, word_of(items.values())
         if not self._is_new:  # else the others know the table from before, or will ask
-            self._times.update((number, TIMES) for number in changed)
+            for medium in self._media.values():
+                medium.times.update((number, TIMES) for number in changed)
         self._is_new = False
 
     def asked(self) -> None:
         """A robot lacks a part of the table: tell all of it."""
-        if self._sweep is None:
-            self._sweep = self._first
+        for medium in self._media.values():
+            if medium.sweep is None:
+                medium.sweep = self._first
 
-    def due(self, round_: int) -> bytes | None:
-        """What to tell in the frame of this round."""
-        if self._times:
-            return self._told(min(self._times))
-        if self._sweep is not None:
-            return self._told(self._sweep)
+    def due(self, round_: int, medium: int = 0) -> bytes | None:
+        """What to tell in the frame of this round over this medium."""
+        of = self._media.setdefault(medium, _Medium())
+        if of.times:
+            return self._told(min(of.times), of)
+        if of.sweep is not None:
+            return self._told(of.sweep, of)
         return None if round_ % WORD_ROUNDS else _encode(Page(self._word))
 
-    def _told(self, first: int) -> bytes:
+    def _told(self, first: int, of: _Medium) -> bytes:
         """A page that begins with this number, as far as it has room."""
         after, size = self._first + ITEMS_MAX, 0
         items: list[bytes] = []
@@ -203,13 +217,13 @@ class Announcer:
                 after = number
                 break
             items.append(self._items[number])
-        self._times = {
+        of.times = {
             number: times - (first <= number < after)
-            for number, times in self._times.items()
+            for number, times in of.times.items()
             if times > 1 or not first <= number < after
         }
-        if self._sweep is not None and first <= self._sweep < after:
-            self._sweep = after if after < self._first + ITEMS_MAX else None
+        if of.sweep is not None and first <= of.sweep < after:
+            of.sweep = after if after < self._first + ITEMS_MAX else None
         return _encode(Page(self._word, first, after, tuple(items)))
 
 

@@ -14,7 +14,7 @@ from failover.boards import directory
 from failover.boards.mapping import MappedFile
 from failover.boards.received import NO_ROOM
 from failover.core.board import layout
-from failover.core.board.announcements import WORD_ROUNDS
+from failover.core.board.announcements import ASK_ROUNDS, QUESTION, WORD_ROUNDS
 from failover.core.board.items import Item
 from failover.errors import BoardError, NeverWrittenError
 from tests.agent.main_loop.test_board_link import ROUND_NS, TEAM, Robot, made, place_of
@@ -194,3 +194,21 @@ def test_an_agent_killed_at_any_step_of_an_addition_leaves_the_table_whole_and_t
         if status == 0:
             break
     assert steps > 3
+
+
+def test_a_question_goes_once_over_each_medium_and_is_counted_by_rounds(pair: tuple[Robot, Robot]) -> None:
+    """A robot may hear but one of them."""
+    first, second = pair
+    first.program.add(Item("goal", "u8")).put(1)
+    for _ in range(10):
+        first.link._own._looked_ns = None
+        first.says()
+    while (first.round + 1) % WORD_ROUNDS:
+        first.says()
+    second.hears(first.says())
+    asked: dict[int, list[int]] = {0: [], 1: [], 2: []}
+    for round_ in range(second.round + 1, second.round + 2 * ASK_ROUNDS):
+        for medium in asked:
+            due = second.link.due(round_, 0, medium)
+            asked[medium] += [round_ for portion in due if portion.number == QUESTION]
+    assert asked == {medium: [second.round + ASK_ROUNDS] for medium in (0, 1, 2)}

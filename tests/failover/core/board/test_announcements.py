@@ -217,3 +217,14 @@ def test_a_page_that_is_longer_than_any_that_a_robot_tells_is_not_read() -> None
     assert learned.take(1, whole) == ()
     assert learned.refused == {NOT_POSSIBLE: 1}
     assert len(learned.take(2, _encode(Page(0, FIRST, FIRST + 9, tuple(declared[:9]))))) == 9
+
+
+def test_a_change_and_a_whole_table_are_told_over_each_medium() -> None:
+    announcer = Announcer(RANK)
+    announcer.hold([])
+    assert announcer.due(1, medium=2) is None
+    for change in (lambda: announcer.hold([record(FIRST)]), announcer.asked):
+        change()
+        told_over = {medium: [announcer.due(1, medium) is not None for _ in range(TIMES + 1)] for medium in (0, 2)}
+        assert told_over[0] == told_over[2]
+        assert told_over[0][0] and not told_over[0][-1]
