@@ -145,13 +145,15 @@ class BoardLink:
     def urgent(self, now_ns: int, medium: int = 0) -> list[Portion]:
         """Urgent items that were put since they last went over this medium, as often as `Bucket` allows it there."""
         urgent = self._own.urgent
+        if medium == 0:
+            self._urgent_ns = now_ns
         try:
             numbers = self._own.numbers(urgent)
         except OSError:
             self.dropped[UNREADABLE] += 1
             return []
         if medium == 0:
-            self._looked, self._urgent_ns = numbers, now_ns
+            self._looked = numbers
         put = [(one, numbers[one.id]) for one in urgent if numbers[one.id] > self._gone.get((medium, one.id), 0)]
         may = [one for one in put if self._buckets.setdefault((medium, one[0].id), Bucket()).take(now_ns)]
         return self._portions(may, now_ns)

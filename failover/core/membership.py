@@ -263,10 +263,11 @@ class Membership:
         return tuple(self._echo(peer, now_ns) for peer in self.peers.values() if peer.boot)
 
     def _echo(self, peer: Peer, now_ns: int) -> Echo:
+        counter = 0 if peer.at_odds else peer.counter
         if self._deaf(peer, now_ns):
-            return Echo(peer.robot, peer.boot, -peer.counter)
+            return Echo(peer.robot, peer.boot, -counter)
         peer.told_ns = now_ns
-        return Echo(peer.robot, peer.boot, 0 if peer.at_odds else peer.counter)
+        return Echo(peer.robot, peer.boot, counter)
 
     def steady(self, now_ns: int) -> bool:
         """Whether each living peer was heard in the last two thirds of a loyalty: none is about to be taken for dead."""
