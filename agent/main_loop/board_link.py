@@ -7,7 +7,7 @@ anything into `own`; every size is checked before it is believed, and nothing of
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -48,6 +48,7 @@ class _Peer(Struct):
 
     Attributes:
         worst_ns: the longest way lately; falls slowly.
+        round_ns: the longest round of its frames, as they come here; 0 until that is told.
     """
 
     items: ReceivedItems
@@ -56,6 +57,7 @@ class _Peer(Struct):
     state: int = layout.NOT
     worst_ns: int = 0
     told_ns: int = 0
+    round_ns: int = 0
 
 
 class BoardLink:
@@ -222,15 +224,20 @@ class BoardLink:
         peer.worst_ns = max(way_ns, peer.worst_ns - peer.worst_ns // WORST_FALLS)
         if came_ns - peer.told_ns > BOUNDS_TOLD_NS:
             peer.told_ns = came_ns
-            round_ns, worst_ns = self._round_ns, peer.worst_ns
+            round_ns, worst_ns = peer.round_ns or self._round_ns, peer.worst_ns
             peer.items.bound(lambda period: bound_ns(period, period * round_ns, worst_ns, round_ns, 1))
 
-    def tell_states(self, now_ns: int, lease_ns: int) -> None:
-        """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease."""
-        for peer in self._peers.values():
+    def tell_states(self, now_ns: int, lease_ns: int, round_of: Callable[[str], int] | None = None) -> None:
+        """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease.
+
+        Args:
+            round_of: the longest round of a robot's frames, ns: one that is heard by radio only is heard more seldom.
+        """
+        for name, peer in self._peers.items():
+            peer.round_ns = round_of(name) if round_of is not None else self._round_ns
             silent_ns = now_ns - self._skew_ns - peer.heard_ns
             state = layout.REMOVE if silent_ns < lease_ns else layout.NOT
-            if silent_ns < REMOVE_ROUNDS * self._round_ns:
+            if silent_ns < REMOVE_ROUNDS * peer.round_ns:
                 state = layout.RUN
             if peer.state != state and peer.heard_ns:
                 peer.state = state

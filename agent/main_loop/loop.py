@@ -489,7 +489,8 @@ class MainLoop:
 
     def _begin_round(self, board: BoardLink, now_ns: int) -> None:
         self._round, self._round_ns = self._round + 1, now_ns
-        board.tell_states(now_ns, self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000)
+        lease_ns = self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000
+        board.tell_states(now_ns, lease_ns, lambda peer: self._media.round_of(peer, now_ns))
         board.tell_primaries(self._node.primaries() if self._node is not None else {}, now_ns)
 
     def _send_urgent(self) -> None:

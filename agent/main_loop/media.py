@@ -216,7 +216,15 @@ class Media:
         """The longest round of items: a heartbeat's period; where all links have slots, a round that the reference stretched."""
         if self.at_once:
             return self._beat_ns
-        return max(stretched_ns(link.period_ns, len(self._roster)) for link in self._slotted)
+        return max(self._longest_ns(link) for link in self._slotted)
+
+    def round_of(self, peer: str, now_ns: int) -> int:
+        """The longest round of a member's frames, ns: of the fastest link over which one came lately; `round_ns` if over none."""
+        lately = [link for link in self._links if now_ns - link.heard_ns.get(peer, -HEARD_NS) < HEARD_NS]
+        return min((self._longest_ns(link) for link in lately), default=self.round_ns)
+
+    def _longest_ns(self, link: Link) -> int:
+        return self._beat_ns if link.slots is None else stretched_ns(link.period_ns, len(self._roster))
 
     def is_first(self, link: Link) -> bool:
         """Whether this is the first link on which this robot has a slot: the pace of the board where all links have slots."""

@@ -299,6 +299,27 @@ def test_states_of_robots_are_told(pair: tuple[Robot, Robot]) -> None:
         assert second.program.robots()["robot1"].state == state
 
 
+def test_a_robot_that_is_heard_by_radio_only_is_judged_by_the_rounds_of_the_radio(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_link, "BOUNDS_TOLD_NS", -1)
+    first, second = pair
+    file = second.link._peers["robot1"].items.file
+    (ball,) = [record for record in file.records() if record.name == "ball"]
+    bounds = []
+    for round_ns in (ROUND_NS, 5 * ROUND_NS):
+        second.link.tell_states(clock.now_ns(), 20 * ROUND_NS, lambda _, ns=round_ns: ns)  # type: ignore[misc]
+        for _ in range(2):
+            second.hears(first.says())
+            first.hears(second.says())
+        bounds.append(file.words[(ball.at + layout.FORMULA_FIELD) // 8])
+    assert bounds[1] - bounds[0] > 10 * ROUND_NS
+    now_ns = clock.now_ns() + 5 * ROUND_NS
+    for round_ns, state in ((ROUND_NS, "remove"), (5 * ROUND_NS, "run")):
+        second.link.tell_states(now_ns, 20 * ROUND_NS, lambda _, ns=round_ns: ns)  # type: ignore[misc]
+        assert second.program.robots()["robot1"].state == state
+
+
 def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_often(pair: tuple[Robot, Robot]) -> None:
     first, second = pair
     item = first.program.item("alarm", bytes)

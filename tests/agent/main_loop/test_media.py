@@ -9,7 +9,7 @@ import pytest
 
 from agent.config import Config, MediumConfig, Settings
 from agent.main_loop.beat_sockets import BeatLane
-from agent.main_loop.media import Media
+from agent.main_loop.media import HEARD_NS, Media, stretched_ns
 from agent.main_loop.messages import LinkNow
 from agent.system import clock
 from failover.config.team import Robot, Team
@@ -104,3 +104,16 @@ def test_when_another_way_to_cast_is_tried_members_get_unicast_besides_at_once(
                 casts.told(rank, (said,))
     both = ("robot2", "robot3")
     assert by_unicast == [(both, Cast.BROADCAST), ((), Cast.BROADCAST), ((), Cast.MULTICAST), (both, Cast.MULTICAST)]
+
+
+def test_the_round_of_a_member_is_that_of_the_fastest_link_over_which_it_is_heard(media: Make) -> None:
+    both = media("radio0", "cable0", slots=("radio0",))
+    now_ns = 10 * HEARD_NS
+    longest_ns = stretched_ns(ROUND_NS, 3)
+    assert longest_ns > ROUND_NS
+    both.heard("robot2", "radio0", now_ns)
+    both.heard("robot3", "radio0", now_ns)
+    both.heard("robot3", "cable0", now_ns - HEARD_NS // 2)
+    assert [both.round_of(peer, now_ns) for peer in ("robot2", "robot3")] == [longest_ns, 20_000_000]
+    assert both.round_of("robot3", now_ns + HEARD_NS // 2) == longest_ns
+    assert both.round_of("robot3", now_ns + 2 * HEARD_NS) == both.round_ns == 20_000_000
