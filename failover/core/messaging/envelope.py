@@ -324,6 +324,8 @@ def _check_numbers(envelope: Envelope) -> None:
             raise EnvelopeError("the message has a negative boot, seq, after or had")
         if number > INTEGER_MAX:
             raise EnvelopeError(f"the message holds the integer {number}: above 2^53 it must be written as text")
+    if envelope.deadline_ms is not None and not -INTEGER_MAX <= envelope.deadline_ms <= INTEGER_MAX:
+        raise EnvelopeError(f"the message has the deadline_ms {envelope.deadline_ms}: 2^53 ms are the most; leave it out for none")
     if len(envelope.hops) > HOPS_MAX:
         raise EnvelopeError(
             f"the message was passed on {len(envelope.hops)} times, {HOPS_MAX} are the most: names lead in a circle"

@@ -110,6 +110,8 @@ def test_no_bytes_raise_anything_but_a_sentence(content: bytes) -> None:
         (b'{"to":5}', "another kind than documented"),
         (b'{"seq":-1}', "negative"),
         (b'{"deadline_ms":"soon"}', "another kind"),
+        (b'{"deadline_ms":1e308}', "2^53 ms are the most"),
+        (b'{"verb":"set","deadline_ms":-1e308}', "2^53 ms are the most"),
         (b'{"to":"\xff"}', "cannot be read"),
         (b'{"a\\nb":1}', "visible characters"),
         (b'{"\\u0000rest":{"to":"x"}}', "visible characters"),
