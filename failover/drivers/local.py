@@ -120,6 +120,7 @@ def listen(path: Path) -> socket.socket:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     path.unlink(missing_ok=True)
     try:
+        os.fchmod(listening.fileno(), 0o600)  # the file gets this mode, whatever the umask lets others do
         listening.bind(os.fspath(path))
         listening.listen(CONNECTIONS_MAX)
     except OSError as error:

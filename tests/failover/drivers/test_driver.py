@@ -258,6 +258,16 @@ def test_files_of_two_paths_are_never_the_same(folder: Path) -> None:
         stem("a/" + "b" * 50, Path("/" + "x" * 100))
 
 
+def test_sockets_are_their_users_alone_whatever_the_umask_is(here: Here) -> None:
+    before = os.umask(0)
+    try:
+        with serving(Engine, here):
+            modes = {one.suffix: one.stat().st_mode & 0o777 for one in here.directory.iterdir() if one.is_socket()}
+    finally:
+        os.umask(before)
+    assert {".calls", ".hand"} <= modes.keys() and set(modes.values()) == {0o600}, modes
+
+
 def test_a_directory_of_others_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = folder / "open"
     place.mkdir()

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 
 import pytest
 
+from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs.states import State
+from failover.drivers.server import Near, Peer
 from failover.errors import BundleRefusedError, CallRefusedError, ProgramError
+from failover.programs.hosting import Hosting
+from failover.programs.sources import Place
 from tests.failover.programs.senders import Lab, engine, switched, until
 
 LEAST = 100
@@ -221,3 +227,20 @@ def test_an_order_that_cannot_be_is_refused_with_a_sentence(lab: Lab, body: dict
             proxy.call("_rollback")
         assert proxy.call("_versions")["active"] == "2"
     assert lab.store.shelf("engine").versions[0].state is State.STAGED
+
+
+def test_an_order_counts_by_the_way_it_came_also_when_that_way_is_forgotten(lab: Lab) -> None:
+    lab.send("1")
+    order = Envelope("engine", "_rollback", id="order", sender="robot2/x")
+    with Hosting(Place(lab.store, lab.team, "engine"), "1", lab.here) as host:
+
+        def sentence(whose: Peer | Near) -> str:
+            found = host.actor.came(order, whose, host.now_ns())
+            for number in range(SENDERS_MAX + 1):
+                host.actor.came(Envelope("nobody", sender=f"robot2/{number}"), Peer(b"x"), host.now_ns())
+            answers = [*found, *host.actor.handle(host.now_ns)]
+            return next(one.error.sentence for one in answers if one.re == "order")  # type: ignore[union-attr]
+
+        assert sentence(Peer(b"x")) == "give this order on the robot itself: robot2/x is on another one"
+        assert "uid 54321 is neither" in sentence(Near(9, 1, 54_321))
+        assert "cannot be rolled back" in sentence(Near(9, 2, os.geteuid()))
