@@ -82,14 +82,15 @@ class Running:
         self.state: State | None = None
         self.notes: tuple[str, ...] = ()
         ours, theirs = socket.socketpair()
-        words = [sys.executable, "-m", "failover.programs.version_process", str(theirs.fileno())]
+        words = [sys.executable, "-P", "-m", "failover.programs.version_process", str(theirs.fileno())]
         environment = {
             key: value
             for key, value in os.environ.items()
             if key in ("PATH", "LANG", "LC_ALL", "TZ", "PYTHONPATH", "VIRTUAL_ENV")
         }
         root = str(Path(__file__).parents[2])
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH", ""))))
+        places = environment.get("PYTHONPATH", "").split(os.pathsep)
+        environment["PYTHONPATH"] = os.pathsep.join((root, *filter(None, places)))  # "" is the folder where the host was started
         with theirs:
             self._process = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=2, pass_fds=(theirs.fileno(),), env=environment, start_new_session=True
