@@ -50,7 +50,9 @@ class Poller:
     def add(self, descriptor: int, *, reading: bool = True, writing: bool = False) -> None:
         """From now on it is waited for, until it can be read or written; or for neither."""
         events = reading * select.EPOLLIN | writing * select.EPOLLOUT
-        if descriptor in self._known:
+        if not events:  # epoll tells that the other end has gone, whatever it was asked for
+            self.remove(descriptor)
+        elif descriptor in self._known:
             self._epoll.modify(descriptor, events)
         else:
             self._epoll.register(descriptor, events)
