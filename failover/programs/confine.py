@@ -3,8 +3,8 @@
 As root: a user of its own; namespaces of network, mounts, processes and IPC. As an ordinary user: the same namespaces inside a
 user namespace where the kernel allows one, and the host's user. What could not be done is told, never passed over.
 
-Files are read-only but /tmp; /root, /home, /run, /var, /srv, /mnt, /media and /etc/failover are empty but for what Python itself needs; in /dev
-are null, zero, full, random, urandom and the devices that the manifest names.
+Files are read-only but /tmp; /root, /home, /run, /var, /srv, /mnt, /media and /etc/failover are empty but for what Python itself
+needs; in /dev are null, zero, full, random, urandom and the devices that the manifest names.
 
 Source: unshare(2), mount(2), mount_setattr(2), user_namespaces(7), pid_namespaces(7), prctl(2), capabilities(7).
 """

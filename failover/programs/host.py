@@ -188,14 +188,18 @@ class HostActor(Actor):
     def _keep(self) -> None:
         """State and mailbox to the disk, before an answer leaves."""
         self._is_changed = False
-        self._number += 1
-        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
         try:
-            self._place.store.keep(self._declaration.path, Kept(self._number, self.version, self._state, streams))
+            self._write()
         except ProgramError as error:
             if str(error) != self._said:
                 self._said = str(error)
                 log.warning("%s", error)
+
+    def _write(self, *, is_lasting: bool = False) -> None:
+        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
+        kept = Kept(self._number + 1, self.version, self._state, streams)
+        self._place.store.keep(self._declaration.path, kept, is_lasting=is_lasting)
+        self._number += 1  # only now: while the disk is full, the newest whole one is never written over
 
     @property
     def version(self) -> str:
@@ -517,11 +521,8 @@ class HostActor(Actor):
                 self._state = self._running.state
             except FailoverError as error:
                 log.warning("%s", error)
-        self._number += 1
-        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
-        kept = Kept(self._number, self.version, self._state, streams)
         try:
-            self._place.store.keep(self._declaration.path, kept, is_lasting=True)
+            self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
         for one in (self._running, self._old, self._coming):

@@ -259,7 +259,7 @@ class Store:
     # --- Kept states ------------------------------------------------------------------------------------------------------
 
     def keep(self, path: str, kept: Kept, *, is_lasting: bool = False) -> None:
-        """Write it beside the one before; ``is_lasting``: it outlives a power cut too.
+        """Write it in place of the one before the last; ``is_lasting``: it outlives a power cut too.
 
         Raises:
             ProgramError: it cannot be written.
@@ -267,11 +267,7 @@ class Store:
         body = msgspec.msgpack.encode(kept)
         file = self._kept(path, kept.number % 2)
         try:
-            with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600), "wb") as opened:
-                opened.write(blake3(body).digest(_CHECK_SIZE) + body)
-                opened.flush()
-                if is_lasting:
-                    os.fdatasync(opened.fileno())
+            _replace(file, blake3(body).digest(_CHECK_SIZE) + body, is_lasting=is_lasting)
         except OSError as error:
             raise ProgramError(f"cannot keep the state of {path} in {file}: {error.strerror}") from error
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,8 +18,10 @@ from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs.states import State
 from failover.drivers.server import Near, Peer
 from failover.errors import BundleRefusedError, CallRefusedError, ProgramError
+from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.sources import Place
+from failover.programs.store import Kept
 from tests.failover.programs.senders import Lab, engine, switched, until
 
 LEAST = 100
@@ -244,3 +248,20 @@ def test_an_order_counts_by_the_way_it_came_also_when_that_way_is_forgotten(lab:
         assert sentence(Peer(b"x")) == "give this order on the robot itself: robot2/x is on another one"
         assert "uid 54321 is neither" in sentence(Near(9, 1, 54_321))
         assert "cannot be rolled back" in sentence(Near(9, 2, os.geteuid()))
+
+
+def test_what_was_kept_last_outlives_a_full_disk(lab: Lab) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    for number in (1, 2):
+        lab.store.keep("Lab/robot1/Engine", Kept(number, "1", KeptState(b"x" * number), {}))
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))
+        for number in (3, 4):
+            with pytest.raises(ProgramError, match="cannot keep the state"):
+                lab.store.keep("Lab/robot1/Engine", Kept(number, "1", KeptState(b"x" * 4_096), {}))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    found = lab.store.kept("Lab/robot1/Engine")
+    assert found is not None and found.number == 2
