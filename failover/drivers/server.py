@@ -128,6 +128,7 @@ class Serving:
         self._readers: dict[int, Callable[[], None]] = {}
         self._numbers = 0
         self._is_over = False
+        self._wake = -1
         with contextlib.ExitStack() as stack:
             self._keeping = self._begin(cls, declaration, stack)
             lock = hold(self.here, declaration.path)
@@ -232,8 +233,9 @@ class Serving:
 
     def wake(self) -> None:
         """Have `serve` look at its actor, from any thread or signal."""
-        with contextlib.suppress(OSError):
-            os.eventfd_write(self._wake, 1)
+        if self._wake >= 0:
+            with contextlib.suppress(OSError):
+                os.eventfd_write(self._wake, 1)
 
     def now_ns(self) -> int:
         """The clock of this process's hops."""

@@ -134,7 +134,7 @@ class HostActor(Actor):
         if orders := {"_versions": self._versions, "_switch": self._switch, "_rollback": self._rollback}.get(message.verb):
             try:
                 return answer(message, orders(message.body if isinstance(message.body, dict) else {}))
-            except FailoverError as error:
+            except (FailoverError, ValueError) as error:  # ValueError: a name of a file with NUL
                 return refusal(message, "refused", str(error))
         if message.verb.startswith("_"):
             return super().carried_out(run)

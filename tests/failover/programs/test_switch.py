@@ -9,15 +9,17 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from msgspec import UNSET
 
 from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs.states import State
 from failover.drivers.server import Near, Peer
-from failover.errors import BundleRefusedError, CallRefusedError, ProgramError
+from failover.errors import BundleRefusedError, CallRefusedError, DriverError, ProgramError
 from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.sources import Place
@@ -160,7 +162,9 @@ def test_mailbox_and_state_outlive_the_host_and_its_version(lab: Lab) -> None:
     lab.send("1")
     with lab.hosting() as host, lab.proxy() as proxy:
         assert [proxy.call("step", number=number) for number in range(3)] == [0, 1, 2]
-        host.actor._running._process.kill()  # type: ignore[union-attr]
+        process = host.actor._running._process  # type: ignore[union-attr]
+        process.kill()
+        process.wait()  # a command that it has in hand would be answered with an error
         assert proxy.call("step", number=3, timeout=60) == 3
         assert proxy.call("read", timeout=60) == [0, 1, 2, 3]
     with lab.hosting() as host, lab.proxy() as proxy:
@@ -265,3 +269,35 @@ def test_what_was_kept_last_outlives_a_full_disk(lab: Lab) -> None:
         signal.signal(signal.SIGXFSZ, ignored)
     found = lab.store.kept("Lab/robot1/Engine")
     assert found is not None and found.number == 2
+
+
+def test_a_second_host_of_a_program_is_refused_and_ends_no_trial_of_the_first(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2", seconds=600)
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("_switch", {"version": "2"})
+        until(proxy, lambda found: found["active"] == "2")
+        before = states_of(lab)
+        with pytest.raises(DriverError, match="is the driver of Lab/robot1/Engine on this robot already"):
+            Hosting(Place(lab.store, lab.team, "engine"), "", lab.here)
+        assert states_of(lab) == before
+
+
+def test_a_bundle_that_comes_again_brings_its_newer_signature_and_mends_its_files(lab: Lab) -> None:
+    source = lab.source("1")
+    digest = lab.store.take(lab.bundle(source, int(time.time()) + 3_600), lab.team).program.digest
+    (lab.store.tree(digest) / "engine.py").unlink()
+    with pytest.raises(ProgramError, match="was changed since it was unpacked; send the bundle again"):
+        lab.store.admitted(digest, lab.team)
+    again = lab.bundle(source, int(time.time()) + 7_200)
+    lab.store.take(again, lab.team)
+    assert lab.store.tree(digest).with_suffix(".bundle").read_bytes() == again
+    assert lab.store.admitted(digest, lab.team).program.digest == digest
+
+
+def test_a_directory_that_no_file_can_have_is_refused_with_a_sentence(lab: Lab) -> None:
+    place = Place(lab.store, lab.team, "engine", lab.source("1"))
+    with Hosting(place, "", lab.here) as host:
+        order = Envelope("engine", "_switch", {"directory": "a\0"}, sender="robot1/x")
+        (answer,) = [*host.actor.came(order, Near(9, 1, 0), host.now_ns()), *host.actor.handle(host.now_ns)]
+        assert answer.error is not UNSET and answer.error.kind == "refused"
