@@ -514,7 +514,6 @@ class HostActor(Actor):
 
     def close(self) -> None:
         """End all processes; the state stays."""
-        self._starter.shutdown(wait=True)
         if self._running is not None and self._running.lives:
             try:
                 self._running.pause()
@@ -525,6 +524,7 @@ class HostActor(Actor):
             self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
+        self._starter.shutdown(wait=True)  # not before: a version dies with the thread that started it
         for one in (self._running, self._old, self._coming):
             if one is not None:
                 one.end()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -81,6 +82,7 @@ class Running:
         self.source = source
         self.state: State | None = None
         self.notes: tuple[str, ...] = ()
+        self._is_ended = False
         ours, theirs = socket.socketpair()
         words = [sys.executable, "-P", "-m", "failover.programs.version_process", str(theirs.fileno())]
         environment = {
@@ -170,9 +172,12 @@ class Running:
         return Answered(answer, state, found.trouble)
 
     def end(self) -> None:
-        """End its process, and see it ended. May be called from any thread, and again."""
+        """End its process and those that it has started in its process group. May be called from any thread, and again."""
         self._channel.close()
+        if self._is_ended:  # its number may be another's by now
+            return
+        self._is_ended = True
         with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
+            os.killpg(self._process.pid, signal.SIGKILL)
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(END_S)

@@ -9,8 +9,10 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from msgspec import UNSET
@@ -301,3 +303,25 @@ def test_a_directory_that_no_file_can_have_is_refused_with_a_sentence(lab: Lab) 
         order = Envelope("engine", "_switch", {"directory": "a\0"}, sender="robot1/x")
         (answer,) = [*host.actor.came(order, Near(9, 1, 0), host.now_ns()), *host.actor.handle(host.now_ns)]
         assert answer.error is not UNSET and answer.error.kind == "refused"
+
+
+def test_with_a_version_end_the_processes_that_it_started_after_it_let_its_device_go(lab: Lab) -> None:
+    retired = lab.folder / "retired"
+    kept = f"numbers: list[int] = failover.kept(default=[])\n    def on_retire(self): open({str(retired)!r}, 'w').close()"
+    before = "import subprocess\nhelper = subprocess.Popen(['sleep', '1000'])"
+    second = lab.source("2", engine(kept=kept, before=before, extra="return helper.pid"))
+    with Hosting(Place(lab.store, lab.team, "engine", lab.source("1")), "", lab.here) as host:
+        thread = threading.Thread(target=host.serve)
+        thread.start()
+        with lab.proxy() as proxy:
+            proxy.call("_switch", {"directory": str(second)})
+            until(proxy, lambda found: found["active"] == "2")
+            helper = Path(f"/proc/{proxy.call('fly')}")
+            assert "sleep" in (helper / "cmdline").read_text() and not retired.exists()
+        host.stop()
+        thread.join()
+    assert retired.exists()
+    deadline = time.monotonic() + 60
+    while helper.exists() and "\nState:\tZ" not in (helper / "status").read_text():  # a zombie where no init reaps it
+        assert time.monotonic() < deadline, "the helper process goes on"
+        time.sleep(0.01)
