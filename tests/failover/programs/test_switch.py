@@ -24,6 +24,7 @@ from failover.drivers.server import Near, Peer
 from failover.errors import BundleRefusedError, CallRefusedError, DriverError, ProgramError
 from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
+from failover.programs.running import Running
 from failover.programs.sources import Place
 from failover.programs.store import Kept
 from tests.failover.programs.senders import Lab, engine, switched, until
@@ -325,3 +326,15 @@ def test_with_a_version_end_the_processes_that_it_started_after_it_let_its_devic
     while helper.exists() and "\nState:\tZ" not in (helper / "status").read_text():  # a zombie where no init reaps it
         assert time.monotonic() < deadline, "the helper process goes on"
         time.sleep(0.01)
+
+
+def test_a_host_that_gets_no_process_says_so_and_goes_on(lab: Lab) -> None:
+    with Hosting(Place(lab.store, lab.team, "engine", lab.source("1")), "", lab.here) as host:
+        source = host.actor._last
+        before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+            with pytest.raises(ProgramError, match="the system gives no process: Too many open files"):
+                Running(source)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
