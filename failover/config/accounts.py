@@ -22,7 +22,7 @@ def subject_named(user: str, groups: Mapping[str, Sequence[str]]) -> Subject:
     """
     try:
         return _subject(pwd.getpwnam(user), groups)
-    except KeyError:
+    except (KeyError, ValueError):  # ValueError: it holds what no name of an account can
         found = frozenset(group for group, users in groups.items() if user in users)
         if not found:
             raise RightsError(

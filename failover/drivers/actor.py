@@ -93,6 +93,8 @@ class Actor:
         if not self._is_meant(envelope.to):
             here = f"this is {self._declaration.path}, and not {envelope.to}: look the name up anew"
             return [refusal(envelope, "wrong_driver", here)]
+        if why := self.forbidden(envelope, whose):
+            return [refusal(envelope, "refused", why)]
         try:
             envelope = envelopes.came(envelope, self._who, now_ns)
         except EnvelopeError as error:
@@ -104,6 +106,10 @@ class Actor:
     def route(self, sender: str) -> Whose | None:
         """The way back to a sender; None: it is forgotten."""
         return self._routes.get(sender)
+
+    def forbidden(self, envelope: Envelope, whose: Whose) -> str:
+        """Why a message may not come over this way; "" if it may. Asked as it comes: later the way may be forgotten."""
+        return ""
 
     def _is_meant(self, to: str) -> bool:
         """Whether a name is this driver's; an address is: the message has come there."""

@@ -85,7 +85,8 @@ class CallRights:
                 return self._by_agent(by if robot is not None else accounts.name_of(uid or 0)), True
             groups = self._rights.config.groups
             if robot is not None:
-                return self._decided(accounts.subject_named(by, groups)), False
+                person = accounts.subject_named(by, groups)
+                return self._decided(replace(person, stands_above=False)), False  # root of another robot is not root here
             subject = accounts.subject_of(uid or 0, groups)
             return self._decided(replace(subject, is_owner=uid == os.geteuid())), False
         except RightsError as error:

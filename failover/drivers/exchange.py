@@ -62,6 +62,7 @@ class Exchange:
             self._socket.setsockopt(socket.SOL_SOCKET, option, BUFFER_SIZE)
         self._path.unlink(missing_ok=True)
         try:
+            os.fchmod(self._socket.fileno(), 0o600)  # the file gets this mode, whatever the umask lets others do
             self._socket.bind(os.fspath(self._path))
         except OSError as error:
             self._socket.close()

@@ -164,12 +164,34 @@ def hold(here: Here, path: str) -> int:
     lock = here.file(path, "lock")
     descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     if not locks.take(descriptor, LOCK_AT):
-        pid = os.pread(descriptor, 20, 0).decode(errors="replace").strip()
+        told = _told_of(descriptor, path)
         os.close(descriptor)
-        raise DriverError(f"pid {pid or 'unknown'} is the driver of {path} on this robot already; end that, or take another path")
+        raise DriverError(told)
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, b"%d\n" % os.getpid(), 0)
     return descriptor
+
+
+def _told_of(descriptor: int, path: str) -> str:
+    pid = os.pread(descriptor, 20, 0).decode(errors="replace").strip()
+    return f"pid {pid or 'unknown'} is the driver of {path} on this robot already; end that, or take another path"
+
+
+def refuse_second(here: Here, path: str) -> None:
+    """Nothing where no process is the driver of a path; `hold` decides later between two that come at once.
+
+    Raises:
+        DriverError: one is; names its pid.
+    """
+    try:
+        descriptor = os.open(here.file(path, "lock"), os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return
+    try:
+        if locks.is_taken(descriptor, LOCK_AT):
+            raise DriverError(_told_of(descriptor, path))
+    finally:
+        os.close(descriptor)
 
 
 def lives(here: Here, path: str) -> bool:

@@ -83,6 +83,14 @@ class Keeping:
         """How long until `safe` is to be called although nothing comes."""
         return AGAIN_NS if self._task.is_missing else None
 
+    def heard(self) -> None:
+        """Take in what made the descriptor readable, also while no answer waits for it.
+
+        Raises:
+            NotCommittedError: nothing becomes safe any more.
+        """
+        self._task.safe()
+
     def safe(self) -> int | None:
         """How many messages are handled for good, if that may have changed.
 

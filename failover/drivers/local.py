@@ -50,7 +50,9 @@ class Poller:
     def add(self, descriptor: int, *, reading: bool = True, writing: bool = False) -> None:
         """From now on it is waited for, until it can be read or written; or for neither."""
         events = reading * select.EPOLLIN | writing * select.EPOLLOUT
-        if descriptor in self._known:
+        if not events:  # epoll tells that the other end has gone, whatever it was asked for
+            self.remove(descriptor)
+        elif descriptor in self._known:
             self._epoll.modify(descriptor, events)
         else:
             self._epoll.register(descriptor, events)
@@ -120,6 +122,7 @@ def listen(path: Path) -> socket.socket:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     path.unlink(missing_ok=True)
     try:
+        os.fchmod(listening.fileno(), 0o600)  # the file gets this mode, whatever the umask lets others do
         listening.bind(os.fspath(path))
         listening.listen(CONNECTIONS_MAX)
     except OSError as error:

@@ -31,7 +31,7 @@ from failover.drivers.call_rights import CallRights
 from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
-from failover.errors import EnvelopeError
+from failover.errors import EnvelopeError, NotCommittedError
 from failover.kept_state.component import kept_of
 
 if TYPE_CHECKING:
@@ -128,6 +128,7 @@ class Serving:
         self._readers: dict[int, Callable[[], None]] = {}
         self._numbers = 0
         self._is_over = False
+        self._wake = -1
         with contextlib.ExitStack() as stack:
             self._keeping = self._begin(cls, declaration, stack)
             lock = hold(self.here, declaration.path)
@@ -139,7 +140,7 @@ class Serving:
             stack.callback(self.service.close)
             self.instance, self._actor = self._made(cls, declaration, f"{self.here.robot}/{self._name}")
             if self._keeping is not None:
-                self._wait_for(self._keeping.fileno(), _nothing)  # the loop looks at it in each turn
+                self._wait_for(self._keeping.fileno(), functools.partial(self._hear_kept, self._keeping))
                 self._keeping.resumed()
             self.service.start()
             self._stack = stack.pop_all()
@@ -232,8 +233,9 @@ class Serving:
 
     def wake(self) -> None:
         """Have `serve` look at its actor, from any thread or signal."""
-        with contextlib.suppress(OSError):
-            os.eventfd_write(self._wake, 1)
+        if self._wake >= 0:
+            with contextlib.suppress(OSError):
+                os.eventfd_write(self._wake, 1)
 
     def now_ns(self) -> int:
         """The clock of this process's hops."""
@@ -260,6 +262,13 @@ class Serving:
     def _woken(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._wake)
+
+    def _hear_kept(self, keeping: Keeping) -> None:
+        try:
+            keeping.heard()
+        except NotCommittedError as error:  # the next message that is carried out ends the driver with it
+            log.warning("%s", error)
+            self._close(keeping.fileno())
 
     def _take_team(self) -> None:
         """All messages that have come from other robots, up to `TURN_MAX`."""
@@ -301,7 +310,7 @@ class Serving:
             self._came(content, near, None)
 
     def _close(self, descriptor: int) -> None:
-        """It is closed next: the kernel gives its number to another one."""
+        """Wait for it no more: it is closed next, and the kernel gives its number to another one."""
         del self._readers[descriptor]
         self._poller.remove(descriptor)
 
@@ -413,10 +422,6 @@ class Serving:
         typing = self._hands.pop(hand)
         self._close(hand.descriptor)
         typing.connection.close()
-
-
-def _nothing() -> None:
-    """What a descriptor tells that only wakes the loop."""
 
 
 @contextlib.contextmanager

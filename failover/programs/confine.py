@@ -3,8 +3,8 @@
 As root: a user of its own; namespaces of network, mounts, processes and IPC. As an ordinary user: the same namespaces inside a
 user namespace where the kernel allows one, and the host's user. What could not be done is told, never passed over.
 
-Files are read-only but /tmp; /root, /home, /run, /var, /srv, /mnt and /media are empty but for what Python itself needs; in /dev
-are null, zero, full, random, urandom and the devices that the manifest names.
+Files are read-only but /tmp; /root, /home, /run, /var, /srv, /mnt, /media and /etc/failover are empty but for what Python itself
+needs; in /dev are null, zero, full, random, urandom and the devices that the manifest names.
 
 Source: unshare(2), mount(2), mount_setattr(2), user_namespaces(7), pid_namespaces(7), prctl(2), capabilities(7).
 """
@@ -47,7 +47,7 @@ _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NO_NEW_PRIVS: Final = 38
 
 DEVICES: Final = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
-HIDDEN: Final = ("/root", "/home", "/var", "/srv", "/mnt", "/media", "/tmp")
+HIDDEN: Final = ("/root", "/home", "/var", "/srv", "/mnt", "/media", "/etc/failover", "/tmp")
 """Empty for a program; /run too, which holds what is bound."""
 
 PROGRAM: Final = "/run/program"
@@ -160,7 +160,7 @@ def _mounts(said: Confinement, found: Confined) -> None:
     try:
         _set("/", _MOUNT_ATTR_RDONLY | _MOUNT_ATTR_NOSUID, 0)
         for path in ("/tmp", "/dev/shm"):
-            _set(path, 0, _MOUNT_ATTR_RDONLY)
+            _set(path, 0, _MOUNT_ATTR_RDONLY, 0)  # not what is bound below it
         found.enforced.append("files read-only but /tmp")
     except OSError as error:
         found.not_enforced.append(f"it may write where its user may: mount_setattr: {error.strerror}")
@@ -237,7 +237,7 @@ def _mount(source: str, target: str, kind: str, flags: int, terms: str = "") -> 
         raise OSError(number, f"mount {target}: {os.strerror(number)}")
 
 
-def _set(path: str, add: int, remove: int) -> None:
+def _set(path: str, add: int, remove: int, flags: int = _AT_RECURSIVE) -> None:
     """mount_setattr(2), since Linux 5.12."""
     terms = struct.pack("QQQQ", add, remove, 0, 0)
     _check(
@@ -245,7 +245,7 @@ def _set(path: str, add: int, remove: int) -> None:
             ctypes.c_long(_MOUNT_SETATTR),
             ctypes.c_int(_AT_FDCWD),
             path.encode(),
-            ctypes.c_uint(_AT_RECURSIVE),
+            ctypes.c_uint(flags),
             terms,
             ctypes.c_size_t(len(terms)),
         )

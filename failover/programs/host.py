@@ -17,6 +17,7 @@ A verb that begins with ``_`` is the host's: ``_versions``, ``_switch``, ``_roll
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -31,9 +32,9 @@ from failover.core.messaging.pacing import SECOND, Pace, merged
 from failover.core.programs import states, versions
 from failover.core.programs.states import Shelf
 from failover.core.programs.trial import Command, Trial, Verdict
-from failover.drivers.actor import Actor
+from failover.drivers.actor import Actor, Whose
 from failover.drivers.declare import Declaration, Marked, Verb
-from failover.drivers.server import Peer
+from failover.drivers.server import Hand, Near
 from failover.errors import FailoverError, ProgramError
 from failover.programs.channel import Hello
 from failover.programs.running import Answered, Running, Source
@@ -132,19 +133,22 @@ class HostActor(Actor):
         message = merged(run) if len(run) > 1 else run[0]
         if orders := {"_versions": self._versions, "_switch": self._switch, "_rollback": self._rollback}.get(message.verb):
             try:
-                self._check_near(message)
                 return answer(message, orders(message.body if isinstance(message.body, dict) else {}))
-            except FailoverError as error:
+            except (FailoverError, ValueError) as error:  # ValueError: a name of a file with NUL
                 return refusal(message, "refused", str(error))
         if message.verb.startswith("_"):
             return super().carried_out(run)
         return self._forwarded(message)
 
-    def _check_near(self, message: Envelope) -> None:
-        """Orders are this robot's: only its own user and root reach its sockets."""
-        whose = self.route(message.sender)
-        if message.verb != "_versions" and isinstance(whose, Peer):
-            raise ProgramError(f"give this order on the robot itself: {message.sender} is on another one")
+    def forbidden(self, envelope: Envelope, whose: Whose) -> str:
+        """Orders come from the host's own user or root on this robot, as the kernel says."""
+        if envelope.verb not in ("_switch", "_rollback"):
+            return ""
+        if not isinstance(whose, Near | Hand):
+            return f"give this order on the robot itself: {envelope.sender} is on another one"
+        if whose.uid not in (0, os.geteuid()):
+            return f"this order is for uid {os.geteuid()}, whose host this is, and root: uid {whose.uid} is neither"
+        return ""
 
     def called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
         """A stream's value."""
@@ -184,14 +188,18 @@ class HostActor(Actor):
     def _keep(self) -> None:
         """State and mailbox to the disk, before an answer leaves."""
         self._is_changed = False
-        self._number += 1
-        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
         try:
-            self._place.store.keep(self._declaration.path, Kept(self._number, self.version, self._state, streams))
+            self._write()
         except ProgramError as error:
             if str(error) != self._said:
                 self._said = str(error)
                 log.warning("%s", error)
+
+    def _write(self, *, is_lasting: bool = False) -> None:
+        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
+        kept = Kept(self._number + 1, self.version, self._state, streams)
+        self._place.store.keep(self._declaration.path, kept, is_lasting=is_lasting)
+        self._number += 1  # only now: while the disk is full, the newest whole one is never written over
 
     @property
     def version(self) -> str:
@@ -506,20 +514,17 @@ class HostActor(Actor):
 
     def close(self) -> None:
         """End all processes; the state stays."""
-        self._starter.shutdown(wait=True)
         if self._running is not None and self._running.lives:
             try:
                 self._running.pause()
                 self._state = self._running.state
             except FailoverError as error:
                 log.warning("%s", error)
-        self._number += 1
-        streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
-        kept = Kept(self._number, self.version, self._state, streams)
         try:
-            self._place.store.keep(self._declaration.path, kept, is_lasting=True)
+            self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
+        self._starter.shutdown(wait=True)  # not before: a version dies with the thread that started it
         for one in (self._running, self._old, self._coming):
             if one is not None:
                 one.end()

@@ -11,7 +11,8 @@ from failover.core.programs import states
 from failover.core.programs.states import State
 from failover.drivers.actor import Actor
 from failover.drivers.declare import DRIVER, Declaration
-from failover.drivers.here import Here
+from failover.drivers.here import Here, refuse_second
+from failover.drivers.here import here as drivers_here
 from failover.drivers.server import Serving
 from failover.errors import FailoverError
 from failover.programs.host import HostActor, declared
@@ -33,6 +34,8 @@ class Hosting(Serving):
         """
         place.store.open()
         if place.directory is None and not place.beside:
+            shelf = place.store.shelf(place.name)
+            refuse_second(here or drivers_here(), shelf.path)  # before anything of a living host is changed
             end_trial(place)
         source = source_of_directory(place.directory) if place.directory is not None else source_of_store(place, version)
         self._source = source

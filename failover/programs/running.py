@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -81,20 +82,12 @@ class Running:
         self.source = source
         self.state: State | None = None
         self.notes: tuple[str, ...] = ()
-        ours, theirs = socket.socketpair()
-        words = [sys.executable, "-m", "failover.programs.version_process", str(theirs.fileno())]
-        environment = {
-            key: value
-            for key, value in os.environ.items()
-            if key in ("PATH", "LANG", "LC_ALL", "TZ", "PYTHONPATH", "VIRTUAL_ENV")
-        }
-        root = str(Path(__file__).parents[2])
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH", ""))))
-        with theirs:
-            self._process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=2, pass_fds=(theirs.fileno(),), env=environment, start_new_session=True
-            )
-        self._channel = Channel(ours)
+        self._is_ended = False
+        try:
+            self._start()
+        except OSError as error:
+            what = f"{source.manifest.name} {source.manifest.version}"
+            raise ProgramError(f"{what} cannot be started: the system gives no process: {error.strerror}") from error
         try:
             file, name = source.manifest.entry_file, source.manifest.entry_class
             self._channel.send(Start(str(source.directory), file, name, source.confinement), LOAD_S)
@@ -108,6 +101,25 @@ class Running:
             self.end()
             raise ProgramError(f"{source.manifest.name} {source.manifest.version} cannot be started: {error}") from error
         threading.Thread(target=self._wait, args=(ended,), daemon=True, name=f"end of {self._process.pid}").start()
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair()
+        words = [sys.executable, "-P", "-m", "failover.programs.version_process", str(theirs.fileno())]
+        environment = {
+            key: value
+            for key, value in os.environ.items()
+            if key in ("PATH", "LANG", "LC_ALL", "TZ", "PYTHONPATH", "VIRTUAL_ENV")
+        }
+        root = str(Path(__file__).parents[2])
+        places = environment.get("PYTHONPATH", "").split(os.pathsep)
+        environment["PYTHONPATH"] = os.pathsep.join((root, *filter(None, places)))  # "" is the folder where the host was started
+        with theirs, contextlib.ExitStack() as stack:
+            stack.callback(ours.close)
+            self._process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=2, pass_fds=(theirs.fileno(),), env=environment, start_new_session=True
+            )
+            stack.pop_all()
+        self._channel = Channel(ours)
 
     @property
     def pid(self) -> int:
@@ -169,9 +181,12 @@ class Running:
         return Answered(answer, state, found.trouble)
 
     def end(self) -> None:
-        """End its process, and see it ended. May be called from any thread, and again."""
+        """End its process and those that it has started in its process group. May be called from any thread, and again."""
         self._channel.close()
+        if self._is_ended:  # its number may be another's by now
+            return
+        self._is_ended = True
         with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
+            os.killpg(self._process.pid, signal.SIGKILL)
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(END_S)

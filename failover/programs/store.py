@@ -111,8 +111,9 @@ class Store:
         with self.locked():
             shelf = self.find(said.name) or Shelf(said.name, said.path)
             self._check(shelf, admitted)
-            if (known := shelf.find(said.version)) is None or known.state is State.REFUSED:
-                self._unpack(admitted.program, content)
+            known = shelf.find(said.version)
+            self._unpack(admitted.program, content)  # also one that is here: its signature may be newer, its files damaged
+            if known is None or known.state is State.REFUSED:
                 one = states.stage(states.verify(Version(said.version, digest), admitted.owner))
                 self.put(states.put(shelf, one))
                 self.log(said.name, f"{said.version} staged as {digest[:12]}: signed by {admitted.owner}; {admitted.because}")
@@ -137,7 +138,8 @@ class Store:
             for one in program.files:
                 _write_new(aside, one)
             _replace(folder.with_suffix(".bundle"), content)
-            if not folder.exists():
+            if not _is_whole(folder, program):
+                shutil.rmtree(folder, ignore_errors=True)
                 aside.rename(folder)
         except OSError as error:
             raise ProgramError(f"cannot unpack {program.manifest.name}: {error.strerror}; nothing was changed") from error
@@ -160,11 +162,8 @@ class Store:
         if found.program.digest != digest:
             raise ProgramError(f"the bundle {digest[:12]} was replaced in {self.place}; send it again")
         for one in found.program.files:
-            path = self.tree(digest) / one.path
-            if path.is_symlink() or packing.read_file(path) != bytes(one.content):
-                raise ProgramError(
-                    f"{path} was changed since it was unpacked; remove {self.tree(digest)}, and send the bundle again"
-                )
+            if not _is_as_unpacked(self.tree(digest), one):
+                raise ProgramError(f"{self.tree(digest) / one.path} was changed since it was unpacked; send the bundle again")
         return found
 
     # --- Shelves and their log --------------------------------------------------------------------------------------------
@@ -259,7 +258,7 @@ class Store:
     # --- Kept states ------------------------------------------------------------------------------------------------------
 
     def keep(self, path: str, kept: Kept, *, is_lasting: bool = False) -> None:
-        """Write it beside the one before; ``is_lasting``: it outlives a power cut too.
+        """Write it in place of the one before the last; ``is_lasting``: it outlives a power cut too.
 
         Raises:
             ProgramError: it cannot be written.
@@ -267,11 +266,7 @@ class Store:
         body = msgspec.msgpack.encode(kept)
         file = self._kept(path, kept.number % 2)
         try:
-            with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600), "wb") as opened:
-                opened.write(blake3(body).digest(_CHECK_SIZE) + body)
-                opened.flush()
-                if is_lasting:
-                    os.fdatasync(opened.fileno())
+            _replace(file, blake3(body).digest(_CHECK_SIZE) + body, is_lasting=is_lasting)
         except OSError as error:
             raise ProgramError(f"cannot keep the state of {path} in {file}: {error.strerror}") from error
 
@@ -295,6 +290,18 @@ def _write_new(folder: Path, one: Member) -> None:
     mode = 0o555 if one.is_executable else 0o444
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode), "wb") as file:
         file.write(one.content)
+
+
+def _is_whole(folder: Path, program: Program) -> bool:
+    return all(_is_as_unpacked(folder, one) for one in program.files)
+
+
+def _is_as_unpacked(folder: Path, one: Member) -> bool:
+    path = folder / one.path
+    try:
+        return not path.is_symlink() and packing.read_file(path) == bytes(one.content)
+    except ProgramError:
+        return False
 
 
 def _replace(path: Path, content: bytes, *, is_lasting: bool = True) -> None:

@@ -28,6 +28,9 @@ ELEMENTS_MAX: Final = 1 << 16
 INTEGER_MAX: Final = 1 << 53
 """Larger integers are not the same in every language; who needs them writes them as text. Source: RFC 8259, section 6."""
 
+TEXT_MAX: Final = 512
+"""Characters of ``to``, ``verb``, ``id``, ``from``, ``by``, ``re`` and of a name in ``hops``: tables keep thousands of them."""
+
 HOPS_MAX: Final = 16
 """Processes that pass on a message; more is a circle of names."""
 
@@ -142,7 +145,7 @@ def _own(content: bytes) -> Envelope | None:
         check([envelope.body])
     if envelope.ok is not UNSET and not _is_flat(envelope.ok):
         check([envelope.ok])
-    _check_numbers(envelope)
+    _check_head(envelope)
     return envelope
 
 
@@ -158,7 +161,7 @@ def _any(content: bytes) -> Envelope:
         envelope = msgspec.convert(fields, Envelope)
     except msgspec.ValidationError as error:
         raise EnvelopeError(f"the message has a field of another kind than documented: {error}") from error
-    _check_numbers(envelope)
+    _check_head(envelope)
     if not unknown:
         return envelope
     return msgspec.structs.replace(envelope, rest={key: value for key, value in fields.items() if key in unknown})
@@ -318,17 +321,24 @@ def _check_text(text: str) -> None:
         raise EnvelopeError("the message holds half of a character (a lone surrogate)") from error
 
 
-def _check_numbers(envelope: Envelope) -> None:
+def _check_head(envelope: Envelope) -> None:
+    for text in (envelope.to, envelope.verb, envelope.id, envelope.sender, envelope.by, envelope.re):
+        if len(text) > TEXT_MAX:
+            raise EnvelopeError(f"the message has the name {text[:40]!r}… of {len(text)} characters; {TEXT_MAX} are the most")
     for number in (envelope.boot, envelope.seq, envelope.after, envelope.had):
         if number < 0:
             raise EnvelopeError("the message has a negative boot, seq, after or had")
         if number > INTEGER_MAX:
             raise EnvelopeError(f"the message holds the integer {number}: above 2^53 it must be written as text")
+    if envelope.deadline_ms is not None and not -INTEGER_MAX <= envelope.deadline_ms <= INTEGER_MAX:
+        raise EnvelopeError(f"the message has the deadline_ms {envelope.deadline_ms}: 2^53 ms are the most; none: leave it out")
     if len(envelope.hops) > HOPS_MAX:
         raise EnvelopeError(
             f"the message was passed on {len(envelope.hops)} times, {HOPS_MAX} are the most: names lead in a circle"
         )
     for hop in envelope.hops:
+        if len(hop.who) > TEXT_MAX:
+            raise EnvelopeError(f"the message has a hop whose name has {len(hop.who)} characters; {TEXT_MAX} are the most")
         for stamp in (hop.came, hop.left):
             if isinstance(stamp, int):
                 if not -INTEGER_MAX <= stamp <= INTEGER_MAX:

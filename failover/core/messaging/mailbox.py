@@ -43,6 +43,9 @@ WINDOW: Final = 1_024
 HELD_MAX: Final = 64
 """Messages of one sender that came before one that must be handled first; the sender sends the others again."""
 
+HELD_ALL_MAX: Final = 1_024
+"""The same of all senders together; then the sender whose messages are held for longest loses them, and sends them again."""
+
 SENDERS_MAX: Final = 1_024
 """Senders that a mailbox remembers; the one silent for longest is forgotten."""
 
@@ -220,20 +223,20 @@ def unpacked(content: bytes) -> dict[str, Stream]:
         raise EnvelopeError(f"the kept mailbox is damaged: {error}") from error
 
 
+class Arrived(Struct):
+    """A message that waits. ``until_ns``: its deadline by the receiver's clock."""
+
+    envelope: Envelope
+    until_ns: int | None
+
+
 class Taken(Struct):
     """Up to where messages of one sender's life were taken into the mailbox; lost with the process. ``held``: came too early."""
 
     boot: int
     last: int = 0
     reliable: int = 0
-    held: list[Envelope] = []
-
-
-class Arrived(Struct):
-    """A message that waits. ``until_ns``: its deadline by the receiver's clock."""
-
-    envelope: Envelope
-    until_ns: int | None
+    held: list[Arrived] = []
 
 
 class Mailbox:
@@ -246,6 +249,8 @@ class Mailbox:
         self._taken = {sender: Taken(one.boot, one.last, one.reliable) for sender, one in self._streams.items()}
         self._queue: deque[Arrived] = deque()
         self._held = 0
+        self._holding: OrderedDict[str, None] = OrderedDict()
+        """Senders of which messages are held, the one that is held for longest first."""
         self._answers: deque[Envelope] = deque()
         self._packed: dict[str, bytes] = {}
         self.handled = 0
@@ -275,40 +280,50 @@ class Mailbox:
 
     def arrived(self, envelope: Envelope, now_ns: int) -> list[Envelope]:
         """Take in a message; answers that are to be sent at once: one given before, or that there is no room."""
+        until_ns = None if envelope.deadline_ms is None else now_ns + int(envelope.deadline_ms * MS)
+        arrived = Arrived(envelope, until_ns)
         if not envelope.seq or not envelope.sender:  # by hand: nothing is promised
-            return self._queued(envelope, now_ns)
+            return self._queued(arrived)
         taken = self._taken.get(envelope.sender)
         if taken is None or envelope.boot > taken.boot:
-            self._held -= len(taken.held) if taken is not None else 0
-            taken = self._taken[envelope.sender] = Taken(envelope.boot)
+            taken = Taken(envelope.boot)  # it is remembered once there is something to remember
         if envelope.boot < taken.boot:
             return []
         if envelope.seq <= taken.last:
             return self._again(envelope)
         if envelope.after > taken.reliable:
-            return self._hold(taken, envelope)
-        answers = self._accept(taken, envelope, now_ns)
-        while following := next((one for one in taken.held if one.after <= taken.reliable), None):
+            self._hold(taken, arrived)
+            return []
+        answers = self._accept(taken, arrived)
+        while following := next((one for one in taken.held if one.envelope.after <= taken.reliable), None):
             taken.held.remove(following)
-            self._held -= 1
-            if following.seq > taken.last:
-                answers += self._accept(taken, following, now_ns)
+            self._unheld(envelope.sender, 1, left=len(taken.held))
+            if following.envelope.seq > taken.last:
+                answers += self._accept(taken, following)
         return answers
 
-    def _queued(self, envelope: Envelope, now_ns: int) -> list[Envelope]:
-        if len(self) >= MAILBOX_MAX:
-            return [refusal(envelope, "busy", f"{MAILBOX_MAX} messages wait; retry later")]
-        until_ns = None if envelope.deadline_ms is None else now_ns + int(envelope.deadline_ms * MS)
-        self._queue.append(Arrived(envelope, until_ns))
+    def _queued(self, arrived: Arrived) -> list[Envelope]:
+        if len(self._queue) >= MAILBOX_MAX:
+            return [refusal(arrived.envelope, "busy", f"{MAILBOX_MAX} messages wait; retry later")]
+        self._queue.append(arrived)
         return []
 
-    def _accept(self, taken: Taken, envelope: Envelope, now_ns: int) -> list[Envelope]:
-        refused = self._queued(envelope, now_ns)
+    def _accept(self, taken: Taken, arrived: Arrived) -> list[Envelope]:
+        envelope = arrived.envelope
+        refused = self._queued(arrived)
         if not refused:
+            self._remember(envelope.sender, taken)
             taken.last = envelope.seq
             if envelope.reliable:
                 taken.reliable = envelope.seq
         return refused
+
+    def _remember(self, sender: str, taken: Taken) -> None:
+        before = self._taken.get(sender)
+        if before is not taken:
+            if before is not None:
+                self._unheld(sender, len(before.held), left=0)
+            self._taken[sender] = taken
 
     def _again(self, envelope: Envelope) -> list[Envelope]:
         """One that was taken before: its answer, once what it did is kept."""
@@ -318,12 +333,30 @@ class Mailbox:
         answer = stream.answers.get(envelope.seq)
         return [] if answer is None else [answer]
 
-    def _hold(self, taken: Taken, envelope: Envelope) -> list[Envelope]:
-        if len(taken.held) < HELD_MAX and len(self) < MAILBOX_MAX and all(one.seq != envelope.seq for one in taken.held):
-            taken.held.append(envelope)
-            taken.held.sort(key=_seq)
-            self._held += 1
-        return []
+    def _hold(self, taken: Taken, arrived: Arrived) -> None:
+        sender = arrived.envelope.sender
+        if len(taken.held) >= HELD_MAX or any(one.envelope.seq == arrived.envelope.seq for one in taken.held):
+            return
+        self._remember(sender, taken)
+        taken.held.append(arrived)
+        taken.held.sort(key=_seq)
+        self._held += 1
+        self._holding.setdefault(sender)
+        if self._held > HELD_ALL_MAX:
+            self._drop_held(next(iter(self._holding)))
+
+    def _unheld(self, sender: str, count: int, *, left: int) -> None:
+        self._held -= count
+        if not left:
+            self._holding.pop(sender, None)
+
+    def _drop_held(self, sender: str) -> None:
+        taken = self._taken[sender]
+        self._held -= len(taken.held)
+        taken.held.clear()
+        del self._holding[sender]
+        if sender not in self._streams and all(one.envelope.sender != sender for one in self._queue):
+            del self._taken[sender]  # nothing of it was taken
 
     # --- A message is handled ---------------------------------------------------------------------------------------------
 
@@ -377,8 +410,8 @@ class Mailbox:
             sender, _ = self._streams.popitem(last=False)
             self._free.pop(sender, None)
             self._packed.pop(sender, None)
-            taken = self._taken.pop(sender, None)
-            self._held -= len(taken.held) if taken is not None else 0
+            if (taken := self._taken.pop(sender, None)) is not None:
+                self._unheld(sender, len(taken.held), left=0)
 
     def committed(self, handled: int | None = None) -> list[Envelope]:
         """All that is done is kept, or so many as were `handled` once: the answers that may leave now."""
@@ -391,5 +424,5 @@ class Mailbox:
         return answers
 
 
-def _seq(envelope: Envelope) -> int:
-    return envelope.seq
+def _seq(arrived: Arrived) -> int:
+    return arrived.envelope.seq

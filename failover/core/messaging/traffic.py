@@ -5,7 +5,6 @@ Each edge (sender, verb) has a row for each of the last 60 minutes; the oldest l
 
 from __future__ import annotations
 
-import re
 from typing import Any, Final
 
 from msgspec import Struct
@@ -23,12 +22,18 @@ BY_HAND: Final = "by hand"
 STEPS: Final = 64
 """Classes of duration, each twice as long every second one: from a microsecond to an hour."""
 
-_LIFE: Final = re.compile(r"(-\d+)+$")
-
 
 def who(sender: str) -> str:
     """A sender without pid and number: what stays the same when it is started again."""
-    return BY_HAND if sender.startswith("by-hand-") else _LIFE.sub("", sender) or sender
+    if sender.startswith("by-hand-"):
+        return BY_HAND
+    name, dash, number = sender.rpartition("-")
+    while dash and number.isdecimal():
+        left = name
+        name, dash, number = left.rpartition("-")
+        if not (dash and number.isdecimal()):
+            return left or sender
+    return sender
 
 
 class Minute(Struct):

@@ -35,7 +35,9 @@ paths = ["**/Engines/**"]
 """
 
 
-@pytest.mark.parametrize(("by", "is_allowed"), [("anna", True), ("bert", False), ("carl", False), ("", True)])
+@pytest.mark.parametrize(
+    ("by", "is_allowed"), [("anna", True), ("bert", False), ("carl", False), ("", True), ("root", False), ("a\0b", False)]
+)
 def test_persons_at_another_robot_get_what_the_rules_say(tmp_path: Path, by: str, is_allowed: bool) -> None:
     (tmp_path / "rights.toml").write_text(RULES)
     assert (CallRights(tmp_path, PATH).refusal(None, "robot2", by) == "") == is_allowed

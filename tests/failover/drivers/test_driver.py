@@ -22,7 +22,7 @@ from failover.core.messaging.mailbox import MAILBOX_MAX
 from failover.core.naming.tree import Reach
 from failover.drivers import here as here_module
 from failover.drivers.here import Here, lives, stem
-from failover.drivers.local import LocalWay
+from failover.drivers.local import LocalWay, Poller
 from failover.drivers.lookup import lookup, whole_tree
 from failover.drivers.server import Serving
 from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError
@@ -256,6 +256,28 @@ def test_files_of_two_paths_are_never_the_same(folder: Path) -> None:
     assert all(len(f"{folder}/{one}.names".encode()) <= 107 for one in stems)
     with pytest.raises(DriverError, match="shorter place"):
         stem("a/" + "b" * 50, Path("/" + "x" * 100))
+
+
+def test_a_descriptor_that_is_waited_for_neither_way_does_not_wake_the_loop_when_its_other_end_closes() -> None:
+    poller = Poller()
+    ours, theirs = socket.socketpair()
+    with contextlib.closing(poller), ours, theirs:
+        poller.add(ours.fileno())
+        poller.add(ours.fileno(), reading=False, writing=False)
+        theirs.close()
+        assert poller.wait(0) == []
+        poller.add(ours.fileno(), writing=True)
+        assert poller.wait(0) == [ours.fileno()]
+
+
+def test_sockets_are_their_users_alone_whatever_the_umask_is(here: Here) -> None:
+    before = os.umask(0)
+    try:
+        with serving(Engine, here):
+            modes = {one.suffix: one.stat().st_mode & 0o777 for one in here.directory.iterdir() if one.is_socket()}
+    finally:
+        os.umask(before)
+    assert {".calls", ".hand"} <= modes.keys() and set(modes.values()) == {0o600}, modes
 
 
 def test_a_directory_of_others_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

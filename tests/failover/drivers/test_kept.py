@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import random
+import secrets
+import socket
+import struct
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +20,8 @@ from pathlib import Path
 import pytest
 
 import failover
+from checkpoint.segment.task_messages import VARIABLE, Begin, Safe
+from checkpoint.segment.task_messages import encode as encode_packet
 from failover.core.messaging.envelope import Envelope, decode, encode
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here, lives
@@ -23,6 +30,7 @@ from failover.drivers.lookup import lookup
 from failover.drivers.proxy import Proxy
 from failover.errors import DriverError, NameUnknownError
 from tests.failover.drivers.serving import LIMIT_S, until
+from tests.failover.kept_state.test_agent_link import says
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = Path(__file__).parent / "counter.py"
@@ -119,6 +127,33 @@ def test_a_message_that_was_answered_before_the_death_gets_the_same_answer_after
             way._lose()
     way.close()
     assert answers[0].ok == answers[1].ok == 1 and answers[0].hops == answers[1].hops
+
+
+def test_an_idle_driver_takes_in_what_its_guard_says_and_tells_that_it_has_gone(here: Here, folder: Path) -> None:
+    name = f"failover.{secrets.token_hex(8)}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), VARIABLE: f"@{name}"}
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind("\0" + name)
+        listener.listen(1)
+        listener.settimeout(LIMIT_S)
+        with subprocess.Popen([sys.executable, PROGRAM], env=environment, stderr=subprocess.PIPE, text=True) as driver:
+            try:
+                guard, _ = listener.accept()
+                with guard:
+                    says(encode_packet(Begin("/Lab/Counter", 3, (1, 2))), descriptors=1)(guard)
+                    until(lambda: here.file("Lab/Counter", "calls").exists() and lives(here, "Lab/Counter"))
+                    guard.send(encode_packet(Safe(1)))
+                    until(lambda: unread(guard) == 0)
+                assert driver.stderr is not None
+                assert any("has gone" in line for line in driver.stderr)
+                assert driver.poll() is None
+            finally:
+                driver.kill()
+
+
+def unread(end: socket.socket) -> int:
+    """Bytes that the other end has not taken. Source: unix(7), SIOCOUTQ."""
+    return struct.unpack("i", fcntl.ioctl(end, termios.TIOCOUTQ, bytes(4)))[0]  # type: ignore[no-any-return]
 
 
 def test_a_class_is_a_driver_or_a_component_and_not_both() -> None:

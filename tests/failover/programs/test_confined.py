@@ -62,3 +62,27 @@ def test_a_version_dies_with_its_host_and_leaves_no_process(lab: Lab) -> None:
 def test_from_a_directory_nothing_is_taken_and_that_is_told() -> None:
     found = confine.confine(Confinement(is_trusted=True), "/somewhere")
     assert found.enforced == [] and "all that this user may do" in found.not_enforced[0] and found.directory == "/somewhere"
+
+
+@pytest.mark.root
+def test_no_code_comes_from_where_the_host_was_started_and_folders_bound_below_tmp_stay_read_only(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere, modules = lab.folder / "elsewhere", lab.folder / "modules"
+    for folder in (elsewhere, modules):
+        folder.mkdir()
+    (elsewhere / "failover").mkdir()
+    (elsewhere / "failover" / "__init__.py").write_text("raise SystemExit('foreign code')")
+    modules.chmod(0o777)
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.setenv("PYTHONPATH", str(modules))
+    lab.send("1", engine(extra=LOOKS))
+    with lab.hosting("1"), lab.proxy() as proxy:
+
+        def seen(expression: str) -> object:
+            return proxy.call("fly", what=expression, timeout=30)
+
+        assert str(lab.folder).startswith("/tmp/")
+        assert seen(f"os.path.exists({str(elsewhere)!r})") is False
+        assert seen(f"[os.path.isdir({str(modules)!r}), os.access({str(modules)!r}, os.W_OK)]") == [True, False]
+        assert seen("os.path.exists('/etc/failover') and os.listdir('/etc/failover')") in (False, [])

@@ -4,14 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import resource
+import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
+from msgspec import UNSET
 
+from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs.states import State
-from failover.errors import BundleRefusedError, CallRefusedError, ProgramError
+from failover.drivers.server import Near, Peer
+from failover.errors import BundleRefusedError, CallRefusedError, DriverError, ProgramError
+from failover.programs.channel import State as KeptState
+from failover.programs.hosting import Hosting
+from failover.programs.running import Running
+from failover.programs.sources import Place
+from failover.programs.store import Kept
 from tests.failover.programs.senders import Lab, engine, switched, until
 
 LEAST = 100
@@ -150,7 +165,9 @@ def test_mailbox_and_state_outlive_the_host_and_its_version(lab: Lab) -> None:
     lab.send("1")
     with lab.hosting() as host, lab.proxy() as proxy:
         assert [proxy.call("step", number=number) for number in range(3)] == [0, 1, 2]
-        host.actor._running._process.kill()  # type: ignore[union-attr]
+        process = host.actor._running._process  # type: ignore[union-attr]
+        process.kill()
+        process.wait()  # a command that it has in hand would be answered with an error
         assert proxy.call("step", number=3, timeout=60) == 3
         assert proxy.call("read", timeout=60) == [0, 1, 2, 3]
     with lab.hosting() as host, lab.proxy() as proxy:
@@ -221,3 +238,103 @@ def test_an_order_that_cannot_be_is_refused_with_a_sentence(lab: Lab, body: dict
             proxy.call("_rollback")
         assert proxy.call("_versions")["active"] == "2"
     assert lab.store.shelf("engine").versions[0].state is State.STAGED
+
+
+def test_an_order_counts_by_the_way_it_came_also_when_that_way_is_forgotten(lab: Lab) -> None:
+    lab.send("1")
+    order = Envelope("engine", "_rollback", id="order", sender="robot2/x")
+    with Hosting(Place(lab.store, lab.team, "engine"), "1", lab.here) as host:
+
+        def sentence(whose: Peer | Near) -> str:
+            found = host.actor.came(order, whose, host.now_ns())
+            for number in range(SENDERS_MAX + 1):
+                host.actor.came(Envelope("nobody", sender=f"robot2/{number}"), Peer(b"x"), host.now_ns())
+            answers = [*found, *host.actor.handle(host.now_ns)]
+            return next(one.error.sentence for one in answers if one.re == "order")  # type: ignore[union-attr]
+
+        assert sentence(Peer(b"x")) == "give this order on the robot itself: robot2/x is on another one"
+        assert "uid 54321 is neither" in sentence(Near(9, 1, 54_321))
+        assert "cannot be rolled back" in sentence(Near(9, 2, os.geteuid()))
+
+
+def test_what_was_kept_last_outlives_a_full_disk(lab: Lab) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    for number in (1, 2):
+        lab.store.keep("Lab/robot1/Engine", Kept(number, "1", KeptState(b"x" * number), {}))
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))
+        for number in (3, 4):
+            with pytest.raises(ProgramError, match="cannot keep the state"):
+                lab.store.keep("Lab/robot1/Engine", Kept(number, "1", KeptState(b"x" * 4_096), {}))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    found = lab.store.kept("Lab/robot1/Engine")
+    assert found is not None and found.number == 2
+
+
+def test_a_second_host_of_a_program_is_refused_and_ends_no_trial_of_the_first(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2", seconds=600)
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("_switch", {"version": "2"})
+        until(proxy, lambda found: found["active"] == "2")
+        before = states_of(lab)
+        with pytest.raises(DriverError, match="is the driver of Lab/robot1/Engine on this robot already"):
+            Hosting(Place(lab.store, lab.team, "engine"), "", lab.here)
+        assert states_of(lab) == before
+
+
+def test_a_bundle_that_comes_again_brings_its_newer_signature_and_mends_its_files(lab: Lab) -> None:
+    source = lab.source("1")
+    digest = lab.store.take(lab.bundle(source, int(time.time()) + 3_600), lab.team).program.digest
+    (lab.store.tree(digest) / "engine.py").unlink()
+    with pytest.raises(ProgramError, match="was changed since it was unpacked; send the bundle again"):
+        lab.store.admitted(digest, lab.team)
+    again = lab.bundle(source, int(time.time()) + 7_200)
+    lab.store.take(again, lab.team)
+    assert lab.store.tree(digest).with_suffix(".bundle").read_bytes() == again
+    assert lab.store.admitted(digest, lab.team).program.digest == digest
+
+
+def test_a_directory_that_no_file_can_have_is_refused_with_a_sentence(lab: Lab) -> None:
+    place = Place(lab.store, lab.team, "engine", lab.source("1"))
+    with Hosting(place, "", lab.here) as host:
+        order = Envelope("engine", "_switch", {"directory": "a\0"}, sender="robot1/x")
+        (answer,) = [*host.actor.came(order, Near(9, 1, 0), host.now_ns()), *host.actor.handle(host.now_ns)]
+        assert answer.error is not UNSET and answer.error.kind == "refused"
+
+
+def test_with_a_version_end_the_processes_that_it_started_after_it_let_its_device_go(lab: Lab) -> None:
+    retired = lab.folder / "retired"
+    kept = f"numbers: list[int] = failover.kept(default=[])\n    def on_retire(self): open({str(retired)!r}, 'w').close()"
+    before = "import subprocess\nhelper = subprocess.Popen(['sleep', '1000'])"
+    second = lab.source("2", engine(kept=kept, before=before, extra="return helper.pid"))
+    with Hosting(Place(lab.store, lab.team, "engine", lab.source("1")), "", lab.here) as host:
+        thread = threading.Thread(target=host.serve)
+        thread.start()
+        with lab.proxy() as proxy:
+            proxy.call("_switch", {"directory": str(second)})
+            until(proxy, lambda found: found["active"] == "2")
+            helper = Path(f"/proc/{proxy.call('fly')}")
+            assert "sleep" in (helper / "cmdline").read_text() and not retired.exists()
+        host.stop()
+        thread.join()
+    assert retired.exists()
+    deadline = time.monotonic() + 60
+    while helper.exists() and "\nState:\tZ" not in (helper / "status").read_text():  # a zombie where no init reaps it
+        assert time.monotonic() < deadline, "the helper process goes on"
+        time.sleep(0.01)
+
+
+def test_a_host_that_gets_no_process_says_so_and_goes_on(lab: Lab) -> None:
+    with Hosting(Place(lab.store, lab.team, "engine", lab.source("1")), "", lab.here) as host:
+        source = host.actor._last
+        before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+            with pytest.raises(ProgramError, match="the system gives no process: Too many open files"):
+                Running(source)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)

@@ -19,6 +19,7 @@ from failover.core.messaging.envelope import (
     ELEMENTS_MAX,
     HOPS_MAX,
     MESSAGE_SIZE_MAX,
+    TEXT_MAX,
     Encoding,
     Envelope,
     Hop,
@@ -110,11 +111,16 @@ def test_no_bytes_raise_anything_but_a_sentence(content: bytes) -> None:
         (b'{"to":5}', "another kind than documented"),
         (b'{"seq":-1}', "negative"),
         (b'{"deadline_ms":"soon"}', "another kind"),
+        (b'{"deadline_ms":1e308}', "2^53 ms are the most"),
+        (b'{"verb":"set","deadline_ms":-1e308}', "2^53 ms are the most"),
         (b'{"to":"\xff"}', "cannot be read"),
         (b'{"a\\nb":1}', "visible characters"),
         (b'{"\\u0000rest":{"to":"x"}}', "visible characters"),
         (b'{"\\u007frest":{"to":"x"}}', "visible characters"),
         (b'{"hops":[["a","x",null]]}', "the stamp"),
+        (b'{"from":"' + b"-1" * 257 + b'"}', "of 514 characters; 512 are the most"),
+        (b'{"verb":"set","id":"' + b"x" * 513 + b'"}', "of 513 characters"),
+        (b'{"hops":[["' + b"x" * 513 + b'",1,2]]}', "a hop whose name has 513 characters"),
         (b"\x81\x01\x02", "no text"),
         (b"\x81\xa4body\xc4\x01x", "the message"),
         (b"\x81\xa4body\xd6\xff\x00\x00\x00\x00", "the message"),
@@ -189,5 +195,5 @@ def test_each_sample_of_the_document_is_read_and_written_as_it_says() -> None:
 def test_the_document_names_every_field_and_limit() -> None:
     for name in module._KNOWN:
         assert f"| `{name}` |" in DOCUMENT
-    for limit in (MESSAGE_SIZE_MAX, ELEMENTS_MAX, DEPTH_MAX, HOPS_MAX):
+    for limit in (MESSAGE_SIZE_MAX, ELEMENTS_MAX, DEPTH_MAX, HOPS_MAX, TEXT_MAX):
         assert f" {limit:,} " in DOCUMENT

@@ -15,7 +15,17 @@ from msgspec import UNSET
 
 from failover.core.messaging import mailbox
 from failover.core.messaging.envelope import Envelope, answer
-from failover.core.messaging.mailbox import MAILBOX_MAX, MS, WINDOW, Mailbox, Outbox, unpacked
+from failover.core.messaging.mailbox import (
+    HELD_ALL_MAX,
+    HELD_MAX,
+    MAILBOX_MAX,
+    MS,
+    SENDERS_MAX,
+    WINDOW,
+    Mailbox,
+    Outbox,
+    unpacked,
+)
 from failover.errors import MailboxFullError
 
 
@@ -321,8 +331,8 @@ MUTANTS = {
         "_again",
         lambda self, envelope: [one for one in self._answers if one.seq == envelope.seq],
     ),
-    "the one before is not waited for": ("_hold", lambda self, taken, envelope: self._accept(taken, envelope, 0)),
-    "a number is taken again": ("_again", lambda self, envelope: self._queued(envelope, 0)),
+    "the one before is not waited for": ("_hold", lambda self, taken, arrived: self._accept(taken, arrived)),
+    "a number is taken again": ("_again", lambda self, envelope: self._queued(mailbox.Arrived(envelope, None))),
 }
 
 
@@ -340,3 +350,35 @@ def look() -> None:
         world = World(seed, 3, 100, loss=0.3, double=0.3)
         world.run(300)
         world.check()
+
+
+def test_messages_held_for_ones_that_never_come_neither_make_it_busy_nor_let_it_remember_without_end() -> None:
+    box = Mailbox()
+    for sender in range(3 * SENDERS_MAX):
+        for seq in range(2, 2 + HELD_MAX if sender < 100 else 3):
+            assert box.arrived(Envelope("actor", "x", sender=f"s{sender}", boot=1, seq=seq, after=1, reliable=True), 0) == []
+    assert len(box) <= HELD_ALL_MAX and len(box._taken) <= HELD_ALL_MAX
+    assert box.arrived(Envelope("actor", "x", sender="honest", boot=1, seq=1), 0) == []
+    taken = box.take(0)
+    assert taken is not None and taken.sender == "honest"
+
+
+def test_senders_that_are_refused_because_it_is_full_are_not_remembered() -> None:
+    box = Mailbox()
+    for number in range(MAILBOX_MAX):
+        assert box.arrived(Envelope("actor", "x", sender="s", boot=1, seq=number + 1), 0) == []
+    for number in range(100):
+        (busy,) = box.arrived(Envelope("actor", "x", sender=f"t{number}", boot=1, seq=1), 0)
+        assert busy.error is not UNSET and busy.error.kind == "busy"
+    assert set(box._taken) == {"s"}
+
+
+def test_a_held_message_keeps_the_deadline_that_it_came_with() -> None:
+    box = Mailbox()
+    box.arrived(Envelope("actor", "late", sender="s", boot=1, seq=2, after=1, deadline_ms=10.0), 0)
+    box.arrived(Envelope("actor", "first", sender="s", boot=1, seq=1, reliable=True), 20 * MS)
+    taken = box.take(20 * MS)
+    assert taken is not None and taken.verb == "first"
+    box.done(taken, answer(taken, None))
+    assert box.take(20 * MS) is None
+    assert [one.error.kind for one in box.committed() if one.error is not UNSET] == ["expired"]

@@ -59,3 +59,8 @@ def test_more_edges_than_there_is_room_for_count_together() -> None:
 def test_a_program_that_was_started_anew_is_the_same_one() -> None:
     assert who("robot1/mission-4711-1") == who("robot1/mission-9-3-2") == "robot1/mission"
     assert who("by-hand-0badcafe") == "by hand"
+
+
+def test_a_sender_without_pid_and_number_is_found_of_any_form() -> None:
+    told = {"r/x-12-3": "r/x", "r/x": "r/x", "r/x-": "r/x-", "r/x-1-": "r/x-1-", "r/a-b-7": "r/a-b", "-1-2": "-1-2", "": ""}
+    assert {name: who(name) for name in told} == told
