@@ -58,7 +58,7 @@ def test_each_frame_is_one_datagram_for_all_and_brings_heartbeats_and_items(
         assert {one.rank for one in came} == {1, 2, 3}
         cast = [one for one in came if one.to.startswith("239.77.")]
         assert len(cast) > len(came) * 3 / 4, "few were sent to this robot besides"
-        assert all(teams.hears_all(robot) for robot in stage.robots)
+        robots.until(lambda: all(teams.hears_all(robot) for robot in stage.robots), "each robot to hear all others")
         for board in boards:
             board.close()
 
@@ -79,7 +79,7 @@ def test_a_robot_that_no_multicast_reaches_is_served_by_unicast_and_its_componen
         no_multicast_to(stage, last.name)
         for robot in stage.robots[:-1]:
             robots.until(lambda one=robot: last.name in by_unicast(one), f"{robot.name} to serve {last.name} by unicast")
-        assert all(teams.hears_all(robot) for robot in stage.robots)
+        robots.until(lambda: all(teams.hears_all(robot) for robot in stage.robots), "each robot to hear all others")
         before = len(robots.numbers(last))
         robots.until(lambda: len(robots.numbers(last)) > before + 20, "it to go on")
         now = robots.component(last, "count")
@@ -95,4 +95,4 @@ def test_where_multicast_reaches_no_robot_frames_are_broadcast(tmp_path: Path) -
             no_multicast_to(stage, name)
         robots.until(lambda: all(bridged.is_cast_to_all(robot, Cast.BROADCAST) for robot in stage.robots), "broadcast everywhere")
         assert "none has heard a multicast" in str(bridged.medium(stage.robots[0])["because"])
-        assert all(teams.hears_all(robot) for robot in stage.robots)
+        robots.until(lambda: all(teams.hears_all(robot) for robot in stage.robots), "each robot to hear all others")
