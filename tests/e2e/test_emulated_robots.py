@@ -35,7 +35,7 @@ def others() -> Iterator[Kind]:
     return (kind for kind in KINDS if kind.processor != platform.machine())
 
 
-@pytest.fixture(scope="module", params=others(), ids=lambda kind: kind.name)
+@pytest.fixture(params=others(), ids=lambda kind: kind.name)
 def kind(request: pytest.FixtureRequest) -> Kind:
     wanted: Kind = request.param
     if reason := wanted.unwanted() or wanted.lacking():
@@ -45,12 +45,11 @@ def kind(request: pytest.FixtureRequest) -> Kind:
     return wanted
 
 
-@pytest.fixture(scope="module")
-def mixed(kind: Kind, tmp_path_factory: pytest.TempPathFactory) -> Iterator[MixedStage]:
-    """robot1 is of this machine, robot2 an emulated one: it boots once for all tests, the last of which cuts its power."""
-    directory = tmp_path_factory.mktemp("mixed")
-    guest = made(kind, directory)
-    with guest.booted(*to_this_machine(NAMES[1])), MixedStage(directory / "stage", {NAMES[1]: guest}) as stage:
+@pytest.fixture
+def mixed(kind: Kind, tmp_path: Path) -> Iterator[MixedStage]:
+    """robot1 is of this machine, robot2 an emulated one."""
+    guest = made(kind, tmp_path)
+    with guest.booted(*to_this_machine(NAMES[1])), MixedStage(tmp_path / "stage", {NAMES[1]: guest}) as stage:
         yield from started(stage)
 
 
@@ -109,6 +108,23 @@ def until_safe(robot: RobotMachine, name: str) -> int:
     return len(counted(robot, name))
 
 
+def test_a_program_that_keeps_its_state_moves_to_another_processor_and_outlives_it(mixed: MixedStage, tmp_path: Path) -> None:
+    if sys.version_info[:2] != (3, 11):
+        pytest.skip("the machine has Python 3.11")
+    first, second = mixed.robots
+    program = tmp_path / "counter.py"
+    program.write_text(COUNTER.replace("0.01", "0.1"))
+    environment = {"PYTHONPATH": os.pathsep.join(PLACES)}
+    robots.run(first, "count", PYTHON, str(program), env=environment, cwd=str(tmp_path), engine="cooperative")
+    before = until_safe(first, "count")
+    hand_over(first, "count")
+    until_it_goes_on(second, "count", before)
+    before = until_safe(second, "count")
+    second.cut_power()
+    robots.until(lambda: robots.component(first, "count").get("role") == "primary", "robot1 to take it over", PATIENCE_S)
+    until_it_goes_on(first, "count", before)
+
+
 def test_a_program_that_nobody_prepared_is_refused_there_by_name_and_goes_on(mixed: MixedStage, kind: Kind) -> None:
     first, _ = mixed.robots
     robots.run(first, "count", PYTHON, "-c", COUNTING)
@@ -119,24 +135,6 @@ def test_a_program_that_nobody_prepared_is_refused_there_by_name_and_goes_on(mix
     refused = robots.failover(first, "handover", "count")
     assert refused.returncode == 1 and robots.component(first, "count")["role"] == "primary", refused
     until_it_goes_on(first, "count", len(counted(first, "count")))
-    robots.failover(first, "stop", "count")  # it would be offered to robot2 again and again
-
-
-def test_a_program_that_keeps_its_state_moves_to_another_processor_and_outlives_it(mixed: MixedStage, tmp_path: Path) -> None:
-    if sys.version_info[:2] != (3, 11):
-        pytest.skip("the machine has Python 3.11")
-    first, second = mixed.robots
-    program = tmp_path / "counter.py"
-    program.write_text(COUNTER.replace("0.01", "0.1"))
-    environment = {"PYTHONPATH": os.pathsep.join(PLACES)}
-    robots.run(first, "keeps", PYTHON, str(program), env=environment, cwd=str(tmp_path), engine="cooperative")
-    before = until_safe(first, "keeps")
-    hand_over(first, "keeps")
-    until_it_goes_on(second, "keeps", before)
-    before = until_safe(second, "keeps")
-    second.cut_power()
-    robots.until(lambda: robots.component(first, "keeps").get("role") == "primary", "robot1 to take it over", PATIENCE_S)
-    until_it_goes_on(first, "keeps", before)
 
 
 def test_a_program_that_nobody_prepared_outlives_its_robot(alike: MixedStage) -> None:
