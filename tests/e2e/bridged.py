@@ -15,6 +15,7 @@ from failover.cli.demo.robots import USUAL_PACE, Pace, RobotMachine, Stage, ip_c
 from failover.config import team
 from failover.config.team import Robot, Team
 from failover.core.frames.media import Cast
+from failover.errors import AgentRefusedError
 from tests.e2e import robots, teams
 from tests.e2e.frames_seen import Seen
 
@@ -127,6 +128,21 @@ def is_cast_to_all(robot: RobotMachine, cast: Cast = Cast.MULTICAST) -> bool:
 def settled(stage: SwitchStage, patience_s: float = robots.PATIENCE_S) -> None:
     """Wait until each robot reaches all others by multicast alone."""
     robots.until(lambda: all(map(is_cast_to_all, stage.robots)), "multicast everywhere", patience_s)
+
+
+def run_at_last(robot: RobotMachine, name: str, *argv: str) -> None:
+    """Start a program under protection, as soon as the robot's votes of an earlier life bind it no more."""
+
+    def is_begun() -> bool:
+        try:
+            robots.run(robot, name, *argv)
+        except AgentRefusedError as refusal:
+            if "ask again in a moment" not in str(refusal):
+                raise
+            return False
+        return True
+
+    robots.until(is_begun, f"{robot.name} to start {name}")
 
 
 def sent(robot: RobotMachine) -> int:

@@ -73,7 +73,7 @@ def seen(board: failover.Board, robot: str) -> float | None:
 def test_a_robot_that_no_multicast_reaches_is_served_by_unicast_and_its_component_stays(tmp_path: Path) -> None:
     with four(tmp_path) as stage:
         first, *_, last = stage.robots
-        robots.run(last, "count", *COUNTER)
+        bridged.run_at_last(last, "count", *COUNTER)
         robots.until_protected(last)
         epoch = robots.component(last, "count")["epoch"]
         no_multicast_to(stage, last.name)

@@ -58,7 +58,7 @@ def test_all_agree_and_each_sends_once_a_round_in_its_order_and_a_crash_is_share
     first, second, third, fourth = stage.robots
     robots.until(lambda: agree([first, second, third, fourth]), "K = 4 at all four")
     robots.until(lambda: rounds_in_order(stage, [0, 1, 2]), "rounds of one frame of each other robot, in their order")
-    robots.run(second, "count", *COUNTER)
+    bridged.run_at_last(second, "count", *COUNTER)
     robots.until_protected(second)
     robots.until(lambda: len(robots.numbers(second)) > 20, "some numbers")
     second.cut_power()
