@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from failover.drivers.here import DIRECTORY, ROBOT, TEAM, Here
+from failover.drivers.here import Here
+from tests.failover.drivers.serving import robot_alone
 
 
 @pytest.fixture
@@ -17,10 +18,5 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Here:
-    """A robot without a team; also for programs and commands that the test starts."""
-    for name in (TEAM, ROBOT):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv(DIRECTORY, str(folder / "m"))
-    monkeypatch.setenv(ROBOT, "robot1")
-    (folder / "m").mkdir(mode=0o700)
-    return Here("robot1", folder / "m", alone="this test has no team")
+    """See `robot_alone`."""
+    return robot_alone(folder, monkeypatch)

@@ -8,13 +8,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
+
+import pytest
 
 from agent.worker.network.replication_link import new_keys
 from failover.config.team import Robot, Team, write, write_secret_key
-from failover.drivers.here import Here
+from failover.drivers.here import DIRECTORY, ROBOT, TEAM, Here
 from failover.drivers.lookup import lookup
 from failover.drivers.proxy import Proxy
 from failover.drivers.server import Serving
+
+S = TypeVar("S", bound=Serving)
 
 LIMIT_S = 60
 """Until a test gives up waiting for a condition."""
@@ -29,9 +34,9 @@ def until(condition: Callable[[], object]) -> None:
 
 
 @contextlib.contextmanager
-def serving(cls: type, here: Here) -> Iterator[Serving]:
-    """A driver that takes messages until the body ends."""
-    with Serving(cls, here) as one:
+def taking_messages(one: S) -> Iterator[S]:
+    """Open sockets, behind which a thread takes messages until the body ends."""
+    with one:
         thread = threading.Thread(target=one.serve)
         thread.start()
         try:
@@ -39,6 +44,21 @@ def serving(cls: type, here: Here) -> Iterator[Serving]:
         finally:
             one.stop()
             thread.join()
+
+
+def serving(cls: type, here: Here) -> contextlib.AbstractContextManager[Serving]:
+    """A driver that takes messages until the body ends."""
+    return taking_messages(Serving(cls, here))
+
+
+def robot_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Here:
+    """A robot without a team; also for programs and commands that the test starts."""
+    for name in (TEAM, ROBOT):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(DIRECTORY, str(folder / "m"))
+    monkeypatch.setenv(ROBOT, "robot1")
+    (folder / "m").mkdir(mode=0o700)
+    return Here("robot1", folder / "m", alone="this test has no team")
 
 
 def called(here: Here, name: str) -> Proxy:

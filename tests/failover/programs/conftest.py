@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from failover.drivers.here import DIRECTORY, ROBOT, TEAM, Here
+from failover.drivers.here import Here
 from failover.programs.store import PLACE
+from tests.failover.drivers.serving import robot_alone
 from tests.failover.programs.senders import Lab
 
 
@@ -20,14 +21,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Here:
-    """A robot without a team; also for programs and commands that the test starts."""
-    for name in (TEAM, ROBOT):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv(DIRECTORY, str(folder / "m"))
-    monkeypatch.setenv(ROBOT, "robot1")
+    """See `robot_alone`; with a store."""
     monkeypatch.setenv(PLACE, str(folder / "s"))
-    (folder / "m").mkdir(mode=0o700)
-    return Here("robot1", folder / "m", alone="this test has no team")
+    return robot_alone(folder, monkeypatch)
 
 
 @pytest.fixture

@@ -7,9 +7,7 @@ import itertools
 import json
 import select
 import sys
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from failover.core.programs.bundle import Program
@@ -20,6 +18,7 @@ from failover.programs import keys, packing
 from failover.programs.hosting import Hosting
 from failover.programs.sources import Place
 from failover.programs.store import Store
+from tests.failover.drivers.serving import taking_messages
 
 NAME = "Lab/robot1/Engine"
 
@@ -136,17 +135,9 @@ class Lab:
         """A version comes to the robot."""
         return self.store.take(self.bundle(self.source(version, text, **terms)), self.team).program  # type: ignore[arg-type]
 
-    @contextlib.contextmanager
-    def hosting(self, version: str = "", *, beside: bool = False) -> Iterator[Hosting]:
+    def hosting(self, version: str = "", *, beside: bool = False) -> contextlib.AbstractContextManager[Hosting]:
         """A host, until the body ends."""
-        with Hosting(Place(self.store, self.team, "engine", beside=beside), version, self.here) as host:
-            thread = threading.Thread(target=host.serve)
-            thread.start()
-            try:
-                yield host
-            finally:
-                host.stop()
-                thread.join()
+        return taking_messages(Hosting(Place(self.store, self.team, "engine", beside=beside), version, self.here))
 
     def proxy(self, name: str = "engine") -> Proxy:
         """A way to it."""
