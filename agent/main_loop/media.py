@@ -20,6 +20,7 @@ from agent.config import MediumConfig, Settings
 from agent.main_loop.beat_sockets import BeatLane
 from agent.main_loop.messages import LinkNow, MediumView
 from agent.system import clock
+from failover.core.board.ages import effective_round_ns
 from failover.core.frames.casts import LINKS_MAX, Casts
 from failover.core.frames.frame import SLOTTED, Part, Portion
 from failover.core.frames.lane import FrameLane, Sealed
@@ -143,7 +144,7 @@ class Media:
             return ""
         if link.number > MEDIA_MAX:
             return f"only the first {MEDIA_MAX} links can have slots"
-        least_ms = lease_needed_ms(Terms(config.t_tup_ms), len(self._roster))
+        least_ms = lease_needed_ms(config.t_tup_ms, len(self._roster))
         lease_ms = self._settings.config.lease_ms
         if config.slots == "auto" and lease_ms < least_ms:
             return (
@@ -224,7 +225,7 @@ class Media:
         return min((self._longest_ns(link) for link in lately), default=self.round_ns)
 
     def _longest_ns(self, link: Link) -> int:
-        return self._beat_ns if link.slots is None else stretched_ns(link.period_ns, len(self._roster))
+        return self._beat_ns if link.slots is None else effective_round_ns(link.period_ns, max(len(self._roster), 2))
 
     def is_first(self, link: Link) -> bool:
         """Whether this is the first link on which this robot has a slot: the pace of the board where all links have slots."""
@@ -367,7 +368,7 @@ class Media:
             yield from self._lease_of_slots_alone(link, view)
 
     def _lease_of_slots_alone(self, link: Link, view: SlotsView) -> Iterator[str]:
-        least_ms = lease_needed_ms(Terms(link.period_ns // MS), max(view.count, 2))
+        least_ms = lease_needed_ms(link.period_ns // MS, view.count)
         lease_ms = self._settings.config.lease_ms
         if lease_ms < least_ms:
             yield (
@@ -376,12 +377,6 @@ class Media:
             )
 
 
-def stretched_ns(period_ns: int, robots: int) -> int:
-    """The longest round of so many robots: the reference follows delays of a part of a slot."""
-    return round(period_ns * (1 + Terms().epsilon / max(robots, 2)))
-
-
-def lease_needed_ms(terms: Terms, robots: int) -> int:
+def lease_needed_ms(t_tup_ms: int, robots: int) -> int:
     """A lease in which as many of the longest rounds pass as of a heartbeat's periods: the reference stretches rounds."""
-    longest_ms = terms.t_tup_ms * (1 + terms.epsilon / max(robots, 2))
-    return math.ceil(BEATS_IN_LEASE_MIN * longest_ms)
+    return math.ceil(BEATS_IN_LEASE_MIN * effective_round_ns(t_tup_ms * MS, max(robots, 2)) / MS)

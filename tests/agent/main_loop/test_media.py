@@ -9,10 +9,11 @@ import pytest
 
 from agent.config import Config, MediumConfig, Settings
 from agent.main_loop.beat_sockets import BeatLane
-from agent.main_loop.media import HEARD_NS, Media, stretched_ns
+from agent.main_loop.media import HEARD_NS, Media
 from agent.main_loop.messages import LinkNow
 from agent.system import clock
 from failover.config.team import Robot, Team
+from failover.core.board.ages import effective_round_ns
 from failover.core.frames.lane import FrameLane
 from failover.core.frames.lanes import FrameLanes
 from failover.core.frames.media import RETRY_ROUNDS, Cast, Casting
@@ -109,7 +110,7 @@ def test_when_another_way_to_cast_is_tried_members_get_unicast_besides_at_once(
 def test_the_round_of_a_member_is_that_of_the_fastest_link_over_which_it_is_heard(media: Make) -> None:
     both = media("radio0", "cable0", slots=("radio0",))
     now_ns = 10 * HEARD_NS
-    longest_ns = stretched_ns(ROUND_NS, 3)
+    longest_ns = effective_round_ns(ROUND_NS, 3)
     assert longest_ns > ROUND_NS
     both.heard("robot2", "radio0", now_ns)
     both.heard("robot3", "radio0", now_ns)
