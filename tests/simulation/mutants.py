@@ -536,24 +536,29 @@ ELECTIVE_MUTANTS: tuple[Mutant, ...] = (
 """Mistakes that lives of voting teams catch."""
 
 
-NEAR: dict[str, int] = {
-    "nobody_needs_the_right": 62,
-    "no_base_for_the_lost": 12,
-    "double_voting": 22,
-    "no_margin": 435,
-    "disloyal_voter": 19,
-    "anybody_may_have_it": 132,
-    "best_lease_counts": 19,
-    "lease_from_strangers": 52,
-    "votes_with_a_copy": 22,
-    "claims_for_ever": 15,
-    "generous_lease": 11,
-    "runs_the_finished": 52,
-}
-"""The first seed that catches a mistake, where that is a late one: it is tried first."""
+PAIRS, VOTES, AS_THE_SEED_SAYS, LONG_LIFE = True, False, 0, 150
 
-LONG = {"named_in_advance": 37, "shown_when_accepted": 113, "takes_the_unreadable_for_silence": 0}
-"""The first long life that catches one which hardly any short one does."""
+CAUGHT_BY: dict[tuple[str, bool], tuple[int, int]] = {
+    ("everybody_yields", PAIRS): (AS_THE_SEED_SAYS, 35),
+    ("nobody_needs_the_right", PAIRS): (AS_THE_SEED_SAYS, 53),
+    ("takes_the_unreadable_for_silence", PAIRS): (LONG_LIFE, 0),
+    ("double_voting", VOTES): (AS_THE_SEED_SAYS, 22),
+    ("no_margin", VOTES): (AS_THE_SEED_SAYS, 435),
+    ("disloyal_voter", VOTES): (AS_THE_SEED_SAYS, 26),
+    ("anybody_may_have_it", VOTES): (AS_THE_SEED_SAYS, 132),
+    ("named_in_advance", VOTES): (LONG_LIFE, 37),
+    ("best_lease_counts", VOTES): (AS_THE_SEED_SAYS, 32),
+    ("lease_from_strangers", VOTES): (AS_THE_SEED_SAYS, 52),
+    ("votes_with_a_copy", VOTES): (AS_THE_SEED_SAYS, 22),
+    ("generous_lease", VOTES): (AS_THE_SEED_SAYS, 57),
+    ("claims_for_ever", VOTES): (AS_THE_SEED_SAYS, 15),
+    ("runs_the_finished", VOTES): (AS_THE_SEED_SAYS, 52),
+    ("shown_when_accepted", VOTES): (LONG_LIFE, 17),
+}
+"""Of a mistake that the first seeds do not catch, in pairs or voting teams: faults of a life, and the seed that caught it last.
+
+That seed is tried first. Any change of the rules can turn a life around, so the other seeds are tried after it.
+"""
 
 
 @contextmanager
