@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
@@ -172,7 +172,7 @@ class Config:
     """The whole file. Times in milliseconds.
 
     Attributes:
-        robot: this robot's name in the team file.
+        robot: this robot's name in the team file; "": the host name, up to its first dot.
         team_directory: see `failover.config.team`.
         state_directory: files that survive a power cut: vote record, snapshots, streams.
         runtime_directory: sockets; gone after a reboot.
@@ -201,7 +201,7 @@ class Config:
         media: how frames leave over an interface, by its name.
     """
 
-    robot: str
+    robot: str = ""
     team_directory: str = "/etc/failover/team"
     state_directory: str = "/var/lib/failover"
     runtime_directory: str = "/run/failover"
@@ -337,6 +337,7 @@ def load(path: Path) -> Settings:
     """
     try:
         config = strict_toml.read(path, Config)
+        config = config if config.robot else replace(config, robot=os.uname().nodename.partition(".")[0])
         members = team_directory.read(Path(config.team_directory))
         if config.robot not in members.robots:
             known = ", ".join(sorted(members.robots)) or "no member"

@@ -9,6 +9,7 @@ import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import pytest
@@ -49,9 +50,8 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     (component,) = documented.pop("components").values()
     (task,) = documented.pop("tasks").values()
     (medium,) = documented.pop("media").values()
-    assert documented.pop("robot") == "robot1"
-    defaults = dataclasses.asdict(Config("robot1"))
-    del defaults["robot"], defaults["components"], defaults["tasks"], defaults["media"]
+    defaults = dataclasses.asdict(Config())
+    del defaults["components"], defaults["tasks"], defaults["media"]
     assert documented == defaults
     assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
     assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
@@ -245,6 +245,20 @@ def test_a_robot_outside_the_team_is_told_who_is_in_it(directory: Path) -> None:
     path.write_text(f'robot = "robot9"\nteam_directory = "{directory / "team"}"\n')
     with pytest.raises(ConfigError, match="robot1, robot2"):
         configuration.load(path)
+
+
+def test_a_robot_without_a_name_has_its_host_name(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = directory / "agent.toml"
+    path.write_text(f'insecure = true\nteam_directory = "{directory / "team"}"\n')
+    monkeypatch.setattr(configuration.os, "uname", lambda: Named("robot2.lab.example"))
+    assert configuration.load(path).config.robot == "robot2"
+    monkeypatch.setattr(configuration.os, "uname", lambda: Named("laptop"))
+    with pytest.raises(ConfigError, match=r"robot 'laptop' is not in .* robot1, robot2"):
+        configuration.load(path)
+
+
+class Named(NamedTuple):
+    nodename: str
 
 
 def test_keys_are_asked_for_unless_the_operator_says_insecure(directory: Path) -> None:
