@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -314,13 +315,32 @@ def test_no_file_names_a_package_registry() -> None:
     assert wrong == []
 
 
+def pinned(name: str) -> list[str]:
+    """The entries of a list of packages: a version and its hashes each."""
+    return re.split(r"\n(?=\S)", re.sub(r"(?m)^#.*\n", "", (ROOT / name).read_text()).strip())
+
+
 def test_the_development_set_is_pinned_by_version_and_hash() -> None:
-    text = (ROOT / "requirements-dev.txt").read_text()
-    entries = re.split(r"\n(?=\S)", re.sub(r"(?m)^#.*\n", "", text).strip())
+    entries = pinned("requirements-dev.txt")
     assert len(entries) > 20
     for entry in entries:
         assert re.match(r"[a-z0-9.\-]+==\S+ \\\n", entry), entry.splitlines()[0]
         assert "--hash=sha256:" in entry
+
+
+def test_what_runs_and_installs_failover_is_what_its_tests_run_with() -> None:
+    tested = set(pinned("requirements-dev.txt"))
+    running = pinned("requirements.txt")
+    assert {*running, *pinned("requirements-build.txt")} <= tested
+    wanted = {
+        re.split(r"[<>=]", line)[0] for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    }
+    assert wanted <= {entry.split("==")[0] for entry in running}
+
+
+def test_the_package_has_the_version_of_the_program() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert (ROOT / "debian/changelog").read_text().startswith(f"failover ({version}) ")
 
 
 def mentioned_verbs(text: str) -> set[str]:

@@ -1,7 +1,8 @@
 """A machine whose PID 1 is a real systemd, in namespaces of its own: it boots in about a second and leaves no trace.
 
 Its root consists of this machine's own /usr (an overlay: nothing of it can be changed), this checkout, the Python that runs the
-tests, and an /etc and /var of its own. It has its own network, PIDs, hostname and cgroups. Needs root, systemd and overlayfs.
+tests, and an /etc and /var of its own; or of another system, which lies in a folder. It has its own network, PIDs, hostname and
+cgroups. Needs root, systemd and overlayfs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Final
 
 SYSTEMD: Final = Path("/usr/lib/systemd/systemd")
 CHECKOUT: Final = Path(__file__).resolve().parents[2]
-PATIENCE_S: Final = 60.0
+PATIENCE_S: Final = 180.0
 POLL_S: Final = 0.02
 
 COPIED: Final = (
@@ -43,11 +44,17 @@ LAY: Final = r"""
 set -e
 root=$1; shift
 mount -t tmpfs -o mode=755 tmpfs "$root"
-cd "$root"
-mkdir -p etc var/lib var/log var/tmp usr proc sys dev run tmp root overlay/up overlay/work
+if [ -n "$BASE" ]; then
+    mkdir "$root/up" "$root/work" "$root/all"
+    mount -t overlay overlay -o "lowerdir=$BASE,upperdir=$root/up,workdir=$root/work" "$root/all"
+    root=$root/all; cd "$root"
+else
+    cd "$root"
+    mkdir -p etc var/lib var/log var/tmp usr proc sys dev run tmp root overlay/up overlay/work
+    mount -t overlay overlay -o "lowerdir=/usr,upperdir=$root/overlay/up,workdir=$root/overlay/work" usr
+    for name in bin sbin lib lib64; do ln -s "usr/$name" "$name"; done
+fi
 cp -a "$ETC"/. etc/
-mount -t overlay overlay -o "lowerdir=/usr,upperdir=$root/overlay/up,workdir=$root/overlay/work" usr
-for name in bin sbin lib lib64; do ln -s "usr/$name" "$name"; done
 mount -t proc proc proc; mount -t sysfs sysfs sys
 mount -t cgroup2 cgroup2 sys/fs/cgroup
 mount -t tmpfs -o mode=755 tmpfs dev
@@ -167,13 +174,14 @@ def _remove(cgroup: Path, deadline: float) -> None:
 
 
 @contextmanager
-def booted(directory: Path, name: str) -> Iterator[Machine]:
+def booted(directory: Path, name: str, base: Path | None = None) -> Iterator[Machine]:
     """A machine that has finished booting; it is gone afterwards.
 
     Args:
         directory: for its root and its boot log.
+        base: its whole system, with systemd in it, of which nothing is changed; None: this machine's /usr.
     """
-    machine = _boot(directory, name)
+    machine = _boot(directory, name, base)
     try:
         _wait_until_up(machine, directory / f"{name}.log")
         yield machine
@@ -181,18 +189,19 @@ def booted(directory: Path, name: str) -> Iterator[Machine]:
         machine.end()
 
 
-def _boot(directory: Path, name: str) -> Machine:
+def _boot(directory: Path, name: str, system: Path | None) -> Machine:
     etc, root = directory / f"{name}.etc", directory / f"{name}.root"
     root.mkdir()
-    _write_etc(etc, name)
+    _write_etc(etc, name, COPIED if system is None else ())
     base = cgroup_root()
     assert base is not None
     cgroup = base / f"failover-test-{os.getpid()}-{name}"
     cgroup.mkdir()
-    places = sorted({str(CHECKOUT), sys.prefix, sys.base_prefix} - {"/usr"})
+    places = sorted({str(CHECKOUT), sys.prefix, sys.base_prefix} - {"/usr"}) if system is None else []
     script = f'echo 0 >{cgroup}/cgroup.procs; exec unshare --cgroup bash -c "$LAY" lay "$@"'
     command = ["unshare", "--mount", "--uts", "--ipc", "--net", "--pid", "--fork", "--kill-child", "--propagation", "private"]
-    environment = {**os.environ, "LAY": LAY, "ETC": str(etc), "NAME": name, "DEVICES": " ".join(DEVICES)}
+    settings = {"BASE": str(system or ""), "ETC": str(etc), "NAME": name, "DEVICES": " ".join(DEVICES)}
+    environment = {**os.environ, "LAY": LAY, **settings}
     with (directory / f"{name}.log").open("wb") as log:
         process = subprocess.Popen(
             [*command, "bash", "-c", script, "boot", str(root), *places],
@@ -205,9 +214,9 @@ def _boot(directory: Path, name: str) -> Machine:
     return Machine(name, process, _first_child(process, directory / f"{name}.log"), cgroup)
 
 
-def _write_etc(etc: Path, name: str) -> None:
+def _write_etc(etc: Path, name: str, copied: tuple[str, ...]) -> None:
     etc.mkdir()
-    for one in COPIED:
+    for one in copied:
         source = Path("/etc") / one
         if source.is_dir():
             shutil.copytree(source, etc / one, symlinks=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,9 +22,9 @@ POLITE: Final = "import signal, sys\nsignal.signal(signal.SIGTERM, lambda *_: sy
 
 def install(machine: Machine) -> None:
     """What the guide tells a person to type, line by line; the checkout is set up already."""
-    commands = (CHECKOUT / "docs" / "guide.md").read_text().split("```\n")[1]
+    commands = (CHECKOUT / "docs" / "guide.md").read_text().split("```\n")[3]
     lines = [line for line in commands.splitlines() if line not in ("./run setup", ".venv/bin/failover check")]
-    typed = "\n".join(lines).replace("$PWD/.venv", sys.prefix).replace('"r1"', f'"{machine.name}"')
+    typed = "\n".join(lines).replace("$PWD/.venv", sys.prefix)
     machine.run("sh", "-ec", f"cd {CHECKOUT}\n{typed}")
 
 
@@ -50,6 +52,48 @@ def robot_with_users(directory: Path, **uids: int) -> Iterator[Machine]:
         machine.run("sed", "-i", 's/^#group = .*/group = "failover"/', "/etc/failover/agent.toml")
         yield machine
         print(machine.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
+
+
+ADDRESSES: Final = {"robot1": "10.9.0.1", "robot2": "10.9.0.2"}
+
+
+@contextmanager
+def two_robots(
+    directory: Path, install: Callable[[Machine], None], base: Path | None = None
+) -> Iterator[tuple[Machine, Machine]]:
+    """Two booted robots of one team, joined by a cable; they hear each other.
+
+    Args:
+        directory: for their roots and their boot logs.
+        install: brings failover to a machine.
+        base: their system, as `machines.booted` takes it.
+    """
+    with ExitStack() as stack:
+        first, second = (stack.enter_context(machines.booted(directory, name, base)) for name in ADDRESSES)
+        lay_cable(first, second)
+        for machine in (first, second):
+            install(machine)
+        make_team(first, **ADDRESSES)
+        shutil.copytree(first.root / "etc/failover/team", second.root / "etc/failover/team", dirs_exist_ok=True)
+        for machine in (first, second):
+            machine.run("systemctl", "enable", "--now", SERVICE)
+        robots.until(lambda: connected(first) and connected(second), "the robots to hear each other")
+        yield first, second
+
+
+def lay_cable(first: Machine, second: Machine) -> None:
+    ends = [["netns", str(machine.pid)] for machine in (first, second)]
+    command = ["ip", "link", "add", "wire", *ends[0], "type", "veth", "peer", "name", "wire", *ends[1]]
+    subprocess.run(command, check=True)
+    for machine in (first, second):
+        machine.run("ip", "address", "add", f"{ADDRESSES[machine.name]}/24", "dev", "wire")
+        machine.run("ip", "link", "set", "wire", "up")
+
+
+def connected(machine: Machine) -> bool:
+    """Whether it hears its peer, and could send it a snapshot."""
+    (peer,) = status(machine)["peers"]
+    return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
 
 
 def as_user(machine: Machine, user: str, *command: str) -> tuple[int, str]:

@@ -10,8 +10,8 @@ import pytest
 
 from tests.e2e import machines, robots
 from tests.e2e.machines import CHECKOUT, Machine
-from tests.e2e.service import SERVICE, component, control, counted
-from tests.e2e.test_systemd_power import ADDRESSES, SNAPSHOTS, USER, expect_it_to_go_on_at, pair
+from tests.e2e.service import ADDRESSES, SERVICE, component, control, counted
+from tests.e2e.test_systemd_power import SNAPSHOTS, USER, expect_it_to_go_on_at, pair
 
 pytestmark = [
     pytest.mark.root,

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from tests.e2e import machines, robots
 from tests.e2e.machines import Machine
-from tests.e2e.service import COUNT, POLITE, SERVICE, component, counted, install, make_team, started, status
+from tests.e2e.service import COUNT, POLITE, SERVICE, component, counted, install, started, two_robots
 
 pytestmark = [
     pytest.mark.root,
@@ -20,7 +17,6 @@ pytestmark = [
     pytest.mark.skipif(bool(machines.why_not()), reason=machines.why_not() or "-"),
 ]
 
-ADDRESSES = {"robot1": "10.9.0.1", "robot2": "10.9.0.2"}
 MORE = 20
 SNAPSHOTS = 5
 USER = "nobody"
@@ -30,33 +26,9 @@ USER = "nobody"
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[tuple[Machine, Machine]]:
     """Two robots of one team that hear each other."""
-    with ExitStack() as stack:
-        first, second = (stack.enter_context(machines.booted(tmp_path, name)) for name in ADDRESSES)
-        lay_cable(first, second)
-        for machine in (first, second):
-            install(machine)
-        make_team(first, **ADDRESSES)
-        shutil.copytree(first.root / "etc/failover/team", second.root / "etc/failover/team", dirs_exist_ok=True)
-        for machine in (first, second):
-            machine.run("systemctl", "start", SERVICE)
-        robots.until(lambda: connected(first) and connected(second), "the robots to hear each other")
+    with two_robots(tmp_path, install) as (first, second):
         yield first, second
         print(second.run("journalctl", "--unit", SERVICE, "--no-pager", "--lines=100", check=False).stdout)
-
-
-def lay_cable(first: Machine, second: Machine) -> None:
-    ends = [["netns", str(machine.pid)] for machine in (first, second)]
-    command = ["ip", "link", "add", "wire", *ends[0], "type", "veth", "peer", "name", "wire", *ends[1]]
-    subprocess.run(command, check=True)
-    for machine in (first, second):
-        machine.run("ip", "address", "add", f"{ADDRESSES[machine.name]}/24", "dev", "wire")
-        machine.run("ip", "link", "set", "wire", "up")
-
-
-def connected(machine: Machine) -> bool:
-    """Whether it hears its peer, and could send it a snapshot."""
-    (peer,) = status(machine)["peers"]
-    return bool(peer["state"] == "live" and peer["hears_us"] and peer["lane"] == "connected")
 
 
 def protected(machine: Machine, name: str, script: str = COUNT) -> None:
