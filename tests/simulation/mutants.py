@@ -545,7 +545,7 @@ CAUGHT_BY: dict[tuple[str, bool], tuple[int, int]] = {
     ("double_voting", VOTES): (AS_THE_SEED_SAYS, 22),
     ("no_margin", VOTES): (AS_THE_SEED_SAYS, 435),
     ("disloyal_voter", VOTES): (AS_THE_SEED_SAYS, 26),
-    ("anybody_may_have_it", VOTES): (AS_THE_SEED_SAYS, 132),
+    ("anybody_may_have_it", VOTES): (AS_THE_SEED_SAYS, 89),
     ("named_in_advance", VOTES): (LONG_LIFE, 37),
     ("best_lease_counts", VOTES): (AS_THE_SEED_SAYS, 32),
     ("lease_from_strangers", VOTES): (AS_THE_SEED_SAYS, 52),
