@@ -111,6 +111,7 @@ class BeatLane:
         self._collects: set[int] = set()
         self._uncounted: set[int] = set()
         self._casts: dict[str, int] = {}
+        self._joined: dict[int, int] = {}
         self.unsent = 0
 
     def fileno(self) -> int:
@@ -163,13 +164,7 @@ class BeatLane:
             for cast, host in ((Cast.MULTICAST, self._group), (Cast.BROADCAST, BROADCAST)):
                 if (cast, port) not in self._collecting:
                     self._collect(cast, host, port)
-            joined = self._collecting[Cast.MULTICAST, port]
-            membership = _MEMBERSHIP.pack(socket.inet_aton(self._group), everywhere, index)
-            try:
-                joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-            except OSError as error:
-                if error.errno != ALREADY_JOINED:
-                    raise
+            self._join(self._collecting[Cast.MULTICAST, port], place, index)
             link.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _MEMBERSHIP.pack(everywhere, everywhere, index))
             link.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
             link.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 0)
@@ -178,6 +173,23 @@ class BeatLane:
         except OSError as error:
             return f"the kernel refused to open the link to multicast: {error.strerror}"
         return ""
+
+    def _join(self, collecting: socket.socket, place: int, index: int) -> None:
+        """Join the group at that interface; leave it at the one that the link had before: a socket may be in 20 groups.
+
+        Source: /proc/sys/net/ipv4/igmp_max_memberships; an interface that has gone is still known by its number to be left.
+        """
+        group, everywhere = socket.inet_aton(self._group), bytes(4)
+        before = self._joined.pop(place, index)
+        if before != index and before not in self._joined.values():
+            with contextlib.suppress(OSError):
+                collecting.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, _MEMBERSHIP.pack(group, everywhere, before))
+        try:
+            collecting.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, _MEMBERSHIP.pack(group, everywhere, index))
+        except OSError as error:
+            if error.errno != ALREADY_JOINED:
+                raise
+        self._joined[place] = index
 
     def _collect(self, cast: Cast, host: str, port: int) -> None:
         """Open the socket at which this kind of datagram comes. What this robot cast itself is dropped by the kernel."""

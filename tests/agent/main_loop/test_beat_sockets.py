@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import select
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -83,3 +85,27 @@ def test_what_does_not_begin_as_a_beat_is_dropped_by_the_kernel_and_counted(work
     assert [frame for frame, *_ in theirs.receive()] == [longest] * 2
     assert theirs.dropped() == 2 * 5_004
     assert ours.dropped() == 0
+
+
+GOING_INTERFACES = """
+import subprocess
+from agent.main_loop.beat_sockets import BeatLane
+from failover.config.team import Robot
+lane = BeatLane(Robot(("127.0.0.1:7420",), "127.0.0.1:7421"), {}, "team")
+for index in range(10, 35):
+    subprocess.run(["ip", "link", "add", "cable", "index", str(index), "type", "veth"], check=True)
+    subprocess.run(["ip", "link", "set", "cable", "up"], check=True)
+    refusal = lane.open_to_casts(0, index)
+    assert not refusal, f"the {index - 9}th: {refusal}"
+    subprocess.run(["ip", "link", "delete", "cable"], check=True)
+"""
+
+
+@pytest.mark.root
+@pytest.mark.command("unshare")
+@pytest.mark.command("ip")
+def test_an_interface_that_goes_and_comes_back_many_times_is_joined_each_time() -> None:
+    """A socket may be in 20 groups: each interface that has gone would be one of them for ever."""
+    command = ["unshare", "--net", sys.executable, "-c", GOING_INTERFACES]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
