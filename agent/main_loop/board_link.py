@@ -98,10 +98,6 @@ class BoardLink:
         agents = Primaries.open(place) if (place / directory.AGENT_NAME).exists() else None
         return cls(own, peers, round_ns, agents)
 
-    def keep_pace(self, round_ns: int) -> None:
-        """Rounds last so long now: what counts as missed, and as old, follows."""
-        self._round_ns = round_ns
-
     # --- Out ---
 
     def due(self, round_: int, now_ns: int, medium: int = 0, since: int | None = None) -> list[Portion]:
@@ -227,14 +223,14 @@ class BoardLink:
             round_ns, worst_ns = peer.round_ns or self._round_ns, peer.worst_ns
             peer.items.bound(lambda period: bound_ns(period, period * round_ns, worst_ns, round_ns, 1))
 
-    def tell_states(self, now_ns: int, lease_ns: int, round_of: Callable[[str], int] | None = None) -> None:
+    def tell_states(self, now_ns: int, lease_ns: int, round_of: Callable[[str], int]) -> None:
         """Note of each robot whether it is there: heard in the last rounds, missed, or silent for a lease.
 
         Args:
             round_of: the longest round of a robot's frames, ns: one that is heard by radio only is heard more seldom.
         """
         for name, peer in self._peers.items():
-            peer.round_ns = round_of(name) if round_of is not None else self._round_ns
+            peer.round_ns = round_of(name)
             silent_ns = now_ns - self._skew_ns - peer.heard_ns
             state = layout.REMOVE if silent_ns < lease_ns else layout.NOT
             if silent_ns < REMOVE_ROUNDS * peer.round_ns:

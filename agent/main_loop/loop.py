@@ -421,8 +421,6 @@ class MainLoop:
                 self._frames.hear(peer, key)
             case LinksAre(links):
                 self._media.take(links, clock.now_ns())
-                if self._board is not None:
-                    self._board.keep_pace(self._media.round_ns)
             case Alive():
                 pass
             case _:

@@ -295,7 +295,7 @@ def test_states_of_robots_are_told(pair: tuple[Robot, Robot]) -> None:
     second.hears(first.says())
     now_ns = clock.now_ns()
     for silent_ns, state in ((0, "run"), (4 * ROUND_NS, "remove"), (20 * ROUND_NS, "not")):
-        second.link.tell_states(now_ns + silent_ns, 10 * ROUND_NS)
+        second.link.tell_states(now_ns + silent_ns, 10 * ROUND_NS, lambda _: ROUND_NS)
         assert second.program.robots()["robot1"].state == state
 
 
