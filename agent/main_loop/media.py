@@ -41,6 +41,9 @@ unicast. A lease is at least four."""
 HEARD_NS: Final = 1_000_000_000
 """A member of which a frame came in this time over a link could hear us there."""
 
+TRY_AGAIN_NS: Final = 60_000_000_000
+"""What the kernel refused when a link was opened to casts is tried again after a minute: memory or descriptors were short."""
+
 CAST_MEMBERS_MIN: Final = 2
 """For one receiver a cast saves nothing."""
 
@@ -61,6 +64,7 @@ class Link(Struct):
         by_unicast: the members that got the last frame by unicast besides.
         sent_ns: when the last frame without a slot left.
         turned: round of the board that the last frame in a slot told of.
+        try_again_ns: when the kernel is asked again to open it to casts; 0: it did not refuse.
     """
 
     place: int
@@ -76,6 +80,7 @@ class Link(Struct):
     by_unicast: tuple[str, ...] = ()
     sent_ns: int = 0
     turned: int = 0
+    try_again_ns: int = 0
 
     @property
     def number(self) -> int:
@@ -129,7 +134,8 @@ class Media:
         elif not has_slots:
             link.slots = link.lane = None
         link.period_ns = config.t_tup_ms * MS if has_slots else self._beat_ns
-        link.why = self._hindrance(link, config)
+        link.try_again_ns = 0
+        link.why = self._hindrance(link, config, now_ns)
         link.casting = None if link.why else Casting(Cast(config.cast))
         self._forget_proofs(link)
         if link.casting is not None:
@@ -153,7 +159,7 @@ class Media:
             )
         return ""
 
-    def _hindrance(self, link: Link, config: MediumConfig) -> str:
+    def _hindrance(self, link: Link, config: MediumConfig, now_ns: int) -> str:
         """Why nothing is cast over this link; "" if it is."""
         if not link.now.name:
             return "no interface has its address now"
@@ -172,6 +178,7 @@ class Media:
             return f"fewer than {CAST_MEMBERS_MIN} members listen at its port over IPv4"
         if cast is Cast.AUTO and link.now.is_wireless and link.slots is None:
             return RADIO_UNICAST
+        link.try_again_ns = now_ns + TRY_AGAIN_NS if refusal else 0
         return refusal
 
     # --- What is heard ---
@@ -256,6 +263,9 @@ class Media:
         Args:
             patience_ns: by how much longer than usual members may take to say what they heard: they rest.
         """
+        for link in self._links:
+            if 0 < link.try_again_ns <= now_ns:
+                self._set_up(link, now_ns)
         links = [link for link in self._links if self._goes_at_once(link, now_ns)]
         if not links:
             return 0

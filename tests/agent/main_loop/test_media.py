@@ -9,7 +9,7 @@ import pytest
 
 from agent.config import Config, MediumConfig, Settings
 from agent.main_loop.beat_sockets import BeatLane
-from agent.main_loop.media import HEARD_NS, Media
+from agent.main_loop.media import HEARD_NS, TRY_AGAIN_NS, Media
 from agent.main_loop.messages import LinkNow
 from agent.system import clock
 from failover.config.team import Robot, Team
@@ -118,3 +118,21 @@ def test_the_round_of_a_member_is_that_of_the_fastest_link_over_which_it_is_hear
     assert [both.round_of(peer, now_ns) for peer in ("robot2", "robot3")] == [longest_ns, 20_000_000]
     assert both.round_of("robot3", now_ns + HEARD_NS // 2) == longest_ns
     assert both.round_of("robot3", now_ns + 2 * HEARD_NS) == both.round_ns == 20_000_000
+
+
+def test_what_the_kernel_refused_is_tried_again_after_a_minute(media: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the links do not change nothing else would."""
+    refusals = ["the kernel refused to open the link to multicast: Cannot allocate memory"]
+    monkeypatch.setattr(BeatLane, "open_to_casts", lambda *_: refusals[-1])
+    monkeypatch.setattr(BeatLane, "reached", lambda *_: ("robot2", "robot3"))
+    monkeypatch.setattr(BeatLane, "cast", lambda *_: "")
+    one = media("cable0", slots=())
+    (link,), began_ns = one._links, clock.now_ns()
+    assert link.casting is None and link.why == refusals[0]
+    refusals.append("")
+    one.send(None, (), began_ns + TRY_AGAIN_NS // 2, 1)
+    assert link.casting is None
+    one.send(None, (), began_ns + TRY_AGAIN_NS, 2)
+    assert link.casting is not None and link.casting.now is Cast.MULTICAST
+    one.send(None, (), began_ns + 3 * TRY_AGAIN_NS, 3)
+    assert link.try_again_ns == 0
