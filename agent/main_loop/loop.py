@@ -476,6 +476,8 @@ class MainLoop:
         """
         now_ns = clock.now_ns()
         self._beat = beat
+        if self._node is not None and self._media.all_wait(now_ns):
+            self._node.waits(beat)
         if self._board is None or now_ns - self._round_ns <= self._outbox.beat_ns // 2 or not self._media.paces(now_ns):
             self._send_frame(beat, (), now_ns)
             return
@@ -519,6 +521,8 @@ class MainLoop:
         self._hear()
         for link in self._media.due():
             self._send_in_slot(link, self._beat)
+            if self._node is not None:
+                self._node.waits(None)
 
     def _send_in_slot(self, link: Link, beat: Beat) -> None:
         """The newest beat, and the items whose round was since the last slot here."""

@@ -234,6 +234,10 @@ class Media:
     def _longest_ns(self, link: Link) -> int:
         return self._beat_ns if link.slots is None else effective_round_ns(link.period_ns, max(len(self._roster), 2))
 
+    def all_wait(self, now_ns: int) -> bool:
+        """Whether a heartbeat leaves over no link now: it waits for a slot, and a newer one may take its place."""
+        return not self.at_once and not any(self._goes_at_once(link, now_ns) for link in self._links)
+
     def is_first(self, link: Link) -> bool:
         """Whether this is the first link on which this robot has a slot: the pace of the board where all links have slots."""
         return link is next((one for one in self._slotted if one.has_slot), None)

@@ -113,6 +113,13 @@ class Speaker:
             self._rule,
         )
 
+    def unsaid(self, beat: Beat) -> None:
+        """That beat leaves over no link: what no later one has said is said first in the next one."""
+        for entry in beat.entries:
+            said = self._said.get(entry.name)
+            if said is not None and said[1] == beat.counter:
+                self._said[entry.name] = (said[0], 0)
+
     def _fitting(self, entries: list[Entry], empty: Beat) -> tuple[Entry, ...]:
         room = self._size_max - beat_size(empty) - BEAT_OVERHEAD
         chosen: list[Entry] = []

@@ -100,6 +100,7 @@ class Node:
         self._found = {one.component: one for one in found}
         self._begun = False
         self._load = 0
+        self._waiting: Beat | None = None
         self._promise = ""
         self._grounds: tuple[tuple[str, ...], tuple[str, ...]] | None = None
         self._configure(held)
@@ -148,6 +149,10 @@ class Node:
             if echo.robot == me and (echo.boot, abs(echo.counter)) > ours and echo.boot < LIVES_MAX:
                 return echo.boot
         return 0
+
+    def waits(self, beat: Beat | None) -> None:
+        """The newest beat waits for a slot on each link; None: it is on its way. One that waits when the next is made is lost."""
+        self._waiting = beat
 
     def rests(self, now_ns: int) -> bool:
         """Nothing runs or waits anywhere, as far as we know, and no member is missing: what peers say may wait a little."""
@@ -290,6 +295,9 @@ class Node:
             self._next_beat_ns = min(self._next_beat_ns, self._last_beat_ns + URGENT_GAP_NS)
         if turn.now_ns < self._next_beat_ns:
             return ()
+        if self._waiting is not None:
+            self._speaker.unsaid(self._waiting)
+            self._waiting = None
         beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns))
         self._load = beat.load
         self._team.asked(beat.counter, turn.now_ns)

@@ -370,3 +370,16 @@ def test_a_component_that_resumes_says_what_was_lost_and_not_how_long_it_did_not
     assert told.endswith(f"; it lost {lost_s} s of its work")
     notes = node.status(9_001 * MS).components[0].notes
     assert ("it resumed at robot1 from its last checkpoint and lost 8.1 s of its work" in notes) == (lost_ns < 0)
+
+
+def test_what_a_heartbeat_said_that_never_left_is_said_in_the_next_one() -> None:
+    """More components than fit one heartbeat, and every second heartbeat is replaced before its slot."""
+    specs = [replace(SPEC, name=f"/lab/robot1/component-with-a-long-name-{number:02}") for number in range(40)]
+    node, told = Node(ALONE, 1, VoteRecord(), 0), set[str]()
+    for spec in specs:
+        running(node, spec)
+    for turn in range(1, 20):
+        (beat,) = node.step(Tick(), turn * 100 * MS).send
+        node.waits(None if turn % 2 else beat)
+        told.update(entry.name for entry in beat.entries if turn % 2)
+    assert told == {spec.name for spec in specs}
