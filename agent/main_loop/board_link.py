@@ -208,7 +208,7 @@ class BoardLink:
         if items and items[0].number >= RESERVED:
             items = self._announcements.take(part.sender, items)
         if items:
-            peer.items.take(items, came_ns, way_bound_us(heard.way_ns), part.round)
+            peer.items.take(items, came_ns, way_bound_us(heard.way_ns), part.round, heard.missing)
         self._note_frame(peer, heard.way_ns, came_ns)
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:

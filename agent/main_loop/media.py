@@ -264,6 +264,8 @@ class Media:
     def send(self, beat: Beat | None, items: Sequence[Portion], now_ns: int, round_: int, *, patience_ns: int = 0) -> int:
         """One frame at once, over each link where none waits for a slot; how many of the items are in it.
 
+        On a medium with slots it counts among the frames of that medium: a member that hears no other one misses none of others.
+
         Args:
             patience_ns: by how much longer than usual members may take to say what they heard: they rest.
         """
@@ -273,12 +275,15 @@ class Media:
         links = [link for link in self._links if self._goes_at_once(link, now_ns)]
         if not links:
             return 0
-        lane = self._lanes.lane(0)
-        made, placed = lane.seal(beat, items, now_ns, round_=round_)
+        made: dict[int, tuple[list[Sealed], int]] = {}
         for link in links:
+            lane = self._lanes.lane(0) if link.lane is None else link.lane
+            medium = 0 if link.lane is None else link.number
+            if medium not in made:
+                made[medium] = lane.seal(beat, items, now_ns, round_=round_)
             link.sent_ns = now_ns
-            self._deliver(link, lane, made, now_ns, self._beat_ns, patience_ns)
-        return placed
+            self._deliver(link, lane, made[medium][0], now_ns, self._beat_ns, patience_ns)
+        return made[min(made)][1]
 
     def _goes_at_once(self, link: Link, now_ns: int) -> bool:
         """On a medium with slots a robot without one speaks as seldom as those that have one."""

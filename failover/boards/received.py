@@ -35,8 +35,8 @@ GROWTH: Final = 64 << 10
 _GENERATION: Final = layout.GENERATION_AT // 8
 _CHANGED: Final = layout.CHANGED_AT // 8
 
-Take = Callable[[Portion, int, int, int], bool | None]
-"""``(item, came_ns, error_us, round)`` → whether it was put; None: it does not fit."""
+Take = Callable[[Portion, int, int, int, int], bool | None]
+"""``(item, came_ns, error_us, round, missing)`` → whether it was put; None: it does not fit."""
 
 
 class ReceivedItems:
@@ -79,14 +79,16 @@ class ReceivedItems:
         """Whether the robot is there: `layout.NOT` … `layout.REMOVE`."""
         self.file.set_word32(layout.STATE_AT, state)
 
-    def take(self, items: Iterable[Portion], came_ns: int, error_us: int, round_: int) -> int:
+    def take(self, items: Iterable[Portion], came_ns: int, error_us: int, round_: int, missing: int = 0) -> int:
         """Put what a frame brought.
 
         Args:
             items: whole values, with their ages when the frame left.
             came_ns: when the frame came; BOOTTIME.
             error_us: how much older the values may be than these two say; `NO_ERROR_BOUND`: not known.
-            round_: of the sender; frames with an item that were missed since the last one are counted by it.
+            round_: of the sender; ``missing``: frames of it that did not come over the medium of this one since the last one
+                there. An item was in as many of them as its turns fell into the rounds between: rounds of which this medium
+                carries no frame lose none.
 
         Returns:
             How many were put. The others are not known here, do not fit, or are not newer than what is there.
@@ -99,7 +101,7 @@ class ReceivedItems:
             if take is None:
                 self.dropped[UNKNOWN] += 1
                 continue
-            is_put = take(item, came_ns, error_us, round_)
+            is_put = take(item, came_ns, error_us, round_, missing)
             if is_put:
                 puts += 1
             elif is_put is None:
@@ -194,14 +196,14 @@ def _taker(file: MappedFile, record: Record) -> Take:
     period, banks, last_number, last_round = record.period, record.banks, 0, -1
     following, count = words[place.newest] + 1, words[frames]
 
-    def take(item: Portion, came_ns: int, error_us: int, round_: int) -> bool | None:
+    def take(item: Portion, came_ns: int, error_us: int, round_: int, missing: int) -> bool | None:
         nonlocal following, last_number, last_round, count
         words[frames] = count = count + 1
         age_us, number, value = item.age_us, item.put, item.value
         error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
         words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error
-        if 0 <= last_round < round_ - period:
-            words[lost] += (round_ - last_round) // period - 1
+        if missing and 0 <= last_round < round_ - period:
+            words[lost] += min((round_ - last_round) // period - 1, missing)
         last_round = round_
         if not least <= len(value) <= limit:
             words[refused] += 1

@@ -52,11 +52,13 @@ class Heard(Struct, frozen=True, gc=False):
     Attributes:
         items: of its items those that are whole now.
         way_ns: the longest that it can have been on its way; None: not known.
+        missing: parts of its sender that did not come over this medium since the newest one before it.
     """
 
     part: Part
     items: Sequence[Portion]
     way_ns: int | None
+    missing: int = 0
 
 
 class _Peer(Struct):
@@ -188,10 +190,12 @@ class FrameLane:
         if part.boot > peer.boot:
             peer = self._peers[part.rank] = _Peer(ClockOffset(), part.boot)
             self.assembly.forget(part.sender)
+        missing = 0
         if part.counter > peer.counter:
+            missing = part.counter - peer.counter - 1 if peer.counter else 0
             peer.counter, peer.came_ns = part.counter, came_ns
         way_ns = self._way_ns(peer, part, came_ns)
-        return Heard(part, self._whole(part), way_ns)
+        return Heard(part, self._whole(part), way_ns, missing)
 
     def _whole(self, part: Part) -> Sequence[Portion]:
         for item in part.items:

@@ -66,6 +66,31 @@ def test_a_robot_without_any_slot_paces_its_board_by_the_frames_that_leave_witho
     assert not both.paces(now_ns + ROUND_NS), "its slot does"
 
 
+def test_a_heartbeat_waits_where_no_link_takes_it_at_once(media: Make) -> None:
+    both = media("radio0", "radio1", slots=("radio0", "radio1"))
+    now_ns = clock.now_ns()
+    own(both, Own.RUNNING, Own.RUNNING)
+    assert both.all_wait(now_ns)
+    own(both, Own.RUNNING, Own.LISTENING)
+    assert not both.all_wait(now_ns)
+    both.send(None, (), now_ns, 1)
+    assert both.all_wait(now_ns + ROUND_NS // 5), "a robot that listens speaks once in a round"
+    cable = media("radio0", "cable0", slots=("radio0",))
+    own(cable, Own.RUNNING)
+    assert not cable.all_wait(now_ns)
+
+
+def test_what_leaves_over_a_medium_with_slots_counts_among_its_frames_also_without_a_slot(media: Make) -> None:
+    """A member that hears that medium only would count the frames of the others as lost."""
+    both = media("radio0", "cable0", slots=("radio0",))
+    own(both, Own.LISTENING)
+    now_ns = clock.now_ns()
+    for passed in range(10):
+        both.send(None, (), now_ns + passed * ROUND_NS // 2, passed)
+    radio, cable = both._lanes.lane(1).counter, both._lanes.lane(0).counter
+    assert (radio, cable) == (5, 10)
+
+
 def test_the_first_link_on_which_a_robot_has_a_slot_paces_its_board(media: Make) -> None:
     both = media("radio0", "radio1", slots=("radio0", "radio1"))
     for states, first in (

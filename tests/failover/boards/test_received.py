@@ -24,9 +24,9 @@ def now() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def put(received: ReceivedItems, item: int, number: int, value: bytes, round_: int = 0) -> bool:
+def put(received: ReceivedItems, item: int, number: int, value: bytes, round_: int = 0, missing: int = 0) -> bool:
     """As a frame that comes now brings it."""
-    return bool(received.take([Portion(item, 0, number, value)], now(), 0, round_))
+    return bool(received.take([Portion(item, 0, number, value)], now(), 0, round_, missing))
 
 
 def test_a_frame_brings_a_value_with_its_age_and_an_upper_bound(place: Path) -> None:
@@ -107,15 +107,31 @@ def test_puts_that_no_frame_carried_do_not_overwrite_the_bank_that_is_read(place
         assert places == {0, 1}
 
 
+def counts(received: ReceivedItems) -> list[int]:
+    """Frames with the only item, and how many were lost."""
+    (record,) = received.file.records()
+    return [received.file.words[(record.at + field) // 8] for field in (layout.FRAMES_FIELD, layout.LOST_FIELD)]
+
+
 def test_frames_that_were_missed_are_counted_by_the_senders_rounds(place: Path) -> None:
     with failover.board() as board:
         item = Item("ball", {"x": "f8"}, period=2)
         board.add(item)
         received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: item}))
-        for number, round_ in enumerate((2, 4, 10, 12, 11), 1):
-            put(received, 7, number, ONE, round_)
-        (record,) = received.file.records()
-        assert [received.file.words[(record.at + field) // 8] for field in (layout.FRAMES_FIELD, layout.LOST_FIELD)] == [5, 2]
+        for number, (round_, missing) in enumerate(((2, 0), (4, 0), (10, 5), (12, 1), (11, 0)), 1):
+            put(received, 7, number, ONE, round_, missing)
+        assert counts(received) == [5, 2]
+
+
+def test_rounds_of_which_a_medium_carries_no_frame_lose_none(place: Path) -> None:
+    """The sender has a cable, too, and begins a round each 20 ms; this robot hears its slots, each 50 ms."""
+    with failover.board() as board:
+        item = Item("ball", {"x": "f8"})
+        board.add(item)
+        received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={7: item}))
+        for number, (round_, missing) in enumerate(((3, 0), (5, 0), (8, 0), (10, 0), (15, 1)), 1):
+            put(received, 7, number, ONE, round_, missing)
+        assert counts(received) == [5, 1]
 
 
 def test_a_robot_that_began_another_life_counts_from_any_number(place: Path) -> None:
