@@ -6,8 +6,9 @@ anything into `own`; every size is checked before it is believed, and nothing of
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -178,9 +179,11 @@ class BoardLink:
         """These are on their way over this medium: what is urgent of them need not go there again."""
         self._gone.update(((medium, portion.number), portion.put) for portion in portions)
 
-    def _portions(self, newest: Iterable[tuple[Record, int]], now_ns: int) -> list[Portion]:
+    def _portions(self, newest: Sequence[tuple[Record, int]], now_ns: int) -> list[Portion]:
         """Of items with the numbers of their newest puts."""
         found, left_ns, get = [], now_ns - self._skew_ns, self._own.get
+        with contextlib.suppress(OSError):  # told for each item below
+            self._own.read_ahead(newest)
         for record, number in newest:
             try:
                 bank = get(record, number)

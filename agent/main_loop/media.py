@@ -228,6 +228,8 @@ class Media:
 
     def round_of(self, peer: str, now_ns: int) -> int:
         """The longest round of a member's frames, ns: of the fastest link over which one came lately; `round_ns` if over none."""
+        if not self._slotted:
+            return self._beat_ns
         lately = [link for link in self._links if now_ns - link.heard_ns.get(peer, -HEARD_NS) < HEARD_NS]
         return min((self._longest_ns(link) for link in lately), default=self.round_ns)
 

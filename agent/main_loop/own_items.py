@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from failover.boards.mapping import MappedFile
@@ -21,8 +22,13 @@ from failover.errors import BoardError, OvertakenError
 LOOK_NS: Final = 100_000_000
 """Between two looks at a table that changes: a program that changes it all the time costs the loop no more."""
 
+NEAR: Final = 64 << 10
+"""Items whose banks lie within so many bytes are read at once."""
+
 _BANK: Final = struct.Struct("<QQQII")
 """Number, stamp, sum, size, error."""
+
+_NUMBER: Final = struct.Struct("<Q")
 
 
 class OwnItems:
@@ -76,6 +82,34 @@ class OwnItems:
         if len(table) < self._table_size:
             raise BoardError(f"{self._file.path}: the file was made shorter")
         return table
+
+    def read_ahead(self, newest: Sequence[tuple[Record, int]]) -> None:
+        """Read the newest puts of several items with two calls, not two for each: `get` has those that were whole.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        known, fresh = self._known, []
+        first, end = sys.maxsize, 0
+        for record, number in newest:
+            before = known.get(record.id)
+            if number and (before is None or before.number != number):
+                at = record.offset + number % record.banks * record.stride
+                fresh.append((record, number, at))
+                first, end = min(first, at), max(end, at + layout.BANK_HEAD + record.size)
+        if len(fresh) < 2 or end - first > NEAR:
+            return
+        content, again = (os.pread(self._descriptor, end - first, first) for _ in range(2))
+        if len(content) < end - first or len(again) < end - first:
+            return
+        for record, number, at in fresh:
+            begin = at - first
+            came, stamp_ns, total, size, error_us = _BANK.unpack_from(content, begin)
+            if came != number or size > record.size or _NUMBER.unpack_from(again, begin)[0] != number:
+                continue
+            value = content[begin + layout.BANK_HEAD : begin + layout.BANK_HEAD + size]
+            if total in (0, sum_of(value, stamp_ns, number)):
+                known[record.id] = Found(value, stamp_ns, error_us, number)
 
     def get(self, record: Record, number: int) -> Found | None:
         """The newest put of an item, whole; None before the first. A put that was read before is not read again.

@@ -64,8 +64,10 @@ def entry_of(component: Component) -> Entry:
 
 def urgent(entry: Entry, before: Entry | None) -> bool:
     """Whether others wait for this change: everything but a primary's own progress."""
+    if entry == before:
+        return False
     if before is None or STATES[entry.state] in (State.STANDBY, State.ABSENT, State.HANDING_OVER):
-        return entry != before
+        return True
     return _essence(entry) != _essence(before) or entry.yields_to != before.yields_to
 
 

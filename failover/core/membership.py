@@ -178,7 +178,8 @@ class Membership:
         news = peer.take(beat, self._own, link, now_ns, self._rule)
         self._count_loyalty(peer)
         if (peer.echoed, peer.heard_us) != before:
-            peer.asked_ns, peer.heard_us_ns = self._left_ns(peer.echoed), self._left_ns(peer.heard_us)
+            peer.asked_ns = self._left_ns(peer.echoed)
+            peer.heard_us_ns = peer.asked_ns if peer.heard_us == peer.echoed else self._left_ns(peer.heard_us)
         return news
 
     def _time(self, peer: Peer, beat: Beat, now_ns: int) -> None:
@@ -245,10 +246,6 @@ class Membership:
             if until_ns > now_ns and (first_ns is None or until_ns < first_ns):
                 first_ns = until_ns
         return first_ns
-
-    def all_dead(self, now_ns: int) -> list[str]:
-        """Every peer that is dead."""
-        return [peer.robot for peer in self.peers.values() if peer.loyal_until_ns <= now_ns]
 
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""
@@ -338,7 +335,7 @@ class Membership:
 
     def living(self, now_ns: int) -> tuple[Peer, ...]:
         """The peers that are alive."""
-        return tuple(peer for peer in self.peers.values() if self.alive(peer.robot, now_ns))
+        return tuple([peer for peer in self.peers.values() if peer.boot > 0 and now_ns < peer.loyal_until_ns])
 
     def lease_ns(self, robot: str) -> int:
         """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease."""

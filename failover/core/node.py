@@ -135,6 +135,8 @@ class Node:
         It is a lie where at least as many others have heard this life of ours.
         """
         life = self._life_told(beat)
+        if not life and not self._outlivers:
+            return 0
         self._outlivers.discard(beat.sender)
         if life and beat.sender in self._team.peers:
             self._outlivers.add(beat.sender)
@@ -262,8 +264,10 @@ class Node:
     def _hear(self, event: Received, turn: Turn) -> list[Component]:
         beat, refused = self._testimony.take(event.beat, turn, self._components)
         news = self._team.hear(beat, event.link, event.came_ns or turn.now_ns)
-        if beat.sender in self._team.peers:
+        if event.copies and beat.sender in self._team.peers:
             self._team.peers[beat.sender].carried(event.copies)
+        if not news and not self._components:
+            return []
         rules = votes if self._config.by_majority else pair
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:

@@ -48,20 +48,27 @@ class ClockOffset(Struct):
         bound = came_ns - left_ns - _drift(came_ns)
         self._ceiling_ns = bound if self._ceiling_ns is None else min(self._ceiling_ns, bound)
 
-    def echoed(self, ours_left_ns: int, left_ns: int, hold_ns: int, came_ns: int) -> None:
-        """That frame echoes ours, which left at ``ours_left_ns`` of our clock; the peer had held it for ``hold_ns``."""
+    def echoed(self, ours_left_ns: int, left_ns: int, hold_ns: int, came_ns: int) -> int | None:
+        """That frame echoes ours, which left at ``ours_left_ns`` of our clock; the peer had held it for ``hold_ns``.
+
+        Returns:
+            `most_ns` of that frame.
+        """
         bound = ours_left_ns - (left_ns - hold_ns) - RESOLUTION_NS + _drift(ours_left_ns)
         self._floor_ns = bound if self._floor_ns is None else max(self._floor_ns, bound)
-        if self.most_ns(left_ns, came_ns) is None:
+        most_ns = self.most_ns(left_ns, came_ns)
+        if most_ns is None:
             self.contradicted += 1
             self._floor_ns, self._ceiling_ns = bound, came_ns - left_ns - _drift(came_ns)
+            return self.most_ns(left_ns, came_ns)
+        return most_ns
 
     def most_ns(self, left_ns: int, came_ns: int) -> int | None:
         """The longest that a frame can have been on its way; None before the first echo, and where clocks contradict it."""
         if self._floor_ns is None:
             return None
-        way_ns = came_ns - left_ns - self._floor_ns + _drift(came_ns)
-        return way_ns + 2 * _drift(way_ns) if way_ns >= 0 else None
+        way_ns = came_ns - left_ns - self._floor_ns + came_ns * DRIFT_PPM // MILLION
+        return way_ns + 2 * (way_ns * DRIFT_PPM // MILLION) if way_ns >= 0 else None
 
     def between(self, now_ns: int) -> tuple[int, int] | None:
         """θ lies between these two; None before the first echo. For people and for messages, never for a rule."""

@@ -326,8 +326,7 @@ class Sealer:
             header = HEADER.pack(
                 MAGIC, VERSION, last, rank, medium, tag, roster, name, boot, counter, round_, part, count, places
             )
-            digest = _digest(header, body)
-            sealed.append(b"".join((header, *[_authenticator(digest, key) if key else _NO_SEAL for key in keys], body)))
+            sealed.append(b"".join((header, *_seals(_digest(header, body), keys), body)))
         return sealed
 
 
@@ -351,11 +350,18 @@ def _prepared(key: bytes) -> tuple[bytes, blake2b]:
     return number, blake2b(digest_size=CODE_SIZE, key=key[:64], person=_PERSON)
 
 
-def _authenticator(digest: bytes, key: bytes) -> bytes:
-    number, keyed = _prepared(key)
-    code = keyed.copy()
-    code.update(digest)
-    return number + code.digest()
+def _seals(digest: bytes, keys: Sequence[bytes]) -> list[bytes]:
+    """The authenticator of each receiver, as one or two pieces."""
+    seals = []
+    for key in keys:
+        if not key:
+            seals.append(_NO_SEAL)
+            continue
+        number, keyed = _prepared(key)
+        code = keyed.copy()
+        code.update(digest)
+        seals += (number, code.digest())
+    return seals
 
 
 # --- Opening ---------------------------------------------------------------------------------------------------------
@@ -508,12 +514,14 @@ def _check(datagram: bytes, body: bytes, places: range, keys: Sequence[bytes]) -
     """Whether one of the authenticators is ours and right."""
     digest = b""
     for key in keys:
-        number = _prepared(key)[0]
+        number, keyed = _prepared(key)
         for place in places:
             at = HEADER.size + SEAL_SIZE * place
             if datagram.startswith(number, at):
                 digest = digest or _digest(datagram[: HEADER.size], body)
-                if hmac.compare_digest(datagram[at : at + SEAL_SIZE], _authenticator(digest, key)):
+                code = keyed.copy()
+                code.update(digest)
+                if hmac.compare_digest(datagram[at + NUMBER_SIZE : at + SEAL_SIZE], code.digest()):
                     return None
     return Reason.FORGED if digest else Reason.UNKNOWN_KEY
 
@@ -525,9 +533,7 @@ def _is_unsealed(datagram: bytes, places: range) -> bool:
 
 def _is_sound(beat: Beat | None, items: Sequence[Portion], boot: int, counter: int) -> bool:
     """Whether the numbers lie in the ranges that ``FRAME.md`` gives."""
-    return (
-        0 < boot < NUMBER_MAX
-        and 0 < counter < NUMBER_MAX
-        and (beat is None or (beat.boot == boot and is_sound(beat)))
-        and all(item.is_sound for item in items if item.total or item.offset)
-    )
+    for item in items:
+        if (item.total or item.offset) and not item.is_sound:
+            return False
+    return 0 < boot < NUMBER_MAX and 0 < counter < NUMBER_MAX and (beat is None or (beat.boot == boot and is_sound(beat)))

@@ -219,7 +219,7 @@ class FrameLane:
             ours = self._rank
             for rank, counter, hold_us in part.slots.echo:
                 if rank == ours and counter in self._left and hold_us >= 0:
-                    peer.offset.echoed(self._left[counter], left_ns, hold_us * US, came_ns)
+                    return peer.offset.echoed(self._left[counter], left_ns, hold_us * US, came_ns)
         return peer.offset.most_ns(left_ns, came_ns)
 
     def _echo(self, now_ns: int) -> tuple[tuple[int, int, int], ...]:

@@ -70,7 +70,7 @@ class FrameLanes:
 
     def open(self, datagram: bytes, came_ns: int) -> Heard | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes."""
-        medium = medium_of(datagram)
+        medium = int.from_bytes(datagram[_MEDIUM], "little")
         lane = self._lanes.get(medium)
         if lane is None:
             if medium > MEDIA_MAX:

@@ -38,9 +38,10 @@ class Watch(Struct):
         if self._stalled_ns:
             late_ms = self._stalled_ns // MS
             turn.say_of_robot(f"{turn.me} itself stood still for {late_ms} ms; that is not counted as its peers' silence")
-        for robot in turn.team.all_dead(turn.now_ns):
-            if robot not in self._dead:
-                self._dead.add(robot)
+        now_ns, dead = turn.now_ns, self._dead
+        for robot, peer in turn.team.peers.items():
+            if peer.loyal_until_ns <= now_ns and robot not in dead:
+                dead.add(robot)
                 turn.say_of_robot(_farewell(turn, robot))
         if isinstance(event, Received) and event.beat.sender in turn.team.peers:
             self._greet(turn, event)

@@ -61,7 +61,7 @@ def is_sound(beat: Beat) -> bool:
         and beat.counter < NUMBER_MAX
         and 0 <= beat.settled <= beat.counter > 0
         and beat.total >= 0
-        and all(_sound_entry(entry) for entry in beat.entries)
+        and (not beat.entries or all(_sound_entry(entry) for entry in beat.entries))
     )
 
 

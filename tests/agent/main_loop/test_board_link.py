@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import shutil
+import struct
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from agent.main_loop import board_link, urgent_items
@@ -121,6 +123,34 @@ def test_what_one_robot_puts_the_other_gets(pair: tuple[Robot, Robot]) -> None:
         second.program.item("map").get("robot1")
     with pytest.raises(NeverWrittenError):
         first.program.item("ball").get("robot2")
+
+
+def test_an_item_that_is_put_while_several_are_read_together_is_read_again_by_itself(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two puts come in the middle of the copy, so that it has the beginning of one value and the end of another."""
+    first, _ = pair
+    balls, maps = first.program.item("ball"), first.program.item("map")
+    balls.put({"x": 1.0, "y": 1.0})
+    maps.put([1] * 900)
+    own, pread, reads = first.link._own, os.pread, []
+
+    def slow(descriptor: int, size: int, at: int) -> bytes:
+        reads.append(size)
+        if len(reads) > 1:
+            return pread(descriptor, size, at)
+        begin = pread(descriptor, size - 500, at)
+        for number in (2, 3):
+            maps.put([number] * 900)
+        return begin + pread(descriptor, 500, at + size - 500)
+
+    own.look(clock.now_ns())
+    newest = [(record, 1) for record in own.records.values() if record.name in ("ball", "map")]
+    monkeypatch.setattr(os, "pread", slow)
+    own.read_ahead(newest)
+    assert len(reads) == 2 and [(one.number, one.value) for one in own._known.values()] == [(1, struct.pack("<2f", 1, 1))]
+    found = {record.name: own.get(record, number) for record, number in newest}
+    assert found["map"] is not None and msgspec.msgpack.decode(found["map"].value) == [3] * 900
 
 
 def test_before_a_round_trip_the_age_has_no_upper_bound_and_after_it_it_has(pair: tuple[Robot, Robot]) -> None:
