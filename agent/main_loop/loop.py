@@ -15,7 +15,7 @@ import select
 import signal
 import socket
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -80,6 +80,9 @@ WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 WORKER_LOOK_NS: Final = NANOSECONDS_A_SECOND
 """Between two looks at a worker that says nothing: longer than between two signs of life, which one that works gives."""
 
+TURNS_NS: Final = NANOSECONDS_A_SECOND // 20
+"""Turns within this time count as one: it is the sum that tells of a worker's silence."""
+
 WORKER_BIRTH_NS: Final = 30 * NANOSECONDS_A_SECOND
 """The same before its first word: an interpreter starts."""
 
@@ -135,6 +138,7 @@ class MainLoop:
         self._persister = VoteRecordWriter(lambda wanted: record_file.keep(core_vote_record.encode(wanted)))
         self._event_log = EventLogWriter(Path(settings.config.state_directory), self._me, record_file.record.boot)
         self._poll = select.epoll()
+        self._inputs: dict[int, Callable[[], None]] = {}
         self._alarm = timers.Alarm()
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
@@ -185,8 +189,10 @@ class MainLoop:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
-        for descriptor in (self._beats.fileno(), self._persister.fileno(), self._wake.fileno(), self._alarm.fileno()):
-            self._poll.register(descriptor, select.EPOLLIN)
+        self._attend(self._beats.fileno(), self._hear)
+        self._attend(self._persister.fileno(), self._note_persisted)
+        self._attend(self._wake.fileno(), self._end_soon)
+        self._poll.register(self._alarm.fileno(), select.EPOLLIN)
         gc.collect()
         syscalls.give_back()  # before memory is locked: then it would stay
         if self._settings.config.realtime:
@@ -194,6 +200,18 @@ class MainLoop:
         self._start_worker()  # told what was refused
         gc.freeze()
         gc.disable()  # what a turn makes is freed by reference counts; a collection would be a pause of milliseconds
+
+    def _attend(self, descriptor: int, input_: Callable[[], None]) -> None:
+        """Call that whenever the descriptor is readable."""
+        self._poll.register(descriptor, select.EPOLLIN)
+        self._inputs[descriptor] = input_
+
+    def _neglect(self, descriptor: int) -> None:
+        self._poll.unregister(descriptor)
+        del self._inputs[descriptor]
+
+    def _end_soon(self) -> None:
+        self._ending = True
 
     def _open_board(self) -> None:
         """Map the board that the worker has made; a robot without its board still protects its programs."""
@@ -208,11 +226,11 @@ class MainLoop:
         except (FailoverError, OSError) as error:
             log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
-        self._poll.register(self._board.wakes.fileno(), select.EPOLLIN)
+        self._attend(self._board.wakes.fileno(), self._note_urgent)
 
     def _close_board(self) -> None:
         if self._board is not None:
-            self._poll.unregister(self._board.wakes.fileno())
+            self._neglect(self._board.wakes.fileno())
             self._board.close()
         self._board = None
 
@@ -223,7 +241,7 @@ class MainLoop:
 
     def _expect_worker(self) -> None:
         self._worker_spoke(WORKER_BIRTH_NS << self._worker_deaths)  # a machine so busy gets no busier
-        self._poll.register(self._worker.fileno(), select.EPOLLIN | select.EPOLLHUP)
+        self._attend(self._worker.fileno(), self._listen_to_worker)
         self._worker.send(Life(self._record_file.record.boot, os.getpid(), self._notes))
 
     def _turn(self) -> None:
@@ -235,17 +253,8 @@ class MainLoop:
         if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
             self._hear()
         for descriptor, _ in came:
-            if descriptor == self._beats.fileno():
-                self._hear()
-            elif descriptor == self._worker.fileno():
-                self._listen_to_worker()
-            elif descriptor == self._persister.fileno():
-                self._note_persisted()
-            elif descriptor == self._wake.fileno():
-                self._ending = True
-            elif self._board is not None and descriptor == self._board.wakes.fileno():
-                self._board.wakes.heed()
-                self._urgent_ns = self._board.urgent_due_ns(self._sent_ns)
+            if descriptor in self._inputs:  # not the alarm, nor what was closed in this turn
+                self._inputs[descriptor]()
         if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
             self._send_urgent()
         if self._media.is_slotted:
@@ -277,6 +286,8 @@ class MainLoop:
         running: another one in its place would say as little.
         """
         now_ns = clock.now_ns()
+        if now_ns - self._turned_ns < TURNS_NS:
+            return
         self._worker_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
         self._turned_ns = now_ns
         if self._worker_unseen_ns < WORKER_LOOK_NS:
@@ -399,6 +410,12 @@ class MainLoop:
         for number, durable in self._persister.finished():
             self._obey(self._outbox.kept(number, durable, clock.now_ns()))
 
+    def _note_urgent(self) -> None:
+        """An urgent item was put."""
+        if self._board is not None:
+            self._board.wakes.heed()
+            self._urgent_ns = self._board.urgent_due_ns(self._sent_ns)
+
     def _listen_to_worker(self) -> None:
         try:
             for message in self._worker.receive():
@@ -452,7 +469,7 @@ class MainLoop:
         if self._worker_deaths > WORKER_TRIES:
             raise AgentError(f"the worker process ended {WORKER_TRIES} times at once ({why}); its last words stand above")
         log.error("the worker process is gone (%s); guards and programs run on, and another worker starts", why)
-        self._poll.unregister(self._worker.fileno())
+        self._neglect(self._worker.fileno())
         self._worker.replace()
         self._expect_worker()
 
