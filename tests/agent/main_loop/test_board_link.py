@@ -133,7 +133,8 @@ def test_an_item_that_is_put_while_several_are_read_together_is_read_again_by_it
     balls, maps = first.program.item("ball"), first.program.item("map")
     balls.put({"x": 1.0, "y": 1.0})
     maps.put([1] * 900)
-    own, pread, reads = first.link._own, os.pread, []
+    own, pread = first.link._own, os.pread
+    reads: list[int] = []
 
     def slow(descriptor: int, size: int, at: int) -> bytes:
         reads.append(size)
