@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -13,19 +12,6 @@ TOP_COLUMNS: Final = ("item", "puts", "size", "age p50", "age p99", "bound", "fr
 
 VALUE_WIDTH: Final = 60
 BAR_WIDTH: Final = 10
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON can say it: bytes as hexadecimal, numbers that are not finite as None, arrays as lists."""
-    if isinstance(value, bytes | bytearray | memoryview):
-        return bytes(value).hex()
-    if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def ms(span_ns: int | None) -> float | None:

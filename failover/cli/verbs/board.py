@@ -17,9 +17,10 @@ from failover.boards import directory
 from failover.boards.board import Board, board
 from failover.boards.overview import Seen, overview
 from failover.cli.output import board_tree, render
-from failover.cli.output.board_tree import ms, plain
-from failover.core.board.item_types import Array, Opaque, Record, Type, is_octets, parse
-from failover.errors import BoardError, BoardGoneError, RequestError, ValueMisfitError
+from failover.cli.output.board_tree import ms
+from failover.core.board.item_types import parse
+from failover.core.board.json_values import of_json, plain
+from failover.errors import BoardError, BoardGoneError, RequestError
 
 NAME: Final = "failover board"
 """Of this program among the board's users."""
@@ -181,7 +182,7 @@ def put(arguments: argparse.Namespace) -> int:
         if robot != opened.robot:
             raise BoardError(f"{robot} alone writes its items, and this robot is {opened.robot}: give this order at {robot}")
         one = _found(opened, arguments.path)
-        opened.item(one.item).put(_for_item(parse(one.type), value, one.item))
+        opened.item(one.item).put(of_json(parse(one.type), value, one.item))
         number = _found(opened, arguments.path).put
     told = {"robot": robot, "item": one.item, "put": number}
     if arguments.json:
@@ -191,35 +192,15 @@ def put(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _for_item(kind: Type, value: Any, place: str) -> Any:
-    """A value of JSON for an item: hexadecimal text where bytes belong.
-
-    Raises:
-        ValueMisfitError: it is no hexadecimal text.
-    """
-    if (isinstance(kind, Opaque) and kind.kind == "bytes") or is_octets(kind):
-        if isinstance(value, str):
-            try:
-                return bytes.fromhex(value)
-            except ValueError:
-                raise ValueMisfitError(f'{place}: bytes are written in hexadecimal, as in "00ff", not {value[:40]!r}') from None
-        return value
-    if isinstance(kind, Record) and isinstance(value, dict):
-        kinds = dict(kind.fields)
-        return {
-            name: _for_item(kinds[name], inner, f"{place}.{name}") if name in kinds else inner for name, inner in value.items()
-        }
-    if isinstance(kind, Array) and isinstance(value, list):
-        return [_for_item(kind.of, inner, f"{place}[{index}]") for index, inner in enumerate(value)]
-    return value
-
-
 # --- Rates and users -------------------------------------------------------------------------------------------------
 
 
 def top(arguments: argparse.Namespace) -> int:
     """Rates, sizes, ages and losses of every item over a span; with --watch again and again."""
-    with _open(arguments) as opened, render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
+    with (
+        _open(arguments) as opened,
+        render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw,
+    ):
         while True:
             items = _measured(opened, arguments.every_ms / 1000)
             if arguments.json:

@@ -1,0 +1,76 @@
+"""Values of items as JSON: what people read and type, what recordings hold, and the JSON Schema of each type.
+
+Bytes are hexadecimal text; a number that is not finite is null.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from failover.core.board.item_types import Array, Number, Opaque, Record, Text, Type, is_octets
+from failover.errors import ValueMisfitError
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can say it: bytes as hexadecimal, numbers that are not finite as None, arrays as lists."""
+    if isinstance(value, bytes | bytearray | memoryview):
+        return bytes(value).hex()
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def of_json(kind: Type, value: Any, place: str) -> Any:
+    """A value of JSON for an item: hexadecimal text where bytes belong.
+
+    Args:
+        place: the item and the fields that lead here, for the message.
+
+    Raises:
+        ValueMisfitError: it is no hexadecimal text.
+    """
+    if (isinstance(kind, Opaque) and kind.kind == "bytes") or is_octets(kind):
+        if isinstance(value, str):
+            try:
+                return bytes.fromhex(value)
+            except ValueError:
+                raise ValueMisfitError(f'{place}: bytes are written in hexadecimal, as in "00ff", not {value[:40]!r}') from None
+        return value
+    if isinstance(kind, Record) and isinstance(value, dict):
+        kinds = dict(kind.fields)
+        return {name: of_json(kinds[name], inner, f"{place}.{name}") if name in kinds else inner for name, inner in value.items()}
+    if isinstance(kind, Array) and isinstance(value, list):
+        return [of_json(kind.of, inner, f"{place}[{index}]") for index, inner in enumerate(value)]
+    return value
+
+
+def schema_of(kind: Type) -> dict[str, Any]:
+    """The JSON Schema of a type's values, as `plain` writes them."""
+    if isinstance(kind, Opaque):
+        return {"type": "string", "description": "hexadecimal"} if kind.kind == "bytes" else {"description": kind.kind}
+    if isinstance(kind, Number):
+        return _number(kind.code)
+    if isinstance(kind, Text):
+        return {"type": "string"}
+    if is_octets(kind):
+        return {"type": "string", "description": "hexadecimal"}
+    if isinstance(kind, Array):
+        return {"type": "array", "items": schema_of(kind.of), "minItems": kind.count, "maxItems": kind.count}
+    properties = {name: schema_of(inner) for name, inner in kind.fields}
+    return {"type": "object", "properties": properties, "required": list(properties)}
+
+
+def _number(code: str) -> dict[str, Any]:
+    if code == "bool":
+        return {"type": "boolean"}
+    if code[0] == "f":
+        return {"type": "number"}
+    bits = 8 * int(code[1])
+    least, most = (0, 2**bits - 1) if code[0] == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    return {"type": "integer", "minimum": least, "maximum": most}
