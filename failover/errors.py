@@ -73,6 +73,10 @@ class WriterTakenError(BoardError):
     """Another process writes this item; the message names its pid."""
 
 
+class RecordingError(FailoverError):
+    """A recording of the board cannot be made, read or replayed; the message names the file, and what was kept."""
+
+
 class ItemError(FailoverError):
     """An item of the board is declared in a way that cannot work; nothing was changed.
 

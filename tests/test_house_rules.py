@@ -58,6 +58,7 @@ DOORS = {
     "zstandard": ("checkpoint/snapshot/compression.py",),
     "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
     "cryptography": ("failover/programs/keys.py",),
+    "mcap": ("failover/recording/mcap_file.py",),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),

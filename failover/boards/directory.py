@@ -187,11 +187,12 @@ def dismiss(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-def enter(directory: Path, name: str) -> tuple[MappedFile, int]:
+def enter(directory: Path, name: str, robot: str = "") -> tuple[MappedFile, int]:
     """Open a board's ``own`` as a user of it; make the board if there is none, or one that its last user left by being killed.
 
     Args:
         name: of this program, for people.
+        robot: whose board it is, where it is made; "": this machine's.
 
     Returns:
         The file, and the user's index.
@@ -200,18 +201,18 @@ def enter(directory: Path, name: str) -> tuple[MappedFile, int]:
         BoardError: it is no board, cannot be made, or has too many users.
     """
     for _ in range(TURNS):
-        entered = _try_to_enter(directory, name)
+        entered = _try_to_enter(directory, name, robot or this_robot())
         if entered is not None:
             return entered
     raise BoardError(f"cannot open the board {directory}: others have made and removed it {TURNS} times meanwhile; try again")
 
 
-def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
+def _try_to_enter(directory: Path, name: str, robot: str) -> tuple[MappedFile, int] | None:
     path = directory / OWN_NAME
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     except FileNotFoundError:
-        return _made(directory, name)
+        return _made(directory, name, robot)
     except OSError as error:
         raise BoardError(f"cannot open {path}: {error.strerror}; its owner may, and the group of [board] in team.toml") from error
     keep = False
@@ -234,9 +235,8 @@ def _try_to_enter(directory: Path, name: str) -> tuple[MappedFile, int] | None:
             os.close(descriptor)
 
 
-def _made(directory: Path, name: str) -> tuple[MappedFile, int] | None:
+def _made(directory: Path, name: str, robot: str) -> tuple[MappedFile, int] | None:
     """Make the board; None if another one was quicker."""
-    robot = this_robot()
     try:
         _make_directory(directory)
         _examine(directory)

@@ -316,6 +316,8 @@ VERBS: Final = (
           failover board --watch
           failover board get robot2/ball
           failover board put ball '{"x": 1.0, "y": 2.5}'
+          failover board record team.mcap
+          failover board replay team.mcap --board /dev/shm/yesterday
           failover board header > items.h
           failover board import rtdb.conf -I include
         """,

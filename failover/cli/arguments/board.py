@@ -1,11 +1,18 @@
-"""board get, put, top, users, header, import: the items that robots share."""
+"""board get, put, top, users, record, replay, header, import: the items that robots share."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 from failover.cli.arguments.shared import add_act, add_json, add_place_of_board, add_repeated, add_team_directory, whole
+from failover.config import quantities
+
+RATE_MAX: Final = 1000
+"""Looks a second: a look at a hundred items takes some tens of microseconds."""
+PACE_MIN: Final = 0.001
+PACE_MAX: Final = 1000.0
 
 
 def board(room: argparse.ArgumentParser) -> None:
@@ -31,6 +38,7 @@ def board(room: argparse.ArgumentParser) -> None:
     top.set_defaults(function="failover.cli.verbs.board:top")
     users = add_act(acts, "users", of_board, "the programs that have the board open", USERS_DESCRIPTION)
     users.set_defaults(function="failover.cli.verbs.board:users")
+    _recordings(acts, of_board)
     of_team = argparse.ArgumentParser(add_help=False, parents=[shared])
     add_team_directory(of_team)
     header = add_act(acts, "header", of_team, "the items as a C header", HEADER_DESCRIPTION)
@@ -51,6 +59,76 @@ def board(room: argparse.ArgumentParser) -> None:
         "--size", metavar="BYTES", type=whole, default=1024, help="the most bytes of a key of an XML file (default: %(default)s)"
     )
     imported.set_defaults(function="failover.cli.verbs.board_files:import_file")
+
+
+def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
+    """Of ``record`` and ``replay``."""
+    some = argparse.ArgumentParser(add_help=False, parents=[of_board])
+    some.add_argument(
+        "--items", metavar="PATTERN", nargs="+", default=[], help="only items of these names: * and ? stand for any characters"
+    )
+    some.add_argument("--robots", metavar="PATTERN", nargs="+", default=[], help="only items of these robots")
+    record = add_act(acts, "record", some, "each put of each item, with its age, into an MCAP file", RECORD_DESCRIPTION)
+    record.add_argument("file", metavar="FILE", help="the file, which must not exist: team.mcap")
+    record.add_argument("--for", dest="span", metavar="SPAN", type=_span_ms, help="end after 10s, 5min, 2h (default: at Ctrl-C)")
+    _add_looks(record)
+    record.add_argument(
+        "--max-size", metavar="SIZE", type=_size, default=0, help="begin another file, team-2.mcap, from 500MB or 2GB on"
+    )
+    record.add_argument("--keep", metavar="COUNT", type=whole, default=0, help="of these files, keep so many, the newest")
+    record.add_argument(
+        "--recover", action="store_true", help="record nothing: give FILE, whose recorder was killed, its end and its index"
+    )
+    record.set_defaults(function="failover.cli.verbs.board_recordings:record")
+    replay = add_act(acts, "replay", some, "a recording, put back on a board at its pace, with its ages", REPLAY_DESCRIPTION)
+    replay.add_argument("files", metavar="FILE", nargs="+", help="of one recording, in their order")
+    replay.add_argument("--pace", metavar="X", type=_pace, default=1.0, help="so many times as fast (default: 1)")
+    replay.add_argument("--loop", action="store_true", help="again and again until Ctrl-C")
+    replay.add_argument(
+        "--as", dest="prefix", metavar="PREFIX", help="on any board: as private items PREFIX.ROBOT.ITEM of this robot"
+    )
+    replay.set_defaults(function="failover.cli.verbs.board_recordings:replay")
+
+
+def _add_looks(room: argparse.ArgumentParser) -> None:
+    """How the board and the agents are looked at."""
+    room.add_argument(
+        "--rate", metavar="HZ", type=_rate, default=100, help="looks at the board in a second, 1 to 1000 (default: %(default)s)"
+    )
+    room.add_argument("--no-decisions", dest="decisions", action="store_false", help="leave out the agents' decisions")
+    room.add_argument("--socket", metavar="PATH", help="the control socket of the agent that is asked for decisions")
+
+
+def _span_ms(text: str) -> int:
+    return _quantity(quantities.span_ms, text)
+
+
+def _size(text: str) -> int:
+    return _quantity(quantities.size_bytes, text)
+
+
+def _quantity(read: Callable[[str], int], text: str) -> int:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _rate(text: str) -> int:
+    number = whole(text)
+    if number > RATE_MAX:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 1 to {RATE_MAX}")
+    return number
+
+
+def _pace(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not PACE_MIN <= number <= PACE_MAX:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r} is no number from {PACE_MIN} to {PACE_MAX:g}")
+    return number
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -89,6 +167,33 @@ USERS_DESCRIPTION: Final = """
     List the programs that have this robot's board open. The kernel tells: a program that was killed is not in the list.
 
       failover board users
+    """
+
+RECORD_DESCRIPTION: Final = """
+    Record the board into an MCAP file, which Foxglove, Lichtblick, PlotJuggler and Rerun open: each item of each robot is a
+    channel /ROBOT/ITEM, each put a message with value, number and age. The log time is the instant at which this command read the
+    value, the publish time that minus its age. Decisions of the agents (takeovers and others) are the channel
+    failover/decisions. A value that is replaced between two looks is not recorded; the answer counts them.
+
+    The file grows each second. A recorder that is killed loses the last second at most: replay reads such a file as it is,
+    other programs after --recover, which keeps the old file as FILE.before. The library comes with the extra "record":
+    pip install 'failover[record]'.
+
+      failover board record team.mcap
+      failover board record team.mcap --items 'ball*' --robots robot2 --for 10min
+      failover board record team.mcap --max-size 500MB --keep 10
+      failover board record --recover team.mcap
+    """
+
+REPLAY_DESCRIPTION: Final = """
+    Put the values of a recording on a board again, each at its time and as old as it was. Without an agent this makes a board
+    (--board, else this user's): the robot that recorded is this robot there, the others are its team, and programs that are told
+    FAILOVER_BOARD run as they did. On an agent's board nothing is replayed under the names of its items: --as PREFIX makes
+    private items PREFIX.ROBOT.ITEM, which are removed at the end.
+
+      failover board replay team.mcap --board /dev/shm/yesterday
+      failover board replay team.mcap team-2.mcap --pace 10
+      failover board replay team.mcap --items ball --loop --as old
     """
 
 HEADER_DESCRIPTION: Final = """

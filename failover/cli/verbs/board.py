@@ -33,7 +33,7 @@ SAMPLE_S: Final = 0.05
 
 
 @contextlib.contextmanager
-def _open(arguments: argparse.Namespace) -> Iterator[Board]:
+def board_there(arguments: argparse.Namespace) -> Iterator[Board]:
     """The board of this robot, if there is one: looking at it must not make it.
 
     Raises:
@@ -51,7 +51,7 @@ def _open(arguments: argparse.Namespace) -> Iterator[Board]:
 
 def show(arguments: argparse.Namespace) -> int:
     """The tree; with --watch again and again until Ctrl-C. Exit status 1: an item is stale or cannot be read."""
-    with _open(arguments) as opened:
+    with board_there(arguments) as opened:
         before, since = overview(opened), time.monotonic()
         with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
             while True:
@@ -133,7 +133,7 @@ def _found(opened: Board, path: str) -> Seen:
 
 def get(arguments: argparse.Namespace) -> int:
     """Print one item's value, how old it is and can be; with --watch each new one. Exit status 1: it is stale."""
-    with _open(arguments) as opened:
+    with board_there(arguments) as opened:
         one = _found(opened, arguments.path)
         handle = opened.item(one.item)
         after = None
@@ -177,7 +177,7 @@ def put(arguments: argparse.Namespace) -> int:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise RequestError(f"the value is not JSON: {error}; text stands in quotes, as in '\"blue\"'") from error
-    with _open(arguments) as opened:
+    with board_there(arguments) as opened:
         robot, _ = _split(arguments.path, opened)
         if robot != opened.robot:
             raise BoardError(f"{robot} alone writes its items, and this robot is {opened.robot}: give this order at {robot}")
@@ -198,7 +198,7 @@ def put(arguments: argparse.Namespace) -> int:
 def top(arguments: argparse.Namespace) -> int:
     """Rates, sizes, ages and losses of every item over a span; with --watch again and again."""
     with (
-        _open(arguments) as opened,
+        board_there(arguments) as opened,
         render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw,
     ):
         while True:
@@ -238,7 +238,7 @@ def _measured(opened: Board, span_s: float) -> list[dict[str, Any]]:
 
 def users(arguments: argparse.Namespace) -> int:
     """The programs that have the board open, without this one."""
-    with _open(arguments) as opened:
+    with board_there(arguments) as opened:
         found = [
             {"pid": pid, "uid": uid, "user": _user(uid), "name": name}
             for pid, uid, name in opened.users()

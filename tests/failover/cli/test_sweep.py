@@ -26,7 +26,17 @@ UNDER_AN_AGENT = {
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")
 TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
-BOARDS = ([], ["get", "ball"], ["put", "ball", "1"], ["top"], ["users"], ["header"], ["import", "missing"], ["import", "junk"])
+BOARDS = (
+    [],
+    ["get", "ball"],
+    ["put", "ball", "1"],
+    ["top"],
+    ["users"],
+    ["header"],
+    ["import", "missing"],
+    ["import", "junk"],
+    ["record", "out.mcap"],
+)
 TASKS = (
     *(["ps"], ["trace", "-o", "out", "--for", "1s"], ["task", "add", "x", "period_ms=9"], ["task", "set", "x", "period_ms=9"]),
     *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
@@ -55,6 +65,8 @@ DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
+    *(["board", "record", "x", *rest] for rest in (["--rate", "0"], ["--rate", "2000"], ["--for", "soon"], ["--max-size", "9"])),
+    *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
     *(["board", "fly"], ["board", "get"], ["board", "--every-ms", "0"], ["board", "import", "f", "--robot", "a"]),
     *(["check", pid] for pid in NO_PIDS),
     ["check", "1", "--table"],
@@ -124,6 +136,13 @@ def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixtur
 def test_with_a_board_that_is_none(act: list[str], at: str, capsys: pytest.CaptureFixture[str]) -> None:
     where = {"header": ["--directory", at], "import": []}.get(act[0] if act else "", ["--board", at])
     assert told(capsys, "board", *act, *where) == main.FAILED
+    assert sorted(Path("directory").iterdir()) == [] and not Path("out.mcap").exists()
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("act", [["replay"], ["record", "--recover"]], ids=" ".join)
+def test_with_a_file_that_is_no_recording(act: list[str], file: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "board", *act, file, "--board", "directory") == main.FAILED
     assert sorted(Path("directory").iterdir()) == []
 
 

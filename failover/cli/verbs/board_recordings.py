@@ -1,0 +1,170 @@
+"""board record, replay: the board's items into MCAP files, and back onto a board."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator, Mapping
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final, Protocol
+
+from failover import __version__
+from failover.boards import directory
+from failover.cli.connection import connect
+from failover.cli.output import render
+from failover.cli.output.team_tree import size
+from failover.cli.verbs.board import board_there
+from failover.core.board import layout
+from failover.errors import RequestError
+from failover.recording.follower import Choice, Follower
+from failover.recording.stream import Decisions
+
+LIBRARY: Final = f"failover {__version__}"
+
+
+class _Endable(Protocol):
+    is_ended: bool
+
+
+@contextlib.contextmanager
+def ended_by_signals(act: _Endable) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end an act in order, instead of the process at once."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        act.is_ended = True
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def chosen(arguments: argparse.Namespace) -> Choice:
+    """What --robots and --items say."""
+    return Choice(tuple(arguments.robots), tuple(arguments.items))
+
+
+def note(text: str) -> None:
+    """A remark, beside the answer."""
+    print(f"failover: note: {text}", file=sys.stderr, flush=True)
+
+
+# --- Record ----------------------------------------------------------------------------------------------------------
+
+
+def record(arguments: argparse.Namespace) -> int:
+    """Record until the span is over, Ctrl-C or SIGTERM."""
+    if arguments.recover:
+        return _recover(arguments)
+    from failover.recording.record import Plan, Recorder
+
+    if arguments.keep and not arguments.max_size:
+        raise RequestError("--keep says how many files stay of those that --max-size closes: give --max-size too")
+    span_s = None if arguments.span is None else arguments.span / 1000
+    plan = Plan(Path(arguments.file), arguments.rate, span_s, arguments.max_size, arguments.keep, LIBRARY)
+    with board_there(arguments) as board:
+        is_agents = not board.ensured().own.header.flags & layout.ALONE
+        decisions = _decisions(arguments)
+        recorder = Recorder(board, Follower(board, chosen(arguments)), plan, decisions)
+        with ended_by_signals(recorder.stream):
+            recorder.run()
+    told, files = recorder.stream.counts, recorder.files
+    if decisions is not None and decisions.complaint and (is_agents or told.decisions):
+        note(f"decisions of the agents are not recorded to the end: {decisions.complaint}")
+    for pause in told.pauses:
+        note(f"nothing was recorded for a while: {pause}")
+    written = sum(path.stat().st_size for path in files)
+    answer = {
+        "files": [str(path) for path in files],
+        "bytes": written,
+        "puts": told.puts,
+        "missed": told.missed,
+        "items": len(told.items),
+        "robots": sorted(told.robots),
+        "decisions": told.decisions,
+        "span_s": round(recorder.took_s, 3),
+    }
+    if arguments.json:
+        render.as_json(answer)
+        return 0
+    places = str(files[0]) if len(files) == 1 else f"{files[0]} to {files[-1].name}, {len(files)} files"
+    print(
+        f"{places}: {told.puts} puts of {len(told.items)} items of {len(told.robots)} robots, {told.decisions} decisions, in "
+        f"{recorder.took_s:.1f} s, {size(written)}"
+    )
+    if told.missed:
+        print(f"{told.missed} puts were replaced between two looks and are not in it; --rate {arguments.rate * 2} sees more")
+    return 0
+
+
+def _decisions(arguments: argparse.Namespace) -> Decisions | None:
+    """Those of the agent's robots; None: they are not wanted."""
+    if not arguments.decisions:
+        return None
+
+    def ask(age_ms: int) -> Mapping[str, Any]:
+        with connect(arguments) as agent:
+            return agent.ask("why", name="", robot="", age_ms_max=age_ms)
+
+    return Decisions(ask)
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    from failover.recording.mcap_file import recover
+
+    path = Path(arguments.file)
+    done = recover(path, LIBRARY)
+    lost = done.loss.sentence(path)
+    if arguments.json:
+        answer = {"file": str(path), "messages": done.messages, "before": None if done.kept is None else str(done.kept)}
+        render.as_json(answer | {"tail": done.loss.tail if done.kept else 0, "damaged_chunks": done.loss.chunks})
+        return 0
+    if done.kept is None:
+        print(f"{path} is whole, with {done.messages} messages; nothing was changed")
+    else:
+        print(f"{path} is whole now, with {done.messages} messages; as it was it is {done.kept.name}\n{lost}")
+    return 0
+
+
+# --- Replay ----------------------------------------------------------------------------------------------------------
+
+
+def replay(arguments: argparse.Namespace) -> int:
+    """Play the files once, or again and again."""
+    from failover.recording.replay import Player, Source, Stage
+
+    source = Source([Path(file) for file in arguments.files], chosen(arguments))
+    contents = source.examined()
+    for lost in contents.lost:
+        note(lost)
+    place = Path(arguments.board) if arguments.board else directory.find()
+    with Stage(place, contents, arguments.prefix or "") as stage:
+        robots = sorted({channel.robot for channel in contents.channels.values()})
+        span_s = (contents.last_ns - contents.first_ns) / 1e9
+        if not arguments.json:
+            there = stage.board.directory
+            since = datetime.fromtimestamp(contents.first_ns / 1e9).strftime("%Y-%m-%d %H:%M:%S")
+            print(
+                f"replaying {contents.puts} puts of {len(contents.channels)} items of {', '.join(robots)}, {span_s:.1f} s from "
+                f"{since} on, to the board of {stage.board.robot}; programs find it by FAILOVER_BOARD={there}",
+                flush=True,
+            )
+        for said in stage.notes:
+            note(said)
+        player = Player(source, contents, stage, arguments.pace)
+        with ended_by_signals(player):
+            player.run()
+            while arguments.loop and not player.is_ended:
+                player.run()
+    answer = {"puts": player.puts, "items": len(contents.channels), "robots": robots, "span_s": round(span_s, 3)}
+    if arguments.json:
+        render.as_json(answer | {"lost": contents.lost})
+    else:
+        print(f"replayed {player.puts} puts")
+    return 0

@@ -1,0 +1,219 @@
+"""A board as a stream of messages, for a file or for programs that look on: each put once, with its age; the robots' states; the
+decisions of their agents.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Protocol
+
+from msgspec import Struct
+
+from failover.boards import boottime
+from failover.boards.board import Board
+from failover.core.board import recording
+from failover.core.board.recording import Channel, Coder, Schema
+from failover.errors import BoardError, FailoverError
+from failover.recording.follower import Follower, Fresh
+
+EACH_S: Final = 1.0
+"""Between two messages of states and decisions, and two flushes: what a killed recorder loses at most."""
+SLEEP_S: Final = 0.1
+"""The longest sleep without a look at the signal that ends it."""
+ASK_S: Final = 2.0
+"""Between two questions for decisions: an answer takes other robots a look at their event logs."""
+LAST_ANSWER_S: Final = 3.0
+"""For the decisions of the last seconds, at the end."""
+MARGIN_MS: Final = 5_000
+"""By how much questions overlap: a line comes late where its robot answers late."""
+
+Ask = Callable[[int], Mapping[str, Any]]
+"""``(age_ms_max)`` → the agent's answer to ``why``."""
+
+
+Act = Callable[[], None]
+
+
+def nothing() -> None:
+    """The act of one who has nothing to do then."""
+
+
+class Sink(Protocol):
+    """Where messages go."""
+
+    def channel(self, topic: str, schema: Schema | None, metadata: Mapping[str, str]) -> int: ...
+
+    def add(self, channel: int, log_ns: int, publish_ns: int, sequence: int, content: bytes) -> None: ...
+
+
+class Decisions:
+    """Lines of the robots' event logs since the beginning, asked for by a thread: other robots may take long to answer."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+        self._since_s = time.time()
+        self._asked_s = time.monotonic()
+        self._known: set[tuple[object, ...]] = set()
+        self._waiting: list[Mapping[str, Any]] = []
+        self._lock = threading.Lock()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="decisions", daemon=True)
+        self.complaint = ""
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask once more, and end."""
+        self._is_over.set()
+        self._thread.join(LAST_ANSWER_S)
+
+    def taken(self) -> list[Mapping[str, Any]]:
+        """Lines that were not given yet."""
+        with self._lock:
+            lines, self._waiting = self._waiting, []
+        return lines
+
+    def _run(self) -> None:
+        while not self._is_over.wait(ASK_S):
+            self._look()
+        self._look()
+
+    def _look(self) -> None:
+        asked_s = time.monotonic()
+        try:
+            answer = self._ask(round((asked_s - self._asked_s) * 1000) + MARGIN_MS)
+        except (FailoverError, OSError) as error:
+            self.complaint = str(error)
+            return
+        self.complaint, self._asked_s = "", asked_s
+        fresh = []
+        for line in answer.get("story") or ():
+            key = (line.get("robot"), line.get("life"), line.get("number"))
+            if key not in self._known and (line.get("at") or 0) >= self._since_s:
+                self._known.add(key)
+                fresh.append(line)
+        with self._lock:
+            self._waiting += fresh
+
+
+class Counts(Struct):
+    """What went through.
+
+    Attributes:
+        missed: puts that were replaced between two looks.
+        pauses: sentences on spans in which there was no board.
+    """
+
+    robots: set[str]
+    items: set[str]
+    pauses: list[str]
+    puts: int = 0
+    missed: int = 0
+    decisions: int = 0
+
+
+class Stream:
+    """Looks at a board, and says to a sink what is new. ``is_ended``: set it, also in a signal's function, to end `run`."""
+
+    def __init__(self, board: Board, follower: Follower, sink: Sink, decisions: Decisions | None = None) -> None:
+        self._board = board
+        self._follower = follower
+        self._sink = sink
+        self._decisions = decisions
+        self._origin_ns = time.time_ns() - boottime.now_ns(board.skew_ns)
+        self._coders: dict[Channel, Coder] = {}
+        self._channels: dict[object, int] = {}
+        self._pause = ""
+        self.counts = Counts(set(), set(), [])
+        self.is_ended = False
+
+    def begin_anew(self, sink: Sink) -> None:
+        """Another sink, which gets the newest value of each item."""
+        self._sink = sink
+        self._channels = {}
+        self._follower.again()
+
+    def run(self, rate: float, span_s: float | None, each_second: Act = nothing, each_look: Act = nothing) -> None:
+        """Look so many times a second, until the end; ``span_s`` None: until `is_ended`.
+
+        Args:
+            each_second: after the states of the robots were said. each_look: before it.
+        """
+        begin_s = look_s = each_s = time.monotonic()
+        end_s = None if span_s is None else begin_s + span_s
+        if self._decisions is not None:
+            self._decisions.start()
+        while not self.is_ended and (end_s is None or look_s < end_s):
+            each_look()
+            self._look()
+            if look_s >= each_s:
+                self._say_robots()
+                self._say_decisions()
+                each_second()
+                each_s = look_s + EACH_S
+            look_s = max(look_s + 1 / rate, time.monotonic())
+            self._sleep_until(look_s if end_s is None else min(look_s, end_s))
+        self._look()
+        if self._decisions is not None:
+            self._decisions.stop()
+            self._say_decisions()
+
+    def _sleep_until(self, instant_s: float) -> None:
+        while not self.is_ended and (left_s := instant_s - time.monotonic()) > 0:
+            time.sleep(min(left_s, SLEEP_S))
+
+    def _look(self) -> None:
+        try:
+            for fresh in self._follower.look():
+                self._say_put(fresh)
+        except BoardError as error:
+            if not self._pause:
+                self.counts.pauses.append(str(error))
+            self._pause = str(error)
+            return
+        self._pause = ""
+
+    def _say_put(self, fresh: Fresh) -> None:
+        channel = recording.channel_of(fresh.robot, fresh.record, fresh.private)
+        if channel not in self._coders:
+            self._coders[channel] = Coder(channel)
+        if channel not in self._channels:
+            metadata = recording.metadata_of(channel)
+            self._channels[channel] = self._sink.channel(channel.topic, recording.item_schema(channel), metadata)
+        octets, number = fresh.found.value, fresh.found.number
+        put = self._coders[channel].put_of(octets, number, fresh.age_ns, fresh.age_max_ns, fresh.is_stale)
+        log_ns = self._origin_ns + fresh.now_ns
+        self._sink.add(self._channels[channel], log_ns, log_ns - fresh.age_ns, number, recording.encode(put))
+        self.counts.puts += 1
+        self.counts.missed += fresh.missed
+        self.counts.robots.add(fresh.robot)
+        self.counts.items.add(fresh.record.name)
+
+    def _say_robots(self) -> None:
+        if self._pause:
+            return  # to ask for them would make a board
+        with contextlib.suppress(BoardError):
+            robots = tuple(
+                recording.Robot(name, one.state, -1 if one.age_ns is None else one.age_ns // 1000, one.rank)
+                for name, one in self._follower.robots().items()
+            )
+            said = recording.Robots(self._board.robot, robots)
+            self._say(recording.ROBOTS_TOPIC, recording.ROBOTS_SCHEMA, recording.encode(said), 0)
+
+    def _say_decisions(self) -> None:
+        for line in self._decisions.taken() if self._decisions is not None else ():
+            age_ns = max(time.time_ns() - round(line["at"] * recording.NS_PER_S), 0)
+            at_ns = self._origin_ns + boottime.now_ns(self._board.skew_ns) - age_ns
+            self._say(recording.DECISIONS_TOPIC, recording.LOG_SCHEMA, recording.encode(recording.log_of(line, at_ns)), age_ns)
+            self.counts.decisions += 1
+
+    def _say(self, topic: str, schema: Schema, message: bytes, age_ns: int) -> None:
+        """A message of a channel that is no item's."""
+        if topic not in self._channels:
+            self._channels[topic] = self._sink.channel(topic, schema, {})
+        log_ns = self._origin_ns + boottime.now_ns(self._board.skew_ns)
+        self._sink.add(self._channels[topic], log_ns, log_ns - age_ns, 0, message)
