@@ -59,6 +59,7 @@ DOORS = {
     "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
     "cryptography": ("failover/programs/keys.py",),
     "mcap": ("failover/recording/mcap_file.py",),
+    "foxglove": ("failover/recording/foxglove_server.py",),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
     "psutil": ("agent/processes.py",),

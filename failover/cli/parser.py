@@ -318,6 +318,7 @@ VERBS: Final = (
           failover board put ball '{"x": 1.0, "y": 2.5}'
           failover board record team.mcap
           failover board replay team.mcap --board /dev/shm/yesterday
+          failover board serve --foxglove 8765
           failover board header > items.h
           failover board import rtdb.conf -I include
         """,

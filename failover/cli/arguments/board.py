@@ -1,4 +1,4 @@
-"""board get, put, top, users, record, replay, header, import: the items that robots share."""
+"""board get, put, top, users, record, replay, serve, header, import: the items that robots share."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from failover.config import quantities
 
 RATE_MAX: Final = 1000
 """Looks a second: a look at a hundred items takes some tens of microseconds."""
+PORT_MAX: Final = 65535
 PACE_MIN: Final = 0.001
 PACE_MAX: Final = 1000.0
 
@@ -62,7 +63,7 @@ def board(room: argparse.ArgumentParser) -> None:
 
 
 def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
-    """Of ``record`` and ``replay``."""
+    """Of ``record``, ``replay`` and ``serve``."""
     some = argparse.ArgumentParser(add_help=False, parents=[of_board])
     some.add_argument(
         "--items", metavar="PATTERN", nargs="+", default=[], help="only items of these names: * and ? stand for any characters"
@@ -80,6 +81,16 @@ def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
         "--recover", action="store_true", help="record nothing: give FILE, whose recorder was killed, its end and its index"
     )
     record.set_defaults(function="failover.cli.verbs.board_recordings:record")
+    serve = add_act(acts, "serve", some, "the board live, for Foxglove and other programs of its protocol", SERVE_DESCRIPTION)
+    serve.add_argument(
+        "--foxglove", metavar="PORT", type=_port, required=True, help="listen at this port; 0: at any; 8765 is usual"
+    )
+    serve.add_argument("--listen", metavar="ADDRESS", default="127.0.0.1", help="listen at this address (default: %(default)s)")
+    serve.add_argument(
+        "--unsafe-listen", action="store_true", help="allow an ADDRESS that other machines reach: they can read the board"
+    )
+    _add_looks(serve)
+    serve.set_defaults(function="failover.cli.verbs.board_recordings:serve")
     replay = add_act(acts, "replay", some, "a recording, put back on a board at its pace, with its ages", REPLAY_DESCRIPTION)
     replay.add_argument("files", metavar="FILE", nargs="+", help="of one recording, in their order")
     replay.add_argument("--pace", metavar="X", type=_pace, default=1.0, help="so many times as fast (default: 1)")
@@ -97,6 +108,12 @@ def _add_looks(room: argparse.ArgumentParser) -> None:
     )
     room.add_argument("--no-decisions", dest="decisions", action="store_false", help="leave out the agents' decisions")
     room.add_argument("--socket", metavar="PATH", help="the control socket of the agent that is asked for decisions")
+
+
+def _port(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text[:6]) > PORT_MAX:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r} is no port: a number from 0 to {PORT_MAX}")
+    return int(text)
 
 
 def _span_ms(text: str) -> int:
@@ -183,6 +200,19 @@ RECORD_DESCRIPTION: Final = """
       failover board record team.mcap --items 'ball*' --robots robot2 --for 10min
       failover board record team.mcap --max-size 500MB --keep 10
       failover board record --recover team.mcap
+    """
+
+SERVE_DESCRIPTION: Final = """
+    Show the board live to programs that speak the Foxglove WebSocket protocol (foxglove.sdk.v1): Foxglove, Lichtblick. Channels
+    and messages are those of failover board record. A program that subscribes gets the newest value, then each put; it can put
+    nothing. In Foxglove: Open connection, Foxglove WebSocket, ws://localhost:8765. The library comes with the extra "foxglove":
+    pip install 'failover[foxglove]'.
+
+    The protocol knows no users and no encryption. So this command listens at this machine alone; from another one use
+    ssh -L 8765:localhost:8765 ROBOT.
+
+      failover board serve --foxglove 8765
+      failover board serve --foxglove 8765 --items ball 'pose*' --rate 20
     """
 
 REPLAY_DESCRIPTION: Final = """

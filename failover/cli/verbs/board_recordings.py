@@ -1,4 +1,4 @@
-"""board record, replay: the board's items into MCAP files, and back onto a board."""
+"""board record, replay, serve: the board's items into MCAP files, back onto a board, and live to programs that look on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from failover.cli.verbs.board import board_there
 from failover.core.board import layout
 from failover.errors import RequestError
 from failover.recording.follower import Choice, Follower
-from failover.recording.stream import Decisions
+from failover.recording.stream import Decisions, Stream
 
 LIBRARY: Final = f"failover {__version__}"
 
@@ -167,4 +167,27 @@ def replay(arguments: argparse.Namespace) -> int:
         render.as_json(answer | {"lost": contents.lost})
     else:
         print(f"replayed {player.puts} puts")
+    return 0
+
+
+# --- Serve -----------------------------------------------------------------------------------------------------------
+
+
+def serve(arguments: argparse.Namespace) -> int:
+    """Show the board live until Ctrl-C or SIGTERM."""
+    from failover.recording.foxglove_server import LiveServer, check_address
+
+    check_address(arguments.listen, arguments.unsafe_listen)
+    with board_there(arguments) as board:
+        follower = Follower(board, chosen(arguments))
+        with LiveServer(f"failover {board.robot}", arguments.listen, arguments.foxglove, follower) as server:
+            told = {"address": arguments.listen, "port": server.port, "robot": board.robot}
+            if arguments.json:
+                render.as_json(told)
+            else:
+                place = f"[{arguments.listen}]" if ":" in arguments.listen else arguments.listen
+                print(f"the board of {board.robot} is live at ws://{place}:{server.port}, until Ctrl-C", flush=True)
+            stream = Stream(board, follower, server, _decisions(arguments))
+            with ended_by_signals(stream):
+                stream.run(arguments.rate, None, each_look=server.fulfil)
     return 0

@@ -36,6 +36,7 @@ BOARDS = (
     ["import", "missing"],
     ["import", "junk"],
     ["record", "out.mcap"],
+    ["serve", "--foxglove", "0"],
 )
 TASKS = (
     *(["ps"], ["trace", "-o", "out", "--for", "1s"], ["task", "add", "x", "period_ms=9"], ["task", "set", "x", "period_ms=9"]),
@@ -66,6 +67,7 @@ USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
     *(["board", "record", "x", *rest] for rest in (["--rate", "0"], ["--rate", "2000"], ["--for", "soon"], ["--max-size", "9"])),
+    *(["board", "serve", "--foxglove", port] for port in ("-1", "65536", "x")),
     *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
     *(["board", "fly"], ["board", "get"], ["board", "--every-ms", "0"], ["board", "import", "f", "--robot", "a"]),
     *(["check", pid] for pid in NO_PIDS),
