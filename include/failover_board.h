@@ -74,6 +74,7 @@ extern "C" {
 
 typedef struct fb_board fb_board;
 typedef struct fb_item fb_item;
+typedef struct fb_component fb_component;
 
 /* Whose item: a robot by its name; this robot's own. */
 #define FB_ROBOT(name) (name)
@@ -136,6 +137,26 @@ static inline int fb_wait(fb_item *item, const char *robot, uint64_t after, cons
 /* Declare an item while the board is in use: 0, also where it is declared alike already. -EEXIST: declared otherwise. */
 static inline int fb_add(fb_board *board, const fb_declaration *wanted);
 
+/* Take an item of this robot off the board: 0. Its name is free then, and other robots lose it. -ENOENT: there is none. -EACCES: this user
+ * may not. A handle of it finds an item again that is added under its name. */
+static inline int fb_remove(fb_board *board, const char *name);
+
+/* An item at the robot that runs a component, wherever that is: to read; it follows a takeover. `item`: from fb_find(); `component`: its
+ * path, "/lab/robot1/mapper". Good until fb_close(), for one thread at a time. An agent is needed. NULL on failure. */
+static inline fb_component *fb_of(fb_item *item, const char *component);
+
+/* The component's newest value: 0. Between a takeover and the first put of the new copy it is what the copy before put last, as old as
+ * it is. -ENODATA: the copy that runs has not put it, and this handle has read none of a copy before. -ENOENT: the agent knows no
+ * robot that runs the component, or no agent runs here. */
+static inline int fb_component_get(fb_component *component, void *value, fb_reading *reading);
+
+/* The same once its number is another one than `after` (0: once there is a value); it follows a takeover meanwhile. -ETIMEDOUT. */
+static inline int fb_component_wait(fb_component *component, void *value, fb_reading *reading, uint64_t after,
+                                    const struct timespec *timeout);
+
+/* The robot of the last reading; "" before the first. */
+static inline const char *fb_component_robot(const fb_component *component);
+
 /* Name of this robot; copied to `name`, which has `size` bytes. */
 static inline int fb_robot(fb_board *board, char *name, size_t size);
 
@@ -173,7 +194,8 @@ enum {
     FB_USER_SIZE_ = 64,
     FB_RECORDS_AT_ = 20480,
     FB_RECORD_SIZE_ = 192,
-    FB_NEWEST_ = 64, /* in a record */
+    FB_BANKS_ = 6,   /* in a record */
+    FB_NEWEST_ = 64,
     FB_WAITERS_ = 72,
     FB_PID_ = 76,
     FB_REFUSED_ = 80,
@@ -182,11 +204,13 @@ enum {
     FB_RETRIES_ = 16,
     FB_TURNS_ = 100,            /* of a call whose board is made anew each time it looks */
     FB_EPOCH_BITS_ = 40,        /* numbers of puts under epoch e begin above e << 40 */
+    FB_FOLLOW_NS_ = 20000000,   /* the longest sleep without a look at who is the primary */
     FB_SLICE_NS_ = 100000000,   /* the longest sleep without a look: a wake-up may be lost */
     FB_TABLE_WAIT_MS_ = 5000,   /* for a process that changes a table, which takes microseconds */
     FB_MAPS_ = 4096             /* mappings that are guarded against files that become shorter */
 };
 
+#define FB_AGENT_ "/" /* in place of a robot: the agent's own file; no robot is called so */
 #define FB_HOLE_ ((uint64_t)0)
 #define FB_GONE_ UINT64_MAX
 #define FB_USER_LOCKS_ ((int64_t)1 << 40)
@@ -257,6 +281,17 @@ struct fb_item {
     char name[FB_NAME_MAX_ + 1];
 };
 
+/* Which robot runs a component, as the agent saw it in put `seen` of its table. */
+struct fb_component {
+    fb_component *next; /* of its board */
+    fb_item *item, *primaries;
+    uint64_t seen, epoch, since;
+    uint64_t last;                   /* number of the last reading */
+    char primary[65], robot[65];     /* now; of the last reading */
+    unsigned char *table;            /* FB_SIZE_MAX_ bytes */
+    char path[256];
+};
+
 typedef struct fb_added_ {
     struct fb_added_ *next;
     fb_declaration wanted;
@@ -272,6 +307,7 @@ struct fb_board {
     fb_area_ *own;          /* NULL: not open */
     fb_place_ *given_up;
     fb_item *items;
+    fb_component *components;
     fb_added_ *added;
     uint32_t user;
     int64_t skew;
@@ -702,7 +738,7 @@ static inline fb_area_ *fb_mapped_(fb_board *board, const char *name, int file)
     char path[PATH_MAX + NAME_MAX + 2];
     fb_header_ header;
     fb_area_ *area = (fb_area_ *)calloc(1, sizeof *area);
-    const bool is_peer = strncmp(name, "peer-", 5) == 0, is_given = file >= 0;
+    const bool is_peer = strncmp(name, "peer-", 5) == 0 || strcmp(name, "agent") == 0, is_given = file >= 0;
     int failed = 0;
     if (area == NULL || strlen(name) > NAME_MAX) {
         free(area);
@@ -1189,6 +1225,50 @@ static inline int fb_add(fb_board *board, const fb_declaration *wanted)
     return outcome;
 }
 
+static inline int fb_remove(fb_board *board, const char *name)
+{
+    fb_record_ record;
+    int outcome = -ESTALE;
+    if (name == NULL || *name == '\0' || strlen(name) > FB_NAME_MAX_)
+        return fb_fail_(EINVAL, "cannot remove item %.80s: a name has 1 to %d bytes", name == NULL ? "" : name, FB_NAME_MAX_);
+    pthread_mutex_lock(&board->guard);
+    for (int turn = 0; outcome == -ESTALE && turn < FB_TURNS_; turn++) {
+        fb_area_ *found = NULL;
+        int index = -ENOENT;
+        outcome = fb_ensure_(board);
+        for (fb_area_ *area = board->areas; outcome == 0 && index == -ENOENT && area != NULL; area = area->next) {
+            index = area->is_peer ? -ENOENT : fb_search_(area, name, 0, &record);
+            found = index >= 0 ? area : found;
+        }
+        if (outcome == 0 && index == -ENOENT)
+            outcome = fb_fail_(ENOENT, "cannot remove item %s: this robot has none on the board %.300s", name, board->directory);
+        else if (outcome == 0 && index < 0)
+            outcome = index;
+        else if (outcome == 0 && !found->is_writable)
+            outcome = fb_fail_(EACCES, "cannot remove item %s: %s may only be read by uid %u", name, found->name, (unsigned)geteuid());
+        if (outcome != 0)
+            continue;
+        outcome = fb_begin_change_(board, found);
+        if (outcome != 0)
+            continue;
+        index = fb_search_(found, name, 0, &record); /* another process may have removed it since */
+        if (index >= 0)
+            __atomic_store_n((uint16_t *)(void *)(found->map + FB_RECORDS_AT_ + (uint64_t)index * FB_RECORD_SIZE_ + FB_BANKS_), 0, __ATOMIC_RELEASE);
+        fb_end_change_(found);
+    }
+    for (fb_added_ **link = &board->added; outcome == 0 && *link != NULL;) {
+        fb_added_ *added = *link;
+        if (strcmp(added->name, name) == 0) {
+            *link = added->next;
+            free(added);
+        } else {
+            link = &added->next;
+        }
+    }
+    pthread_mutex_unlock(&board->guard);
+    return outcome;
+}
+
 /* --- Places of items --------------------------------------------------------------------------------------------------------------------- */
 
 /* The place of a robot's item as far as it is known. */
@@ -1219,12 +1299,16 @@ static inline int fb_fits_(const fb_item *item, const fb_record_ *record, const 
 static inline fb_area_ *fb_peer_(fb_board *board, const char *robot)
 {
     char name[80];
-    for (fb_area_ *area = board->areas; area != NULL; area = area->next)
-        if (area->is_peer && strcmp(area->name + 5, robot) == 0)
+    const bool is_agents = strcmp(robot, FB_AGENT_) == 0, is_none = *robot == '\0' || strlen(robot) > 64 || (!is_agents && strchr(robot, '/') != NULL);
+    snprintf(name, sizeof name, "%s%.64s", is_agents ? "agent" : "peer-", is_agents ? "" : robot);
+    for (fb_area_ *area = board->areas; area != NULL && !is_none; area = area->next)
+        if (area->is_peer && strcmp(area->name, name) == 0)
             return area;
-    snprintf(name, sizeof name, "peer-%s", robot);
-    if (*robot == '\0' || strlen(robot) > 64 || strchr(robot, '/') != NULL || fb_mapped_(board, name, -1) == NULL) {
-        if (errno == ENOENT || *robot == '\0' || strlen(robot) > 64 || strchr(robot, '/') != NULL)
+    if (is_none || fb_mapped_(board, name, -1) == NULL) {
+        if (is_agents && errno == ENOENT)
+            fb_fail_(ENOENT, "no agent has made the board %.300s: it alone knows which robot runs a component; read the item of a robot by its name",
+                     board->directory);
+        else if (is_none || errno == ENOENT)
             fb_fail_(ENOENT, "there is no robot %.80s on the board %.300s", robot, board->directory);
         return NULL;
     }
@@ -1547,6 +1631,212 @@ static inline int fb_wait(fb_item *item, const char *robot, uint64_t after, cons
     }
 }
 
+/* --- The item of a component ---------------------------------------------------------------------------------------------------------------
+ *
+ * The agent's file has one item, `primaries`: msgpack, component -> [robot, epoch, since]. */
+
+/* What is read of msgpack: where it goes on, and what is left of it. A size that is not there makes `left` 0 and `is_bad` true. */
+typedef struct fb_pack_ {
+    const unsigned char *at;
+    uint64_t left;
+    bool is_bad;
+} fb_pack_;
+
+/* The next `size` bytes as a number, the highest first. */
+static inline uint64_t fb_unpacked_(fb_pack_ *pack, uint32_t size)
+{
+    uint64_t number = 0;
+    if (pack->left < size) {
+        pack->is_bad = true;
+        pack->left = 0;
+        return 0;
+    }
+    for (uint32_t index = 0; index < size; index++)
+        number = number << 8 | pack->at[index];
+    pack->at += size;
+    pack->left -= size;
+    return number;
+}
+
+/* How many elements a map or an array has. */
+static inline uint64_t fb_unpacked_count_(fb_pack_ *pack, uint32_t small, uint32_t wide)
+{
+    const uint32_t kind = (uint32_t)fb_unpacked_(pack, 1);
+    if ((kind & 0xF0) == small)
+        return kind & 0x0F;
+    pack->is_bad = pack->is_bad || (kind != wide && kind != wide + 1);
+    return fb_unpacked_(pack, kind == wide ? 2 : 4);
+}
+
+static inline uint64_t fb_unpacked_number_(fb_pack_ *pack)
+{
+    const uint32_t kind = (uint32_t)fb_unpacked_(pack, 1);
+    if (kind < 0x80)
+        return kind;
+    pack->is_bad = pack->is_bad || kind < 0xCC || kind > 0xCF;
+    return pack->is_bad ? 0 : fb_unpacked_(pack, 1u << (kind - 0xCC));
+}
+
+/* The next text; its length in `size`. */
+static inline const char *fb_unpacked_text_(fb_pack_ *pack, uint64_t *size)
+{
+    const uint32_t kind = (uint32_t)fb_unpacked_(pack, 1);
+    const bool is_small = (kind & 0xE0) == 0xA0;
+    const char *text;
+    pack->is_bad = pack->is_bad || (!is_small && (kind < 0xD9 || kind > 0xDB));
+    *size = is_small ? kind & 0x1F : pack->is_bad ? 0 : fb_unpacked_(pack, 1u << (kind - 0xD9));
+    text = (const char *)pack->at;
+    if (*size > pack->left) {
+        pack->is_bad = true;
+        *size = 0;
+    }
+    pack->at += *size;
+    pack->left -= *size;
+    return text;
+}
+
+/* Find a component in the agent's table. 0, -ENOENT, -EBADMSG. */
+static inline int fb_look_up_(fb_component *component, uint32_t size)
+{
+    fb_pack_ pack = {component->table, size, false};
+    const uint64_t count = fb_unpacked_count_(&pack, 0x80, 0xDE);
+    for (uint64_t index = 0; index < count && !pack.is_bad; index++) {
+        uint64_t name_size, robot_size;
+        const char *name = fb_unpacked_text_(&pack, &name_size);
+        const bool is_short = fb_unpacked_count_(&pack, 0x90, 0xDC) != 3;
+        const char *robot = fb_unpacked_text_(&pack, &robot_size);
+        const uint64_t epoch = fb_unpacked_number_(&pack), since = fb_unpacked_number_(&pack);
+        pack.is_bad = pack.is_bad || is_short || robot_size > 64;
+        if (pack.is_bad || name_size != strlen(component->path) || memcmp(name, component->path, name_size) != 0)
+            continue;
+        memcpy(component->primary, robot, robot_size);
+        component->primary[robot_size] = '\0';
+        component->epoch = epoch;
+        component->since = since;
+        return 0;
+    }
+    if (pack.is_bad)
+        return fb_fail_(EBADMSG, "damaged: the agent's table of primaries");
+    return fb_fail_(ENOENT, "the agent knows no robot that runs %s; failover status shows the components of the team", component->path);
+}
+
+/* See which robot runs a component now. */
+static inline int fb_see_primary_(fb_component *component)
+{
+    fb_place_ *place = fb_known_(component->primaries, FB_AGENT_);
+    fb_reading reading;
+    int outcome;
+    if (component->seen != 0 && fb_is_good_(place) && fb_load_(place->newest) == component->seen)
+        return 0;
+    outcome = fb_get_reading(component->primaries, FB_AGENT_, component->table, &reading);
+    if (outcome == -ENODATA)
+        return fb_fail_(ENOENT, "the agent knows no robot that runs %s: it has just started", component->path);
+    outcome = outcome == 0 ? fb_look_up_(component, reading.size) : outcome;
+    component->seen = outcome == 0 ? reading.number : 0;
+    return outcome;
+}
+
+/* What a robot has: 0; -ENODATA where it has not the item, or has never put it. */
+static inline int fb_of_robot_(fb_component *component, const char *robot, void *value, fb_reading *reading)
+{
+    const int outcome = fb_get_reading(component->item, robot, value, reading);
+    return outcome == -ENOENT ? -ENODATA : outcome;
+}
+
+static inline int fb_component_get(fb_component *component, void *value, fb_reading *reading)
+{
+    int outcome = fb_see_primary_(component);
+    if (outcome != 0)
+        return outcome;
+    outcome = fb_of_robot_(component, component->primary, value, reading);
+    if (outcome != 0 && outcome != -ENODATA)
+        return outcome;
+    /* Put by the copy that runs now: under its epoch, or since it runs there; its epoch may grow while it runs. */
+    const int64_t put_ns = outcome != 0 ? 0 : fb_clock_(CLOCK_BOOTTIME) - component->item->board->skew - reading->age_ns;
+    if (outcome == 0 && (reading->number >> FB_EPOCH_BITS_ >= component->epoch || put_ns >= (int64_t)component->since)) {
+        component->last = reading->number;
+        memcpy(component->robot, component->primary, sizeof component->robot);
+        return 0;
+    }
+    if (component->last != 0) {
+        outcome = fb_of_robot_(component, component->robot, value, reading);
+        if (outcome == 0 ? reading->number >= component->last : outcome != -ENODATA)
+            return outcome;
+    }
+    return fb_fail_(ENODATA, "item %s of %s: it runs on %s under epoch %llu, and has not put it there yet", component->item->name,
+                    component->path, component->primary, (unsigned long long)component->epoch);
+}
+
+static inline int fb_component_wait(fb_component *component, void *value, fb_reading *reading, uint64_t after,
+                                    const struct timespec *timeout)
+{
+    const int64_t limit = timeout == NULL ? INT64_MAX : (int64_t)timeout->tv_sec * 1000000000 + timeout->tv_nsec;
+    const int64_t begin = fb_clock_(CLOCK_MONOTONIC);
+    for (;;) {
+        const int outcome = fb_component_get(component, value, reading);
+        const int64_t left = limit == INT64_MAX ? (int64_t)FB_FOLLOW_NS_ : limit - (fb_clock_(CLOCK_MONOTONIC) - begin);
+        const struct timespec slice = {0, (long)(left < (int64_t)FB_FOLLOW_NS_ ? left : (int64_t)FB_FOLLOW_NS_)};
+        uint64_t newest;
+        if (outcome != 0 && outcome != -ENODATA)
+            return outcome;
+        if (outcome == 0 && reading->number != after)
+            return 0;
+        if (left <= 0)
+            return fb_fail_(ETIMEDOUT, "item %s of %s was not put in time", component->item->name, component->path);
+        fb_place_ *place = fb_known_(component->item, component->primary);
+        newest = fb_is_good_(place) ? fb_load_(place->newest) : 0;
+        if (fb_wait(component->item, component->primary, newest, &slice) == -ENOENT)
+            nanosleep(&slice, NULL);
+    }
+}
+
+static inline const char *fb_component_robot(const fb_component *component) { return component->robot; }
+
+static inline fb_item *fb_new_item_(fb_board *board, const char *name, uint64_t size, uint64_t digest)
+{
+    fb_item *item = (fb_item *)calloc(1, sizeof *item);
+    if (item != NULL) {
+        item->board = board;
+        item->size = size;
+        item->digest = digest;
+        memcpy(item->name, name, strlen(name));
+    }
+    return item;
+}
+
+static inline fb_component *fb_of(fb_item *item, const char *component)
+{
+    fb_board *board = item->board;
+    fb_component *made = NULL;
+    if (component == NULL || *component == '\0' || strlen(component) >= sizeof made->path) {
+        fb_fail_(EINVAL, "cannot follow item %s: a component is named by its path, as in /lab/robot1/mapper", item->name);
+        return NULL;
+    }
+    made = (fb_component *)calloc(1, sizeof *made);
+    if (made != NULL) {
+        made->item = item;
+        made->primaries = fb_new_item_(board, "primaries", FB_SIZE_MAX_, 0);
+        made->table = (unsigned char *)malloc(FB_SIZE_MAX_);
+    }
+    if (made == NULL || made->primaries == NULL || made->table == NULL) {
+        if (made != NULL) {
+            free(made->primaries);
+            free(made->table);
+        }
+        free(made);
+        fb_fail_(ENOMEM, "cannot follow item %s: no memory", item->name);
+        return NULL;
+    }
+    memcpy(made->path, component, strlen(component));
+    pthread_mutex_lock(&board->guard);
+    made->next = board->components;
+    board->components = made;
+    made->primaries->next = board->items;
+    board->items = made->primaries;
+    pthread_mutex_unlock(&board->guard);
+    return made;
+}
+
 /* --- Open, find, close ----------------------------------------------------------------------------------------------------------------- */
 
 static inline void fb_forking_(void)
@@ -1598,6 +1888,12 @@ static inline void fb_free_(fb_board *board)
         fb_place_ *place = board->given_up;
         board->given_up = place->older;
         free(place);
+    }
+    while (board->components != NULL) {
+        fb_component *component = board->components;
+        board->components = component->next;
+        free(component->table);
+        free(component);
     }
     while (board->items != NULL) {
         fb_item *item = board->items;
@@ -1652,15 +1948,11 @@ static inline fb_item *fb_find(fb_board *board, const char *name, size_t size, u
         fb_fail_(EINVAL, "cannot find item %.80s: a name has 1 to %d bytes, a value up to %d", name == NULL ? "" : name, FB_NAME_MAX_, FB_SIZE_MAX_);
         return NULL;
     }
-    item = (fb_item *)calloc(1, sizeof *item);
+    item = fb_new_item_(board, name, size, digest);
     if (item == NULL) {
         fb_fail_(ENOMEM, "cannot find item %s: no memory", name);
         return NULL;
     }
-    item->board = board;
-    item->size = size;
-    item->digest = digest;
-    memcpy(item->name, name, strlen(name));
     pthread_mutex_lock(&board->guard);
     outcome = fb_ensure_(board);
     outcome = outcome == 0 ? fb_bind_(item, NULL) : outcome;

@@ -11,6 +11,7 @@ static fb_board *board;
 static struct {
     char name[64];
     fb_item *item;
+    fb_component *of;
 } found[ITEMS];
 
 static fb_item *item_of(const char *name)
@@ -48,6 +49,39 @@ static void wait_for(const char *name, const char *robot, const char *after, con
     long long milliseconds = atoll(ms);
     struct timespec limit = {(time_t)(milliseconds / 1000), (long)(milliseconds % 1000) * 1000000};
     answer(fb_wait(item_of(name), robot_of(robot), strtoull(after, NULL, 10), &limit));
+}
+
+static fb_component *component_of(const char *name)
+{
+    for (int index = 0; index < ITEMS; index++)
+        if (strcmp(found[index].name, name) == 0)
+            return found[index].of;
+    return NULL;
+}
+
+static void follow(const char *name, const char *component)
+{
+    fb_component *made = fb_of(item_of(name), component);
+    for (int index = 0; made != NULL && index < ITEMS; index++)
+        if (strcmp(found[index].name, name) == 0)
+            found[index].of = made;
+    answer(made == NULL ? -errno : 0);
+}
+
+/* The number that a component has put; with `ms`: once it is another than that of `after`. */
+static void of_component(const char *name, const char *after, const char *ms)
+{
+    long long milliseconds = atoll(ms);
+    struct timespec limit = {(time_t)(milliseconds / 1000), (long)(milliseconds % 1000) * 1000000};
+    uint64_t value = 0;
+    fb_reading reading;
+    int outcome = *ms == '\0' ? fb_component_get(component_of(name), &value, &reading)
+                              : fb_component_wait(component_of(name), &value, &reading, strtoull(after, NULL, 10), &limit);
+    if (outcome != 0)
+        answer(outcome);
+    else
+        printf("%" PRIu64 " %s number %" PRIu64 " age %" PRId64 " max %" PRId64 "\n", value, fb_component_robot(component_of(name)),
+               reading.number, reading.age_ns, reading.age_max_ns);
 }
 
 static void add(const char *name, const char *size, const char *area, const char *type)
@@ -133,6 +167,12 @@ int main(void)
             fb_close(board), board = NULL, memset(found, 0, sizeof found), printf("ok\n");
         else if (strcmp(words[0], "add") == 0)
             add(words[1], words[2], words[3], words[4]);
+        else if (strcmp(words[0], "remove") == 0)
+            answer(fb_remove(board, words[1]));
+        else if (strcmp(words[0], "follow") == 0)
+            follow(words[1], words[2]);
+        else if (strcmp(words[0], "of") == 0)
+            of_component(words[1], words[2], words[3]);
         else if (strcmp(words[0], "find") == 0)
             find(words[1], words[2], words[3]);
         else if (strcmp(words[0], "put") == 0)
