@@ -21,6 +21,7 @@ from failover.boards import boottime, directory
 from failover.boards.board import Board, board
 from failover.boards.received import ReceivedItems
 from failover.core.board import ages, layout, recording
+from failover.core.board.item_types import parse
 from failover.core.board.items import Item
 from failover.core.board.layout import Wanted
 from failover.core.board.recording import Channel, Coder, Put
@@ -145,7 +146,7 @@ class _OwnItem:
         try:
             item = Item(
                 wanted.name,
-                recording.parse(wanted.text),
+                parse(wanted.text),
                 shared=shared,
                 period=wanted.period,
                 phase=wanted.phase,
