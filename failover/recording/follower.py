@@ -32,6 +32,7 @@ class Fresh(Struct, frozen=True):
     """A put that no earlier look gave.
 
     Attributes:
+        place: the same object for each put of an item that is declared so.
         private: its robot sends it to no other.
         now_ns: BOOTTIME at which it was read.
         bound_ns: past it a reading is stale; 0: there is none.
@@ -40,6 +41,7 @@ class Fresh(Struct, frozen=True):
 
     robot: str
     record: Record
+    place: object
     private: bool
     found: Found
     now_ns: int
@@ -193,7 +195,7 @@ class Follower:
             row.given, row.again = found.number, False
             now_ns = boottime.now_ns(self._board.skew_ns)
             bound_ns = row.record.bound_ns or place.words[place.formula]
-            yield Fresh(file.robot, row.record, private, found, now_ns, bound_ns, missed)
+            yield Fresh(file.robot, row.record, place, private, found, now_ns, bound_ns, missed)
 
     def _examine(self, file: _File) -> None:
         """Take the records as they are now; an item that is there still goes on.

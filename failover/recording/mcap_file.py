@@ -7,6 +7,7 @@ write(2). So a recorder that is killed leaves whole chunks, and behind them at m
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
 import struct
@@ -115,6 +116,7 @@ class NewFile:
             ) from None
         except OSError as error:
             raise RecordingError(f"cannot make {path}: {error.strerror}") from error
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)  # told to `recover`, for as long as this process writes it
         self._stream = _Stream(self._descriptor)
         self._writer = Writer(cast("IO[Any]", self._stream), chunk_size=CHUNK_SIZE)
         self._schemas: dict[SchemaText, int] = {}
@@ -340,6 +342,8 @@ def recover(path: Path, library: str) -> Recovered:
         RecordingError: it is none, or there is no room; nothing was changed.
     """
     recorded = Recorded(path)
+    if _is_written(path):
+        raise RecordingError(f"{path} is being recorded now: end its recorder first, which gives it its index")
     messages = sum(1 for _ in recorded.messages())
     if not recorded.loss.sentence(path):
         return Recovered(messages, recorded.loss, None)
@@ -362,6 +366,16 @@ def recover(path: Path, library: str) -> Recovered:
             ) from error
         raise
     return Recovered(file.messages, recorded.loss, kept)
+
+
+def _is_written(path: Path) -> bool:
+    """Whether a process writes a file."""
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _copy(recorded: Recorded, file: NewFile) -> None:

@@ -15,7 +15,7 @@ from msgspec import Struct
 from failover.boards import boottime
 from failover.boards.board import Board
 from failover.core.board import recording
-from failover.core.board.recording import Channel, Coder, Schema
+from failover.core.board.recording import Coder, Schema
 from failover.errors import BoardError, FailoverError
 from failover.recording.follower import Follower, Fresh
 
@@ -23,8 +23,8 @@ EACH_S: Final = 1.0
 """Between two messages of states and decisions, and two flushes: what a killed recorder loses at most."""
 SLEEP_S: Final = 0.1
 """The longest sleep without a look at the signal that ends it."""
-ASK_S: Final = 2.0
-"""Between two questions for decisions: an answer takes other robots a look at their event logs."""
+ASK_S: Final = 5.0
+"""Between two questions for decisions, which are seldom: an answer takes each robot a look at its event log on the disk."""
 LAST_ANSWER_S: Final = 3.0
 """For the decisions of the last seconds, at the end."""
 MARGIN_MS: Final = 5_000
@@ -70,6 +70,8 @@ class Decisions:
         """Ask once more, and end."""
         self._is_over.set()
         self._thread.join(LAST_ANSWER_S)
+        if self._thread.is_alive():
+            self.complaint = f"the agent has not answered the last question within {LAST_ANSWER_S:g} s"
 
     def taken(self) -> list[Mapping[str, Any]]:
         """Lines that were not given yet."""
@@ -125,7 +127,7 @@ class Stream:
         self._sink = sink
         self._decisions = decisions
         self._origin_ns = time.time_ns() - boottime.now_ns(board.skew_ns)
-        self._coders: dict[Channel, Coder] = {}
+        self._coders: dict[int, tuple[object, Coder, int]] = {}
         self._channels: dict[object, int] = {}
         self._pause = ""
         self.counts = Counts(set(), set(), [])
@@ -134,7 +136,7 @@ class Stream:
     def begin_anew(self, sink: Sink) -> None:
         """Another sink, which gets the newest value of each item."""
         self._sink = sink
-        self._channels = {}
+        self._channels, self._coders = {}, {}
         self._follower.again()
 
     def run(self, rate: float, span_s: float | None, each_second: Act = nothing, each_look: Act = nothing) -> None:
@@ -178,20 +180,26 @@ class Stream:
         self._pause = ""
 
     def _say_put(self, fresh: Fresh) -> None:
-        channel = recording.channel_of(fresh.robot, fresh.record, fresh.private)
-        if channel not in self._coders:
-            self._coders[channel] = Coder(channel)
-        if channel not in self._channels:
-            metadata = recording.metadata_of(channel)
-            self._channels[channel] = self._sink.channel(channel.topic, recording.item_schema(channel), metadata)
-        octets, number = fresh.found.value, fresh.found.number
-        put = self._coders[channel].put_of(octets, number, fresh.age_ns, fresh.age_max_ns, fresh.is_stale)
+        known = self._coders.get(id(fresh.place))
+        if known is None or known[0] is not fresh.place:
+            known = self._coders[id(fresh.place)] = (fresh.place, *self._line(fresh))
+        _, coder, channel = known
+        age_ns, number = fresh.age_ns, fresh.found.number
+        put = coder.put_of(fresh.found.value, number, age_ns, fresh.age_max_ns, fresh.is_stale)
         log_ns = self._origin_ns + fresh.now_ns
-        self._sink.add(self._channels[channel], log_ns, log_ns - fresh.age_ns, number, recording.encode(put))
+        self._sink.add(channel, log_ns, log_ns - age_ns, number, recording.encode(put))
         self.counts.puts += 1
         self.counts.missed += fresh.missed
         self.counts.robots.add(fresh.robot)
         self.counts.items.add(fresh.record.name)
+
+    def _line(self, fresh: Fresh) -> tuple[Coder, int]:
+        """How values of an item are said, and the number of its channel."""
+        channel = recording.channel_of(fresh.robot, fresh.record, fresh.private)
+        if channel not in self._channels:
+            metadata = recording.metadata_of(channel)
+            self._channels[channel] = self._sink.channel(channel.topic, recording.item_schema(channel), metadata)
+        return Coder(channel), self._channels[channel]
 
     def _say_robots(self) -> None:
         if self._pause:

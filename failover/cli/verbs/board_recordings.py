@@ -72,6 +72,8 @@ def record(arguments: argparse.Namespace) -> int:
         is_agents = not board.ensured().own.header.flags & layout.ALONE
         decisions = _decisions(arguments)
         recorder = Recorder(board, Follower(board, chosen(arguments)), plan, decisions)
+        if not arguments.json:
+            print(f"recording the board of {board.robot} to {plan.path}; Ctrl-C ends it", flush=True)
         with ended_by_signals(recorder.stream):
             recorder.run()
     told, files = recorder.stream.counts, recorder.files

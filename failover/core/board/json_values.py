@@ -15,14 +15,16 @@ from failover.errors import ValueMisfitError
 
 def plain(value: Any) -> Any:
     """A value as JSON can say it: bytes as hexadecimal, numbers that are not finite as None, arrays as lists."""
-    if isinstance(value, bytes | bytearray | memoryview):
-        return bytes(value).hex()
-    if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, int | str):
+        return value
     if isinstance(value, list | tuple):
         return [plain(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+    if isinstance(value, dict | Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, bytes | bytearray | memoryview):
+        return bytes(value).hex()
     return value
 
 
@@ -48,6 +50,15 @@ def of_json(kind: Type, value: Any, place: str) -> Any:
     if isinstance(kind, Array) and isinstance(value, list):
         return [of_json(kind.of, inner, f"{place}[{index}]") for index, inner in enumerate(value)]
     return value
+
+
+def says_all(kind: Type) -> bool:
+    """Whether JSON has each value of a type as it is, as long as its numbers are finite."""
+    if isinstance(kind, Record):
+        return all(says_all(inner) for _, inner in kind.fields)
+    if isinstance(kind, Array):
+        return not is_octets(kind) and says_all(kind.of)
+    return isinstance(kind, Number)
 
 
 def schema_of(kind: Type) -> dict[str, Any]:

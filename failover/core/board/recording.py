@@ -22,7 +22,7 @@ from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, UNBOUNDED_NS
 from failover.core.board.item_types import Opaque, Type, canonical, parse, size_of
 from failover.core.board.item_values import Values, values_of
 from failover.core.board.items import BANKS_MAX, BANKS_MIN, PERIOD_MAX, check_name, type_digest
-from failover.core.board.json_values import of_json, plain, schema_of
+from failover.core.board.json_values import of_json, plain, says_all, schema_of
 from failover.core.board.layout import Record, Wanted
 from failover.core.wire.names import check_robot
 from failover.errors import ItemError, NameFormatError, RecordingError, ValueMisfitError
@@ -286,14 +286,20 @@ class Coder:
         self._place = channel.topic
         self._kind = channel.kind
         self._values: Values = values_of(self._kind)
+        self._is_plain = says_all(self._kind)
 
     def put_of(self, octets: bytes, number: int, age_ns: int, age_max_ns: int, stale: bool) -> Put:
         """The message of a put. Whatever bytes a writer put, the message holds them all."""
         value: msgspec.Raw | None = None
         try:
-            value = msgspec.Raw(encode(plain(self._values.unpack(octets))))
-            is_all = self._values.pack(of_json(self._kind, _decode(value), self._place)) == octets
-        except (ValueMisfitError, TypeError, RecursionError):  # TypeError: what msgpack can say and JSON cannot
+            there = self._values.unpack(octets)
+            told = plain(there)
+            value = msgspec.Raw(encode(told))
+            if self._is_plain:
+                is_all = told == there and self._values.pack(there) == octets
+            else:
+                is_all = self._values.pack(of_json(self._kind, _decode(value), self._place)) == octets
+        except (ValueMisfitError, TypeError, UnicodeError, RecursionError):  # what msgpack can say and JSON cannot
             is_all = False
         return Put(
             value,

@@ -80,10 +80,23 @@ def test_an_unfinished_file_is_recovered_and_kept_as_it_was(tmp_path: Path) -> N
     assert done.kept == tmp_path / "a.mcap.before" and done.kept.read_bytes() == torn
     assert done.loss.tail > 0
     assert by_mcap(path) == numbers(Recorded(path)) == list(range(done.messages))
+    path.unlink()
     path.write_bytes(torn)
     with pytest.raises(RecordingError, match="from an earlier recovery"):
         recover(path, "test")
     assert path.read_bytes() == torn
+
+
+def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    file = NewFile(path, "test")
+    file.add(file.channel("/r/i", None, {}), 1, 1, 1, b"{}")
+    file.flush()
+    with pytest.raises(RecordingError, match="is being recorded now"):
+        recover(path, "test")
+    assert numbers(Recorded(path)) == [1] and len(list(tmp_path.iterdir())) == 1
+    file.close()
+    assert by_mcap(path) == [1]
 
 
 def test_a_damaged_chunk_is_left_out_and_told(tmp_path: Path) -> None:

@@ -47,6 +47,8 @@ while True:
         say("ready")
     time.sleep(0.004)
 """
+AGE_NS = 30_000_000_000
+"""Of each value in `recorded_team`: more than the test takes, less than any machine that runs it is up."""
 RECORDER = (sys.executable, "-m", "failover", "board", "record")
 
 
@@ -274,7 +276,7 @@ def test_a_signal_ends_a_recording_in_order(place: Path, tmp_path: Path) -> None
 
 
 def recorded_team(path: Path, here: str = "robot1", format_: str = recording.FORMAT) -> None:
-    """Two robots: robot1 recorded; ten puts of each, 100 ms between two, 20 ms old, robot2's with 5 ms of doubt."""
+    """Two robots: robot1 recorded; ten puts of each, 100 ms between two, 30 s old, robot2's with 5 ms of doubt."""
     file = NewFile(path, "test")
     states = file.channel(recording.ROBOTS_TOPIC, recording.ROBOTS_SCHEMA, {})
     robots = (recording.Robot(here, "run", 0, 0), recording.Robot("robot2", "remove", 30_000, 1))
@@ -289,8 +291,8 @@ def recorded_team(path: Path, here: str = "robot1", format_: str = recording.FOR
         for robot, one in channels.items():
             octets = layout.struct.pack("<dI4x", step / 2, step)
             error_ns = 0 if robot == here else 5_000_000
-            put = recording.Coder(one).put_of(octets, 1000 + step, 20_000_000, 20_000_000 + error_ns, False)
-            file.add(numbers[robot], log_ns, log_ns - 20_000_000, put.number, recording.encode(put))
+            put = recording.Coder(one).put_of(octets, 1000 + step, AGE_NS, AGE_NS + error_ns, False)
+            file.add(numbers[robot], log_ns, log_ns - AGE_NS, put.number, recording.encode(put))
     file.add(states, log_ns, log_ns, 0, recording.encode(recording.Robots(here, robots)))
     file.close()
 
@@ -319,8 +321,8 @@ say(newest.value["n"], state)
             here, *robots, step, age, doubt = running.hear().split()
             other_age, other_doubt = running.hear().split()
             assert (here, robots) == ("robot1", ["robot1", "robot2"]) and 0 <= int(step) <= 9
-            assert int(age) >= 20_000_000 and int(doubt) == 0
-            assert int(other_age) >= 20_000_000 and 4_999_000 <= int(other_doubt) <= 5_001_000
+            assert int(age) >= AGE_NS and int(doubt) == 0
+            assert int(other_age) >= AGE_NS and 4_999_000 <= int(other_doubt) <= 5_001_000
             replay.send_signal(signal.SIGTERM)
             replay.wait()
             running.tell("")
@@ -339,7 +341,7 @@ def test_a_replay_gives_every_value_in_order(place: Path, tmp_path: Path, capsys
         assert [ball.get(robot).value["n"] for robot in (None, "robot2")] == [9, 9]
         assert (ball.get().number, ball.get("robot2").number) == (10, 10)
         assert board.robots()["robot2"].state == "not"
-        assert ball.get().age_ns >= 20_000_000
+        assert ball.get().age_ns >= AGE_NS
         path.write_bytes(path.read_bytes()[:-100])
         assert answered(capsys, "replay", str(path), "--pace", "1000")["lost"][0].startswith(f"{path}: it was not finished")
 
@@ -379,7 +381,7 @@ def test_an_agents_board_is_left_alone_unless_names_have_a_prefix(
                 _, err = said(capsys, "replay", str(path), "--as", "new", status=1)
                 assert f"pid {replay.pid} replays a recording" in err
                 reading = board.item("old.robot2.ball").wait(timeout=30)
-                assert reading.age_ns >= 20_000_000 and reading.robot == "robot1"
+                assert reading.age_ns >= AGE_NS and reading.robot == "robot1"
                 assert set(board.names()) == {"ball", "old.robot1.ball", "old.robot2.ball"}
                 replay.terminate()
                 replay.communicate()
