@@ -204,7 +204,7 @@ class Follower:
             BoardGoneError: the file is another one by now.
         """
         generation = file.file.generation
-        given = {row.record: (row.given, row.again) for row in file.rows}
+        known = {row.record: row for row in file.rows}
         records = [record for record in file.file.records() if self._choice.has(file.robot, record.name)]
-        file.rows = [_Row(record, file.file.place(record), *given.get(record, (0, False))) for record in records]
+        file.rows = [known.get(record) or _Row(record, file.file.place(record)) for record in records]
         file.generation = generation if generation % 2 == 0 else -1

@@ -30,6 +30,9 @@ LAST_ANSWER_S: Final = 3.0
 MARGIN_MS: Final = 5_000
 """By how much questions overlap: a line comes late where its robot answers late."""
 
+CODERS_MAX: Final = 65_536
+"""Items whose coders are remembered: those that were removed are never asked for again."""
+
 Ask = Callable[[int], Mapping[str, Any]]
 """``(age_ms_max)`` → the agent's answer to ``why``."""
 
@@ -182,6 +185,8 @@ class Stream:
     def _say_put(self, fresh: Fresh) -> None:
         known = self._coders.get(id(fresh.place))
         if known is None or known[0] is not fresh.place:
+            if len(self._coders) >= CODERS_MAX:
+                self._coders.clear()
             known = self._coders[id(fresh.place)] = (fresh.place, *self._line(fresh))
         _, coder, channel = known
         age_ns, number = fresh.age_ns, fresh.found.number

@@ -156,3 +156,11 @@ def test_a_port_that_is_taken_is_told(board: Board, capsys: pytest.CaptureFixtur
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert f"cannot listen at 127.0.0.1, port {port}: " in refused(capsys, str(port))
+
+
+def test_without_the_library_it_says_how_to_install_it(
+    board: Board, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    board.add(failover.Item("goal", size=4))
+    assert "pip install 'failover[foxglove]'" in refused(capsys, "8765")

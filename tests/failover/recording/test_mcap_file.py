@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import sys
 from pathlib import Path
 
 import pytest
@@ -141,3 +142,11 @@ def test_a_file_is_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="exists, and a recording is never overwritten"):
         NewFile(path, "test")
     assert path.read_text() == "mine"
+
+
+def test_without_the_library_it_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    for act in (lambda: NewFile(tmp_path / "a.mcap", "test"), lambda: Recorded(tmp_path / "a.mcap")):
+        with pytest.raises(RecordingError, match=r"needs the library mcap, .* pip install 'failover\[record\]'"):
+            act()
+    assert list(tmp_path.iterdir()) == []
