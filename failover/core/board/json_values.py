@@ -61,10 +61,14 @@ def says_all(kind: Type) -> bool:
     return isinstance(kind, Number)
 
 
-def schema_of(kind: Type) -> dict[str, Any]:
-    """The JSON Schema of a type's values, as `plain` writes them."""
+def schema_of(kind: Type) -> dict[str, Any] | None:
+    """The JSON Schema of a type's values, as `plain` writes them.
+
+    None for what Foxglove and Lichtblick refuse in a schema: arrays of arrays, and contents of any type (msgpack, json). A struct
+    leaves such fields out; the values have them nevertheless. Source: lichtblick, packages/mcap-support/src/parseJsonSchema.ts.
+    """
     if isinstance(kind, Opaque):
-        return {"type": "string", "description": "hexadecimal"} if kind.kind == "bytes" else {"description": kind.kind}
+        return {"type": "string", "description": "hexadecimal"} if kind.kind == "bytes" else None
     if isinstance(kind, Number):
         return _number(kind.code)
     if isinstance(kind, Text):
@@ -72,9 +76,13 @@ def schema_of(kind: Type) -> dict[str, Any]:
     if is_octets(kind):
         return {"type": "string", "description": "hexadecimal"}
     if isinstance(kind, Array):
-        return {"type": "array", "items": schema_of(kind.of), "minItems": kind.count, "maxItems": kind.count}
-    properties = {name: schema_of(inner) for name, inner in kind.fields}
-    return {"type": "object", "properties": properties, "required": list(properties)}
+        items = schema_of(kind.of)
+        if items is None or items["type"] == "array":
+            return None
+        return {"type": "array", "items": items, "minItems": kind.count, "maxItems": kind.count}
+    found = {name: schema_of(inner) for name, inner in kind.fields}
+    properties = {name: inner for name, inner in found.items() if inner is not None}
+    return {"type": "object", "properties": properties, "required": list(found)}
 
 
 def _number(code: str) -> dict[str, Any]:

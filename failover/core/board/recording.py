@@ -197,13 +197,13 @@ def schema_name(channel: Channel) -> str:
 def item_schema(channel: Channel) -> Schema:
     """The schema of an item's messages."""
     whole = {"type": "integer", "minimum": 0}
-    properties = {
-        "value": schema_of(channel.kind),
+    value = schema_of(channel.kind)
+    properties = ({} if value is None else {"value": value}) | {
         "number": whole | {"description": "of the put"},
         "age_us": whole | {"description": "since it was produced, at least"},
         "age_max_us": whole | {"description": "at most; left out where no bound is known"},
         "stale": {"type": "boolean", "description": "it may be older than its bound"},
-        "raw": {"type": "string", "description": "bytes of the value in base64, where JSON does not say them all"},
+        "raw": {"type": "string", "contentEncoding": "base64", "description": "the value's bytes, where JSON does not say all"},
     }
     required = ["value", "number", "age_us", "stale"]
     name = schema_name(channel)

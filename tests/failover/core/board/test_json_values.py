@@ -26,6 +26,7 @@ def test_hexadecimal_text_is_bytes_where_bytes_belong() -> None:
 
 def test_a_schema_says_names_and_limits() -> None:
     schema = schema_of(parse("{x:f4,n:u1,v:i2[3],on:bool,name:char[8],mark:u1[6]}"))
+    assert schema is not None
     assert schema["required"] == ["x", "n", "v", "on", "name", "mark"]
     assert schema["properties"] == {
         "x": {"type": "number"},
@@ -35,4 +36,11 @@ def test_a_schema_says_names_and_limits() -> None:
         "name": {"type": "string"},
         "mark": {"type": "string", "description": "hexadecimal"},
     }
-    assert schema_of(parse("msgpack[9]")) == {"description": "msgpack"}
+
+
+def test_a_schema_leaves_out_what_programs_that_look_on_refuse() -> None:
+    assert schema_of(parse("msgpack[9]")) is schema_of(parse("f4[2][3]")) is schema_of(parse("{v:f4[2][2]}[3][2]")) is None
+    inner = schema_of(parse("{grid:f4[2][3],x:f4}[4]"))
+    assert inner is not None
+    assert inner["items"] == {"type": "object", "properties": {"x": {"type": "number"}}, "required": ["grid", "x"]}
+    assert schema_of(parse("{grid:f4[2][3]}")) == {"type": "object", "properties": {}, "required": ["grid"]}
