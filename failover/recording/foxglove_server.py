@@ -17,8 +17,6 @@ from failover.core.board.recording import Schema
 from failover.errors import RecordingError
 
 if TYPE_CHECKING:
-    import foxglove
-
     from failover.recording.follower import Follower
 
 WISHES_MAX: Final = 4096
@@ -63,13 +61,15 @@ class LiveServer:
             ) from None
         self._foxglove: Any = foxglove
         self._follower = follower
-        self._context = foxglove.Context()
-        self._channels: list[foxglove.Channel] = []
+        self._context: Any = foxglove.Context()
+        self._channels: list[Any] = []
         self._items: dict[str, tuple[str, str]] = {}
         self._numbers: dict[str, int] = {}
         self._wishes: deque[str] = deque(maxlen=WISHES_MAX)
         try:
-            self._server = foxglove.start_server(name=name, host=address, port=port, context=self._context, server_listener=self)  # type: ignore[arg-type]
+            self._server = self._foxglove.start_server(
+                name=name, host=address, port=port, context=self._context, server_listener=self
+            )
         except (RuntimeError, OSError) as error:
             raise RecordingError(f"cannot listen at {address}, port {port}: {error}; give another port") from error
         self.port = int(self._server.port)

@@ -101,7 +101,7 @@ def record(arguments: argparse.Namespace) -> int:
         f"{recorder.took_s:.1f} s, {size(written)}"
     )
     if told.missed:
-        print(f"{told.missed} puts were replaced between two looks and are not in it; --rate {arguments.rate * 2} sees more")
+        print(f"{told.missed} puts were replaced between two looks and are not in it; more looks (--rate) see more")
     return 0
 
 
