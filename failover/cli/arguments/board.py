@@ -65,12 +65,11 @@ def board(room: argparse.ArgumentParser) -> None:
 def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
     """Of ``record``, ``replay`` and ``serve``."""
     some = argparse.ArgumentParser(add_help=False, parents=[of_board])
-    some.add_argument(
-        "--items", metavar="PATTERN", nargs="+", default=[], help="only items of these names: * and ? stand for any characters"
-    )
-    some.add_argument("--robots", metavar="PATTERN", nargs="+", default=[], help="only items of these robots")
+    for option, what in (("--items", "of this name: * and ? stand for any characters"), ("--robots", "of this robot, likewise")):
+        help_ = f"only items {what}; may be given again"
+        some.add_argument(option, metavar="PATTERN", action="append", default=[], help=help_)
     record = add_act(acts, "record", some, "each put of each item, with its age, into an MCAP file", RECORD_DESCRIPTION)
-    record.add_argument("file", metavar="FILE", help="the file, which must not exist: team.mcap")
+    record.add_argument("file", metavar="FILE", help="the file, team.mcap, which must not exist yet; with --recover, it must")
     record.add_argument("--for", dest="span", metavar="SPAN", type=_span_ms, help="end after 10s, 5min, 2h (default: at Ctrl-C)")
     _add_looks(record)
     record.add_argument(
@@ -212,7 +211,7 @@ SERVE_DESCRIPTION: Final = """
     ssh -L 8765:localhost:8765 ROBOT.
 
       failover board serve --foxglove 8765
-      failover board serve --foxglove 8765 --items ball 'pose*' --rate 20
+      failover board serve --foxglove 8765 --items ball --items 'pose*' --rate 20
     """
 
 REPLAY_DESCRIPTION: Final = """
