@@ -45,6 +45,14 @@ Publish = Callable[[Whose, Envelope], bool]
 """Called with (whose, message): send it if that one takes it now; False: it is gone."""
 
 
+Fence = Callable[[int], str]
+"""Called with the epoch of the driver of which a sender has heard: why this copy may not act any more; "" if it may."""
+
+
+def _acts(_: int) -> str:
+    return ""
+
+
 class Subscriber(Struct):
     """One who gets a stream. ``until_ns``: unless it asks again."""
 
@@ -80,16 +88,23 @@ class Actor:
             "_subscribe": self._subscribe,
             "_unsubscribe": self._unsubscribe,
         }
+        self.fence: Fence = _acts
         self._traffic = Traffic()
-        self._routes: OrderedDict[str, Whose] = OrderedDict()
+        self._routes: OrderedDict[str, tuple[int, Whose]] = OrderedDict()
+        """Sender → its life, and the way back to it."""
 
     def came(self, envelope: Envelope, whose: Whose, now_ns: int, size: int = 0) -> list[Envelope]:
         """Take in a message of so many bytes; answers that leave at once."""
         if not envelope.sender:
             envelope = msgspec.structs.replace(envelope, sender=f"by-hand-{hash(whose) & 0xFFFFFFFF:08x}")
-        self._routes[envelope.sender] = whose
+        known = self._routes.get(envelope.sender, (0, None))[0]
+        if 0 < envelope.boot < known:
+            return []  # its sender was started again: no process waits for an answer
+        self._routes[envelope.sender] = (max(envelope.boot, known), whose)
         if len(self._routes) > SENDERS_MAX:
             self._routes.popitem(last=False)
+        if why := self.fence(envelope.epoch):
+            return [refusal(envelope, "moved", why)]
         if not self._is_meant(envelope.to):
             here = f"this is {self._declaration.path}, and not {envelope.to}: look the name up anew"
             return [refusal(envelope, "wrong_driver", here)]
@@ -105,7 +120,11 @@ class Actor:
 
     def route(self, sender: str) -> Whose | None:
         """The way back to a sender; None: it is forgotten."""
-        return self._routes.get(sender)
+        return self._routes.get(sender, (0, None))[1]
+
+    def give_back(self, why: str) -> list[Envelope]:
+        """Answers to all messages that wait: they are for a later copy of the driver."""
+        return [refusal(one, "moved", why) for one in self._mailbox.give_back()]
 
     def forbidden(self, envelope: Envelope, whose: Whose) -> str:
         """Why a message may not come over this way; "" if it may. Asked as it comes: later the way may be forgotten."""
@@ -146,6 +165,8 @@ class Actor:
         """Carry out the next message, if there is one and it is its turn; answers that leave now."""
         now_ns = clock()
         first = self._mailbox.first()
+        if first is not None and (why := self.fence(0)):
+            return self.give_back(why)
         is_turn = first is not None and not (self._is_paced(first) and self._pace.wait_ns(now_ns))
         if self._keeping is None:
             if not is_turn:
@@ -230,7 +251,7 @@ class Actor:
         """Send a stream to who asks, for `LEASE_NS`; what comes of it: the rate, or None without such a stream."""
         name = message.body.get("stream") if isinstance(message.body, dict) else None
         verb = self._declaration.verbs.get(name) if isinstance(name, str) else None
-        whose = self._routes.get(message.sender)
+        whose = self.route(message.sender)
         if verb is None or verb.marked.role != "stream" or whose is None:
             return None
         key = (whose, verb.name)
@@ -240,7 +261,7 @@ class Actor:
         return verb.marked.rate_hz if key in self._subscribers else None
 
     def _unsubscribe(self, message: Envelope, _: int) -> Any:
-        whose = self._routes.get(message.sender)
+        whose = self.route(message.sender)
         for key in [key for key in self._subscribers if key[0] == whose]:
             del self._subscribers[key]
         return None
@@ -258,6 +279,8 @@ class Actor:
                 continue
             period_ns = round(SECOND / those[0].verb.marked.rate_hz)
             self._samples_ns[name] = max(self._samples_ns[name] + period_ns, now_ns)
+            if self.fence(0):
+                continue
             said = self.called(those[0].verb, {}, Envelope(verb=name))
             for one in those:
                 envelope = msgspec.structs.replace(said, to=one.to, verb=name, sender=self._declaration.path)

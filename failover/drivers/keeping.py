@@ -48,15 +48,12 @@ class Keeping:
 
         self._task: Task = open_task(declaration.path, schema, begin)
         PROCESS.keep(self._task)
+        if self._task.resumed is None:
+            self._task.commit()  # a standby gets it before the first message: a driver that waits for one is protected, too
         self.mailbox = Mailbox(unpacked(self._task.value[MAILBOX]))
         self._waiting: deque[tuple[int, int]] = deque()
         """(commit, messages handled by then): their answers leave when the commit is safe."""
         self.instance: Any = component.instance_of(cls, self._task)
-
-    @property
-    def epoch(self) -> int:
-        """Of the primacy under which the driver runs; 0 without an agent."""
-        return self._task.epoch
 
     def fileno(self) -> int:
         """Can be read when `safe` may have something new."""

@@ -30,7 +30,7 @@ UNSENT_MAX: Final = 1 << 20
 CHUNK: Final = 256 << 10
 SIZE_SIZE: Final = 4
 MS: Final = 1_000_000
-CONNECT_AGAIN_S: Final = 0.02
+CONNECT_AGAIN_MS: Final = 20
 """Between two tries to reach a driver that does not listen."""
 
 SEND_LIMIT_S: Final = 1
@@ -238,19 +238,31 @@ class LocalWay:
         """Send as soon as the driver listens; False: it did not within the time."""
         until = time.monotonic_ns() + timeout_ns
         while not self.send(content):
-            left_s = (until - time.monotonic_ns()) / 1e9
-            if left_s <= 0:
+            left_ns = until - time.monotonic_ns()
+            if left_ns <= 0 or not self.await_open(left_ns, -1):
                 return False
-            time.sleep(min(left_s, CONNECT_AGAIN_S))
         return True
 
-    def await_message(self, timeout_ns: int) -> bytes | None:
-        """What comes; None: nothing within the time, or the driver has ended: then `is_lost`."""
+    def await_open(self, timeout_ns: int, wake: int) -> bool:
+        """Whether the driver listens within the time; ``wake``: a descriptor that ends the wait, too."""
+        until = time.monotonic_ns() + timeout_ns
+        while self._open() is None:
+            left_ms = (until - time.monotonic_ns()) // MS
+            if left_ms <= 0 or _readable(wake, min(left_ms, CONNECT_AGAIN_MS)):
+                return False
+        return True
+
+    def await_message(self, timeout_ns: int, wake: int = -1) -> bytes | None:
+        """What comes; None: nothing within the time, or `wake` can be read, or the driver has ended: then `is_lost`."""
         if self._came:
             return self._came.pop(0)
         until = time.monotonic_ns() + timeout_ns
         while (end := self._end) is not None:
-            self._limit(end, max(-(-timeout_ns // MS), 1))
+            timeout_ms = max(-(-timeout_ns // MS), 1)
+            if wake < 0:
+                self._limit(end, timeout_ms)
+            elif not _readable(end.fileno(), timeout_ms, wake):
+                return None
             try:
                 content = end.recv(CHUNK)
                 self._came = self._framed.take(content)
@@ -282,3 +294,12 @@ class LocalWay:
         """Let it go; what was sent arrives."""
         self.closed = True
         self._lose()
+
+
+def _readable(descriptor: int, timeout_ms: int, wake: int = -1) -> bool:
+    """Whether it can be read within the time; below 0: never. ``wake``: ends the wait, too."""
+    poller = select.poll()
+    for one in (descriptor, wake):
+        if one >= 0:
+            poller.register(one, select.POLLIN)
+    return any(found == descriptor for found, _ in poller.poll(timeout_ms))

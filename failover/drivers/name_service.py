@@ -6,14 +6,18 @@ import contextlib
 import os
 import threading
 import time
+from collections.abc import Callable
 from typing import Final
+
+import msgspec
 
 from failover.boards import boottime
 from failover.core.naming.records import Record
 from failover.core.naming.scan import MULTICAST, Scan, Send, Terms
-from failover.core.naming.tree import Place, Tree, robot_of
+from failover.core.naming.tree import Place, Reach, Tree, robot_of
 from failover.drivers.exchange import DOOR_RETRY_NS, ENDING, Exchange
 from failover.drivers.here import Here, stem
+from failover.errors import NameFormatError
 
 BOOT_SHIFT: Final = 20
 """A boot is the wall clock in ns, shifted: it grows each millisecond. If the clock was set back, the scan mends it."""
@@ -31,8 +35,17 @@ def new_boot() -> int:
 class NameService:
     """Registers one record as long as it is open. `resolve` and `tree` may be called from any thread."""
 
-    def __init__(self, here: Here, record: Record, terms: Terms = Terms()) -> None:  # noqa: B008  frozen
+    def __init__(
+        self,
+        here: Here,
+        record: Record,
+        terms: Terms = Terms(),  # noqa: B008  frozen
+        epoch: Callable[[], int] = lambda: 0,
+    ) -> None:
         """
+        Args:
+            epoch: of the primacy under which the driver runs now; 0 without an agent.
+
         Raises:
             NameFormatError: the record cannot be registered.
             DriverError: the sockets cannot be made.
@@ -43,6 +56,9 @@ class NameService:
         self._skew = boottime.skew_ns()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._is_over = False
+        self._epoch = epoch
+        self.rival: Place | None = None
+        """A living driver of the same path under the highest epoch of all that are not this one; None: there is none."""
         self._told: dict[str, tuple[int, int]] = {}
         self._scan = Scan(
             f"{here.robot}/{name}",
@@ -74,6 +90,10 @@ class NameService:
         """
         with self._lock:
             self.record = self._scan.put(record, self._now_ns())
+        os.eventfd_write(self._wake, 1)
+
+    def look(self) -> None:
+        """The epoch has changed: register it, from any thread."""
         os.eventfd_write(self._wake, 1)
 
     def tree(self) -> Tree:
@@ -116,6 +136,7 @@ class NameService:
     def _turn(self, now_ns: int, until_ns: int) -> None:
         """Scan if it is due; then take in what comes, once it comes, until the next scan at most."""
         with self._lock:
+            self._renew(now_ns)
             sends = self._scan.tick(now_ns)
             until_ns = min(until_ns, self._scan.next_ns())
         self._exchange.send(sends)
@@ -124,8 +145,20 @@ class NameService:
             with self._lock:
                 sends = self._scan.heard(message, self._now_ns())
             self._exchange.send(sends)
+        self._find_rival()
         if messages and self._exchange.is_door:
             self._pass_on()
+
+    def _renew(self, now_ns: int) -> None:
+        """Tell the epoch under which the driver runs on, if it is another one."""
+        if not self._is_over and (epoch := self._epoch()) > self.record.epoch:
+            with contextlib.suppress(NameFormatError):  # no room for a larger number: what senders tell each other decides
+                self.record = self._scan.put(msgspec.structs.replace(self.record, epoch=epoch), now_ns, urgent=True)
+
+    def _find_rival(self) -> None:
+        places = self.tree().claimants(self.record.path)
+        others = [one for one in places if one.origin != self._scan.origin and one.reach is Reach.LIVE and not one.refused]
+        self.rival = max(others, key=lambda one: one.record.epoch, default=None)
 
     def _pass_on(self) -> None:
         """The door tells other robots at once what is new on this one, and this one's drivers what is new elsewhere."""

@@ -1,106 +1,109 @@
 """What a program calls drivers by: the name is looked up, and messages are sent until they are answered.
 
     with failover.proxy("engine") as engine:
-        engine.call("set", duty=0.4)
-        print(engine.call("read"))
+        engine.call("set", duty=0.4)                   # waits for the answer
+        done = engine.post("set", duty=0.5)            # does not; a concurrent.futures.Future
         for amperes in engine.stream("current"):
             ...
 
-A call is sent again until it is answered or its time is over; the driver carries it out once. Calls of one proxy are carried out
-in order. A proxy may be used by several threads; one call goes on at a time.
+A message is sent again until it is answered or its time is over; the driver carries it out once. Calls and posts of one proxy are
+carried out in order. A proxy may be used by several threads; one call goes on at a time.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import itertools
 import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 from msgspec import UNSET
 
-from failover.boards import boottime
 from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import Envelope, Hop
-from failover.core.messaging.mailbox import MS, RESEND_FIRST_NS, Outbox
+from failover.core.messaging.envelope import TEXT_MAX, Envelope, Hop
+from failover.core.messaging.mailbox import MS, WINDOW
 from failover.core.naming.tree import Place
 from failover.drivers.actor import LEASE_NS
 from failover.drivers.here import Here, here, lives
-from failover.drivers.local import SCHEME, LocalWay
 from failover.drivers.lookup import lookup
-from failover.drivers.name_service import new_boot
-from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError
-
-if TYPE_CHECKING:
-    from failover.drivers.sockets import TeamWay
+from failover.drivers.sending import EXPIRED, SECOND_NS, Posting, decoded, refused, sending, way_to
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, NoAnswerError
 
 TIMEOUT_S: Final = 5.0
-"""How long a call waits unless told otherwise."""
-
-SECOND_NS: Final = 1_000_000_000
+"""How long a call waits unless told otherwise; and the end of a ``with`` block for what was posted in it."""
 
 _NUMBERS: Final = itertools.count(1)
 
 
-def proxy(name: str) -> Proxy:
+def proxy(name: str, *, queue: int = WINDOW, sender: str = "") -> Proxy:
     """The driver of that name: a path, an alias, or an address.
+
+    Args:
+        queue: messages that may wait for an answer, from 1 to 1,024; one more is refused.
+        sender: a name of this program that stays the same when it is started again: what its process before has sent and was not
+            carried out is then never carried out after what this one sends. One process at a time uses it. "": a new name.
 
     Raises:
         NameFormatError, NameUnknownError, NameAmbiguousError: it names nothing, or several things.
-        DriverError: it is on another robot, and no key of the team can be read here.
+        DriverError: it is on another robot, and no key of the team can be read here; or an argument cannot work.
     """
     place = here()
-    return Proxy(place, lookup(place, name))
+    return Proxy(place, lookup(place, name), queue=queue, sender=sender)
 
 
 class Proxy:
     """One driver, as another process calls it; a context manager."""
 
-    def __init__(self, here: Here, place: Place) -> None:
+    def __init__(self, here: Here, place: Place, *, queue: int = WINDOW, sender: str = "") -> None:
         """
         Raises:
-            DriverError: it is on another robot that cannot be reached.
+            DriverError: it is on another robot that cannot be reached, or an argument cannot work.
         """
         self.here = here
-        self.place = place
         self.path = place.record.path
         self.last: Envelope | None = None
-        """The newest answer, with its hops."""
+        """The newest answer to a call, with its hops."""
+        if not 1 <= queue <= WINDOW:
+            raise DriverError(f"queue={queue} is no number of messages that can wait: write one from 1 to {WINDOW}")
+        if not sender.isprintable() or "/" in sender or len(sender) + len(here.robot) >= TEXT_MAX // 2:
+            raise DriverError(f"sender={sender[:64]!r} cannot name a program: write visible characters without /, 200 at most")
         program = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python").stem
-        self.sender = f"{here.robot}/{program}-{os.getpid()}-{next(_NUMBERS)}"
+        self.sender = f"{here.robot}/{sender or f'{program}-{os.getpid()}-{next(_NUMBERS)}'}"
         self._by = accounts.name_of(os.geteuid()) if place.robot != here.robot else ""
-        self._outbox = Outbox(self.sender, new_boot())
+        self._sending = sending(here, place, self.sender, queue)
+        self._posting: Posting | None = None
         self._lock = threading.Lock()
-        self._skew = boottime.skew_ns()
-        self._address = address_of(here, place)
-        self._way = way_to(here, self._address, place.robot)
 
-    def _connect(self, place: Place) -> None:
-        """By another address, if it has one now."""
-        address = address_of(self.here, place)
-        if address != self._address:
-            way = way_to(self.here, address, place.robot)
-            self._way.close()
-            self.place, self._address, self._way = place, address, way
+    @property
+    def place(self) -> Place:
+        """Where the driver is, as far as it is known."""
+        return self._sending.place
 
     def close(self) -> None:
-        """Let the connection go."""
-        self._way.close()
+        """Let the connection go. What was posted and has no answer is sent no more; its futures say so."""
+        if self._posting is not None:
+            self._posting.close()
+        self._sending.close()
 
     def __enter__(self) -> Proxy:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is None:
+                self.flush(TIMEOUT_S)
+        finally:
+            self.close()
 
     def now_ns(self) -> int:
         """The clock of this process's hops."""
-        return boottime.now_ns(self._skew)
+        return self._sending.now_ns()
 
     def call(self, verb: str, body: Any = None, /, *, timeout: float = TIMEOUT_S, **fields: Any) -> Any:
         """Have a verb carried out, and return what it returns.
@@ -113,17 +116,69 @@ class Proxy:
             CallRefusedError: it was not carried out, or failed; says why.
             NoAnswerError: no answer came in time. Whether it was carried out is not known.
             EnvelopeError: no message can say this body.
-            MailboxFullError: too many earlier calls have had no answer.
+            MailboxFullError: too many earlier messages have had no answer.
         """
-        envelope = Envelope(
-            to=self.path, verb=verb, body=self._body(body, fields), by=self._by, reliable=True, deadline_ms=timeout * 1_000
-        )
         with self._lock:
-            answer = self._answered(envelope, round(timeout * SECOND_NS))
-        self.last = answer
-        if answer.error is not UNSET:
-            raise CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
-        return None if answer.ok is UNSET else answer.ok
+            posting = self._posting
+            if posting is None:
+                answer = self._answered(self._envelope(verb, self._body(body, fields), timeout), round(timeout * SECOND_NS))
+                self.last = answer
+                if answer.error is not UNSET:
+                    raise refused(answer)
+                return None if answer.ok is UNSET else answer.ok
+        try:
+            return self.post(verb, body, deadline_s=timeout, **fields).result(timeout)
+        except concurrent.futures.TimeoutError as error:
+            raise NoAnswerError(self._no_answer(verb, timeout, "")) from error
+        except CallRefusedError as error:
+            if error.kind != EXPIRED:
+                raise
+            raise NoAnswerError(self._no_answer(verb, timeout, "")) from error
+
+    def post(
+        self, verb: str, body: Any = None, /, *, deadline_s: float | None = None, **fields: Any
+    ) -> concurrent.futures.Future[Any]:
+        """Have a verb carried out, without waiting: a thread of this proxy sends it, over cuts and restarts of the driver.
+
+        Args:
+            body, fields: as of `call`.
+            deadline_s: seconds from now; after them the driver does not begin it any more. None: it never expires.
+
+        Returns:
+            The result, once it comes; or `CallRefusedError`, of the kind "expired" after the deadline; or `NoAnswerError`, if
+            the message left, and no answer came until 5 s after its deadline or until the proxy was closed. It cannot be
+            cancelled. What is called when it is done runs in the thread that sends, and must not wait.
+
+        Raises:
+            MailboxFullError: so many messages wait already as the queue takes; this one was not taken.
+            EnvelopeError: no message can say this body.
+            DriverError: the proxy is closed.
+        """
+        envelope = self._envelope(verb, self._body(body, fields), deadline_s)
+        with self._lock:
+            if self._posting is None:
+                self._posting = Posting(self._sending)
+        return self._posting.post(envelope, self.now_ns())
+
+    def flush(self, timeout: float | None = None) -> None:
+        """Return when all that was posted has its result, an error included.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            NoAnswerError: not in time; says how many have none.
+        """
+        if self._posting is None:
+            return
+        _, waiting = concurrent.futures.wait(self._posting.waiting(), timeout)
+        if waiting:
+            raise NoAnswerError(f"{len(waiting)} messages that were posted to {self.path} had no answer within {timeout:g} s")
+
+    def _envelope(self, verb: str, body: Any, deadline_s: float | None) -> Envelope:
+        deadline_ms = None if deadline_s is None else deadline_s * 1_000
+        hops = (Hop(self.sender, self.now_ns()),)
+        return Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
 
     def _body(self, body: Any, fields: Mapping[str, Any]) -> Any:
         if fields and body is not None:
@@ -139,45 +194,23 @@ class Proxy:
     def _answered(self, envelope: Envelope, timeout_ns: int) -> Envelope:
         now_ns = self.now_ns()
         until_ns = now_ns + timeout_ns
-        posted = self._outbox.post(msgspec.structs.replace(envelope, hops=(Hop(self.sender, now_ns),)), now_ns)
-        self._outbox.committed()
+        posted = self._sending.post(envelope, now_ns)
         busy = ""
-        turns = 0
         while now_ns < until_ns:
-            due = self._outbox.due(now_ns)
-            if turns and due:
-                self._look_again(until_ns - now_ns)
-            for one in due:
-                self._way.await_sent(self._encoded(one), min(until_ns - now_ns, RESEND_FIRST_NS))
-            turns += 1
-            next_ns = self._outbox.next_ns()
-            content = self._way.await_message(max(min(until_ns, next_ns or until_ns) - now_ns, 0))
-            now_ns = self.now_ns()
-            answer = _decoded(content) if content is not None else None
-            if answer is None:
-                if self._way.is_lost:  # the driver has ended: it is asked anew once it is there again
-                    self._outbox.connected(now_ns)
-                continue
-            self._outbox.answered(answer)
-            if answer.re == posted.id:
-                if answer.error is UNSET or answer.error.kind != "busy":
+            for answer in self._sending.turn(until_ns):
+                if answer.re != posted.id:
+                    continue
+                if answer.error is UNSET or answer.error.kind not in ("busy", EXPIRED):
                     return answer
-                busy = answer.error.sentence
-        raise NoAnswerError(self._no_answer(envelope.verb, timeout_ns, busy))
+                if answer.error.kind == "busy":
+                    busy = answer.error.sentence
+                elif self.now_ns() < until_ns:
+                    return answer
+            now_ns = self.now_ns()
+        raise NoAnswerError(self._no_answer(envelope.verb, timeout_ns / SECOND_NS, busy))
 
-    def _encoded(self, envelope: Envelope) -> bytes:
-        """As it leaves now. Of one that is sent again the first stamp stays."""
-        return envelopes.encode(envelopes.left(envelope, self.now_ns()))
-
-    def _look_again(self, limit_ns: int) -> None:
-        """It has not answered: it may have been started anew, at another address."""
-        try:
-            self._connect(lookup(self.here, self.path, limit_ns))
-        except (NameUnknownError, DriverError):
-            return  # it is waited for where it was
-
-    def _no_answer(self, verb: str, timeout_ns: int, busy: str) -> str:
-        said = f"{self.path} did not answer {verb!r} within {timeout_ns / SECOND_NS:g} s"
+    def _no_answer(self, verb: str, timeout_s: float, busy: str) -> str:
+        said = f"{self.path} did not answer {verb!r} within {timeout_s:g} s"
         if busy:
             return f"{said}: it is busy: {busy}"
         if self.place.robot == self.here.robot and not lives(self.here, self.path):
@@ -192,7 +225,7 @@ class Proxy:
         """
         if self.call("_describe")["verbs"].get(name, {}).get("role") != "stream":
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
-        way = way_to(self.here, self._address, self.place.robot)
+        way = way_to(self.here, self._sending.address, self.place.robot)
         asked = Envelope(
             to=self.path, verb="_subscribe", body={"stream": name}, sender=f"{self.sender}-{next(_NUMBERS)}", by=self._by
         )
@@ -204,7 +237,7 @@ class Proxy:
                     again_ns = now_ns + LEASE_NS // 3
                 content = way.await_message(max(again_ns - now_ns, MS))
                 again_ns = 0 if way.is_lost else again_ns
-                value = _decoded(content) if content is not None else None
+                value = decoded(content) if content is not None else None
                 if value is None:
                     continue
                 is_denied = value.error is not UNSET and value.error.kind == "denied"
@@ -220,33 +253,3 @@ class Proxy:
 
 LINGER_MS: Final = 100
 """How long the farewell of a stream may take to leave."""
-
-
-def way_to(here: Here, address: str, robot: str) -> LocalWay | TeamWay:
-    """A way to a driver at this address; `DriverError`: the team's keys are not here."""
-    if address.startswith(SCHEME):
-        return LocalWay(address.removeprefix(SCHEME))
-    from failover.drivers.sockets import TeamWay  # ZeroMQ is loaded only by who needs other robots
-
-    return TeamWay(address, here, robot)
-
-
-def address_of(here: Here, place: Place) -> str:
-    """By which address this process reaches a driver: a unix socket on its own robot, else tcp.
-
-    Raises:
-        DriverError: by none.
-    """
-    scheme = SCHEME if place.robot == here.robot else "tcp://"
-    found = next((address for address in place.record.addresses if address.startswith(scheme)), "")
-    if not found:
-        why = here.alone or f"its driver on {place.robot} opened no port: the key of the team could not be read there"
-        raise DriverError(f"cannot reach {place.record.path} on {place.robot}: {why}")
-    return found
-
-
-def _decoded(content: bytes) -> Envelope | None:
-    try:
-        return envelopes.decode(content)
-    except EnvelopeError:
-        return None

@@ -32,6 +32,7 @@ from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
 from failover.errors import EnvelopeError, NotCommittedError
+from failover.fencing.epoch import epoch
 from failover.kept_state.component import kept_of
 
 if TYPE_CHECKING:
@@ -113,13 +114,23 @@ def run(cls: type[T]) -> T:
 class Serving:
     """A driver with open sockets; a context manager. `serve` runs until `stop` is called, from any thread or signal."""
 
-    def __init__(self, cls: type, place: Here | None = None, terms: Terms = Terms()) -> None:  # noqa: B008  frozen
+    def __init__(
+        self,
+        cls: type,
+        place: Here | None = None,
+        terms: Terms = Terms(),  # noqa: B008  frozen
+        epoch: Callable[[], int] = epoch,
+    ) -> None:
         """
+        Args:
+            epoch: of the primacy under which this process runs now; 0 without an agent.
+
         Raises:
             DriverError: it cannot take messages.
         """
         declaration = declaration_of(cls)
         self.here = place or here()
+        self._epoch, self._epoch_told = epoch, 0
         self._name = stem(declaration.path, self.here.directory)
         self._skew = boottime.skew_ns()
         self._rights = CallRights(self.here.rules, declaration.path)
@@ -136,9 +147,10 @@ class Serving:
             self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             stack.callback(os.close, self._wake)
             self._open(declaration, stack)
-            self.service = NameService(self.here, self.record_of(declaration), terms)
+            self.service = NameService(self.here, self.record_of(declaration), terms, epoch)
             stack.callback(self.service.close)
             self.instance, self._actor = self._made(cls, declaration, f"{self.here.robot}/{self._name}")
+            self._actor.fence = self._fence
             if self._keeping is not None:
                 self._wait_for(self._keeping.fileno(), functools.partial(self._hear_kept, self._keeping))
                 self._keeping.resumed()
@@ -201,7 +213,7 @@ class Serving:
             addresses=tuple(self._addresses),
             aliases=declaration.aliases,
             verbs=declaration.schemas(),
-            epoch=0 if self._keeping is None else self._keeping.epoch,
+            epoch=self._epoch(),
             labels=dict(declaration.labels),
         )
         if len(pack(record)) <= BODY_SIZE_MAX:
@@ -240,6 +252,19 @@ class Serving:
     def now_ns(self) -> int:
         """The clock of this process's hops."""
         return boottime.now_ns(self._skew)
+
+    def _fence(self, told: int) -> str:
+        """Why this copy may not act any more: another one runs under a later epoch, as a sender or the names say."""
+        own, path = self._epoch(), self.service.record.path
+        if own != self._epoch_told:
+            self._epoch_told = own
+            self.service.look()
+        if not own:
+            return ""
+        rival = self.service.rival
+        if rival is not None and rival.record.epoch > max(own, told):
+            return f"{path} runs on {rival.robot} under epoch {rival.record.epoch}; this copy has epoch {own}"
+        return f"{path} runs elsewhere under epoch {told}; this copy has epoch {own}" if told > own else ""
 
     # --- The loop ---------------------------------------------------------------------------------------------------------
 
@@ -340,7 +365,7 @@ class Serving:
         for one in answers:
             whose = self._actor.route(one.to)
             if whose is not None:
-                self._publish(whose, one)
+                self._publish(whose, msgspec.structs.replace(one, epoch=self._epoch_told) if self._epoch_told else one)
 
     def _publish(self, whose: Whose, envelope: Envelope) -> bool:
         """Send to one, if it is there and takes it now: who misses an answer to what matters sends it again."""

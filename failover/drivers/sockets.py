@@ -139,9 +139,6 @@ def send(socket: Socket, content: bytes) -> bool:
 class TeamWay:
     """A way to a driver of another robot, with a context of its own."""
 
-    is_lost: Final = False
-    """ZeroMQ connects again by itself."""
-
     def __init__(self, address: str, here: Here, robot: str) -> None:
         """
         Raises:
@@ -165,12 +162,28 @@ class TeamWay:
 
     def await_sent(self, content: bytes, timeout_ns: int) -> bool:
         """Send as soon as there is a connection; False: there was none within the time."""
-        if self.send(content):
-            return True
-        return bool(self._socket.poll(max(-(-timeout_ns // 1_000_000), 0), zmq.POLLOUT)) and self.send(content)
+        return self.send(content) or (self.await_open(timeout_ns, -1) and self.send(content))
 
-    def await_message(self, timeout_ns: int) -> bytes | None:
-        """What comes; None: nothing within the time."""
+    @property
+    def is_lost(self) -> bool:
+        """Whether there is no connection. ZeroMQ connects again by itself."""
+        return not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLOUT
+
+    def await_open(self, timeout_ns: int, wake: int) -> bool:
+        """Whether there is a connection within the time; ``wake``: a descriptor that ends the wait, too."""
+        return bool(self._ready(zmq.POLLOUT, timeout_ns, wake) & zmq.POLLOUT)
+
+    def _ready(self, events: int, timeout_ns: int, wake: int) -> int:
+        poller = zmq.Poller()
+        poller.register(self._socket, events)
+        if wake >= 0:
+            poller.register(wake, zmq.POLLIN)
+        return int(dict(poller.poll(max(-(-timeout_ns // 1_000_000), 0))).get(self._socket, 0))
+
+    def await_message(self, timeout_ns: int, wake: int = -1) -> bytes | None:
+        """What comes; None: nothing within the time, or `wake` can be read."""
+        if wake >= 0:
+            return self._socket.recv(zmq.NOBLOCK) if self._ready(zmq.POLLIN, timeout_ns, wake) else None
         self._socket.setsockopt(zmq.RCVTIMEO, max(-(-timeout_ns // 1_000_000), 0))
         try:
             return self._socket.recv()

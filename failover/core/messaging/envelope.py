@@ -77,6 +77,7 @@ class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from"
         after: the number of the message that must be handled before. reliable: it is sent until it is answered.
         had: the sender has all answers up to this number, and will not ask for them again.
         deadline_ms: how long from now on it is worth being handled.
+        epoch: the highest one of the receiver that the sender has heard of; of an answer: the receiver's own. 0: it has none.
         hops: who passed it on.
         ok, error: of an answer: the result or why there is none.
         rest: fields that this version does not know.
@@ -94,6 +95,7 @@ class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from"
     had: int = 0
     reliable: bool = False
     deadline_ms: float | None = None
+    epoch: int = 0
     hops: tuple[Hop, ...] = ()
     re: str = ""
     ok: Any | UnsetType = UNSET
@@ -325,9 +327,9 @@ def _check_head(envelope: Envelope) -> None:
     for text in (envelope.to, envelope.verb, envelope.id, envelope.sender, envelope.by, envelope.re):
         if len(text) > TEXT_MAX:
             raise EnvelopeError(f"the message has the name {text[:40]!r}… of {len(text)} characters; {TEXT_MAX} are the most")
-    for number in (envelope.boot, envelope.seq, envelope.after, envelope.had):
+    for number in (envelope.boot, envelope.seq, envelope.after, envelope.had, envelope.epoch):
         if number < 0:
-            raise EnvelopeError("the message has a negative boot, seq, after or had")
+            raise EnvelopeError("the message has a negative boot, seq, after, had or epoch")
         if number > INTEGER_MAX:
             raise EnvelopeError(f"the message holds the integer {number}: above 2^53 it must be written as text")
     if envelope.deadline_ms is not None and not -INTEGER_MAX <= envelope.deadline_ms <= INTEGER_MAX:

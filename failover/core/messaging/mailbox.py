@@ -43,6 +43,9 @@ WINDOW: Final = 1_024
 HELD_MAX: Final = 64
 """Messages of one sender that came before one that must be handled first; the sender sends the others again."""
 
+FLIGHT_MAX: Final = HELD_MAX
+"""Reliable messages that a sender has on their way at once: the receiver holds so many if the first of them is lost."""
+
 HELD_ALL_MAX: Final = 1_024
 """The same of all senders together; then the sender whose messages are held for longest loses them, and sends them again."""
 
@@ -52,7 +55,16 @@ SENDERS_MAX: Final = 1_024
 MS: Final = 1_000_000
 RESEND_FIRST_NS: Final = 500 * MS
 RESEND_MOST_NS: Final = 8_000 * MS
-"""Until an unanswered message is sent again; doubled each time, and from the beginning when the link comes back."""
+"""Until an unanswered message is sent again; doubled each time, and from the beginning after an answer or a cut."""
+
+MOVED: Final = ("moved", "wrong_driver")
+"""Kinds of errors of one who is not, or is no more, the receiver: it took nothing; look the name up anew."""
+
+AGAIN: Final = ("busy", *MOVED)
+"""Kinds of errors after which a reliable message is sent again."""
+
+ANSWER_NS: Final = 5_000 * MS
+"""How long after the deadline of a message that left its answer is waited for: its receiver says then that it expired."""
 
 
 # --- Sending ----------------------------------------------------------------------------------------------------------
@@ -76,17 +88,21 @@ class Outgoing(Struct):
 class Outbox:
     """What one sender has to tell one receiver."""
 
-    def __init__(self, sender: str, boot: int, kept: Outgoing | None = None) -> None:
+    def __init__(self, sender: str, boot: int, kept: Outgoing | None = None, limit: int = WINDOW) -> None:
         """
         Args:
             boot: of a sender that keeps nothing: greater than in all its lives before. With ``kept`` its own goes on.
+            limit: messages that may wait for an answer; from 1 to `WINDOW`.
         """
+        self._limit = limit
         self._sender = sender
         self._boot = kept.boot if kept is not None else boot
         self._seq = kept.seq if kept is not None else 0
         self._sent = deque(kept.waiting if kept is not None else ())
         """May have arrived: all that was kept, too, as it may have left after the commit."""
         self._unsent: deque[Waiting] = deque()
+        self._handed: list[Waiting] = []
+        """Those that the newest `due` gave for the first time."""
         self._free = self._seq
         self._had = 0
         self._is_connected = True
@@ -107,9 +123,9 @@ class Outbox:
             It with its number; with an ``id`` if it had none.
 
         Raises:
-            MailboxFullError: `WINDOW` wait already.
+            MailboxFullError: so many wait already as may.
         """
-        if len(self) >= WINDOW:
+        if len(self) >= self._limit:
             raise MailboxFullError(f"{len(self)} messages to {envelope.to} wait, and that is the limit; try again later")
         self._seq += 1
         name = envelope.id or f"{self._sender}-{self._boot:x}-{self._seq}"
@@ -132,15 +148,27 @@ class Outbox:
         """The link is cut: messages wait."""
         self._is_connected = False
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether messages leave."""
+        return self._is_connected
+
+    @property
+    def left(self) -> int:
+        """Messages that may have left, and have no answer yet."""
+        return len(self._sent)
+
     def next_ns(self) -> int | None:
-        """When `due` or `expired` has something without anything else happening; None: never."""
+        """When `due`, `expired` or `given_up` has something without anything else happening; None: never."""
         times = [one.until_ns for one in self._unsent if one.until_ns is not None]
+        times += [one.until_ns + ANSWER_NS for one in self._sent if one.until_ns is not None]
         if self._is_connected and self._sent and self._again_ns is not None:
             times.append(self._again_ns)
         return min(times, default=None)
 
     def due(self, now_ns: int) -> list[Envelope]:
-        """What is to be sent now, in order."""
+        """What is to be sent now, in order; `returned` takes back what does not leave."""
+        self._handed = []
         if not self._is_connected:
             return []
         found: list[Envelope] = []
@@ -152,8 +180,9 @@ class Outbox:
             self._sent = deque(one for one in self._sent if one.envelope.reliable)
             self._again_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, RESEND_MOST_NS)
-        while self._unsent and self._unsent[0].envelope.seq <= self._free:
+        while self._unsent and self._unsent[0].envelope.seq <= self._free and len(self._sent) < FLIGHT_MAX:
             one = self._unsent.popleft()
+            self._handed.append(one)
             found.append(_as_sent(one, self._sent[-1].envelope.seq if self._sent else 0, self._had, now_ns))
             if one.envelope.reliable:
                 self._sent.append(one)
@@ -161,9 +190,18 @@ class Outbox:
             self._again_ns = now_ns + self._pause_ns
         return found
 
-    def answered(self, answer: Envelope) -> bool:
-        """Whether this is the first final answer to one of our reliable messages; ``busy`` is none: it is sent again."""
-        if answer.boot != self._boot or (answer.error is not msgspec.UNSET and answer.error.kind == "busy"):
+    def returned(self, count: int) -> None:
+        """So many of the last that `due` has given did not leave, for the link is cut: they wait as before."""
+        self.disconnected()
+        for one in self._handed[::-1][:count]:
+            if one.envelope.reliable:
+                self._sent.pop()
+            self._unsent.appendleft(one)
+        self._handed = []
+
+    def answered(self, answer: Envelope, now_ns: int) -> bool:
+        """Whether this is the first final answer to one of our reliable messages; after one in `AGAIN` it is sent again."""
+        if answer.boot != self._boot or (answer.error is not msgspec.UNSET and answer.error.kind in AGAIN):
             return False
         for place, one in enumerate(self._sent):
             if one.envelope.seq == answer.seq:
@@ -171,6 +209,8 @@ class Outbox:
                 self._pause_ns = RESEND_FIRST_NS
                 if not self._sent:
                     self._again_ns = None
+                elif place == 0:  # nothing before it was lost; nor was an answer
+                    self._again_ns = now_ns + RESEND_FIRST_NS
                 return True
         return False
 
@@ -182,6 +222,20 @@ class Outbox:
         return [
             refusal(one.envelope, "expired", "its deadline passed while it waited to be sent; it was not handled") for one in late
         ]
+
+    def given_up(self, now_ns: int) -> list[Envelope]:
+        """Messages that left, and of which no answer came until long after their deadline; they are forgotten."""
+        late = [one for one in self._sent if one.until_ns is not None and one.until_ns + ANSWER_NS <= now_ns]
+        if late:
+            self._sent = deque(one for one in self._sent if one not in late)
+        return [one.envelope for one in late]
+
+    def abandoned(self) -> tuple[list[Envelope], list[Envelope]]:
+        """All that have no answer, which are forgotten: those that may have left, and those that have not."""
+        found = [one.envelope for one in self._sent], [one.envelope for one in self._unsent]
+        self._sent.clear()
+        self._unsent.clear()
+        return found
 
 
 def _as_sent(one: Waiting, after: int, had: int, now_ns: int) -> Envelope:
@@ -357,6 +411,16 @@ class Mailbox:
         del self._holding[sender]
         if sender not in self._streams and all(one.envelope.sender != sender for one in self._queue):
             del self._taken[sender]  # nothing of it was taken
+
+    def give_back(self) -> list[Envelope]:
+        """Messages that wait and were not handled: it is as if they had never come."""
+        given = [one.envelope for one in self._queue]
+        given += [one.envelope for taken in self._taken.values() for one in taken.held]
+        self._queue.clear()
+        self._holding.clear()
+        self._held = 0
+        self._taken = {sender: Taken(one.boot, one.last, one.reliable) for sender, one in self._streams.items()}
+        return given
 
     # --- A message is handled ---------------------------------------------------------------------------------------------
 

@@ -101,7 +101,7 @@ def test_messages_of_one_sender_are_handled_in_order_while_others_send(engine: S
 
 def test_a_large_message_and_a_large_answer_come_whole(engine: Serving, here: Here) -> None:
     from failover.core.messaging.envelope import Envelope, decode, encode
-    from failover.drivers.proxy import way_to
+    from failover.drivers.sending import way_to
 
     way = way_to(here, engine.service.record.addresses[0], "robot1")
     asked = Envelope(to="engine", verb="read", id="1", sender="test", rest={"note": "x" * 900_000})

@@ -16,6 +16,8 @@ from msgspec import UNSET
 from failover.core.messaging import mailbox
 from failover.core.messaging.envelope import Envelope, answer
 from failover.core.messaging.mailbox import (
+    ANSWER_NS,
+    FLIGHT_MAX,
     HELD_ALL_MAX,
     HELD_MAX,
     MAILBOX_MAX,
@@ -135,7 +137,7 @@ class World:
 
     def get(self, one: Envelope) -> None:
         sender = self.senders[one.to]
-        if sender.outbox.answered(one):
+        if sender.outbox.answered(one, self.now_ns):
             sender.told[one.seq] = "ok" if one.error is UNSET else one.error.kind
             assert one.error is not UNSET or one.ok == one.seq, "the answer of another message"
 
@@ -185,7 +187,7 @@ class World:
                 break
         for one in list(self.cut):
             self.heal(one)
-        for _ in range(60_000):
+        for _ in range(240_000):  # thirty tries at the longest pause
             if all(sender.is_done for sender in self.senders.values()) and not self._events and not len(self.actor.mailbox):
                 return
             self.step()
@@ -242,6 +244,56 @@ def test_queued_over_an_outage_they_arrive_in_order_or_their_sender_is_told_that
     assert [box.take(0).body for _ in sent] == [1, 3, 4]  # type: ignore[union-attr]
 
 
+def test_what_did_not_leave_because_the_link_is_cut_waits_as_before_and_expires_with_a_sentence() -> None:
+    outbox = Outbox("s", 1)
+    for number in range(1, 4):
+        outbox.post(Envelope("actor", "add", number, reliable=True, deadline_ms=50.0 if number == 2 else None), 0)
+    outbox.committed()
+    assert [one.seq for one in outbox.due(0)] == [1, 2, 3]
+    outbox.returned(2)
+    assert (outbox.left, len(outbox), outbox.is_connected, outbox.due(MS)) == (1, 3, False, [])
+    (late,) = outbox.expired(50 * MS)
+    assert late.seq == 2 and late.error is not UNSET and "it was not handled" in late.error.sentence
+    outbox.connected(60_000 * MS)
+    assert [(one.seq, one.after) for one in outbox.due(60_000 * MS)] == [(1, 0), (3, 1)]
+    assert outbox.answered(answer(Envelope(boot=1, seq=1), None), 60_000 * MS)
+    outbox.connected(60_001 * MS)
+    assert [(one.seq, one.after) for one in outbox.due(60_001 * MS)] == [(3, 0)]
+
+
+def test_one_that_left_and_is_never_answered_is_given_up_and_the_next_does_not_wait_for_it() -> None:
+    outbox = Outbox("s", 1)
+    outbox.post(Envelope("actor", "add", 1, reliable=True, deadline_ms=50.0), 0)
+    outbox.committed()
+    assert len(outbox.due(0)) == 1 and outbox.expired(60 * MS) == [], "its receiver knows whether it was handled"
+    outbox.disconnected()
+    assert outbox.next_ns() == 50 * MS + ANSWER_NS and outbox.given_up(50 * MS + ANSWER_NS - 1) == []
+    assert [one.seq for one in outbox.given_up(50 * MS + ANSWER_NS)] == [1] and not len(outbox)
+    outbox.post(Envelope("actor", "add", 2, reliable=True), 0)
+    outbox.committed()
+    outbox.connected(10_000 * MS)
+    assert [(one.seq, one.after) for one in outbox.due(10_000 * MS)] == [(2, 0)]
+
+
+def test_a_sender_has_no_more_on_its_way_than_the_receiver_holds() -> None:
+    outbox, box = Outbox("s", 1), Mailbox()
+    for number in range(WINDOW):
+        outbox.post(Envelope("actor", "add", number, reliable=True), 0)
+    outbox.committed()
+    sent = outbox.due(0)
+    assert len(sent) == FLIGHT_MAX and outbox.due(1) == []
+    for one in sent[1:]:
+        box.arrived(one, 0)
+    box.arrived(sent[0], 0)  # it had been lost: the others were held
+    for one in sent:
+        taken = box.take(0)
+        assert taken is not None and taken.seq == one.seq
+        box.done(taken, answer(taken, None))
+    for told in box.committed():
+        assert outbox.answered(told, 2)
+    assert [one.seq for one in outbox.due(2)] == list(range(FLIGHT_MAX + 1, 2 * FLIGHT_MAX + 1))
+
+
 def test_nothing_leaves_before_it_is_kept() -> None:
     outbox, box = Outbox("s", 1), Mailbox()
     outbox.post(Envelope("actor", reliable=True), 0)
@@ -255,8 +307,8 @@ def test_nothing_leaves_before_it_is_kept() -> None:
     assert box.arrived(sent, 0) == []
     (told,) = box.committed()
     assert box.arrived(sent, 0) == [told]
-    assert outbox.answered(told)
-    assert not outbox.answered(told)
+    assert outbox.answered(told, 0)
+    assert not outbox.answered(told, 0)
 
 
 def test_only_so_many_answers_leave_as_were_handled_at_the_commit_that_is_safe() -> None:

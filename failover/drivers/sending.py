@@ -1,0 +1,343 @@
+"""Sends what one program has to tell one driver, over cuts and restarts, until each message is answered.
+
+A call sends by the thread that calls. Once something was posted, one thread sends for all calls and posts of the proxy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import threading
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+from msgspec import UNSET
+
+from failover.boards import boottime
+from failover.core.messaging import envelope as envelopes
+from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.mailbox import MOVED, RESEND_FIRST_NS, RESEND_MOST_NS, Outbox
+from failover.core.naming.tree import Place
+from failover.drivers.here import Here
+from failover.drivers.local import SCHEME, LocalWay
+from failover.drivers.lookup import lookup
+from failover.drivers.name_service import new_boot
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError
+
+if TYPE_CHECKING:
+    from failover.drivers.sockets import TeamWay
+
+SECOND_NS: Final = 1_000_000_000
+
+LOOK_NS: Final = 2 * SECOND_NS
+"""How long it may take to look a name up while messages wait."""
+
+SLICE_NS: Final = SECOND_NS // 2
+"""How often a way is looked at while an answer is waited for: ZeroMQ does not tell that its connection is lost."""
+
+MOVED_NS: Final = SECOND_NS // 5
+"""Between two looks at the names, while a driver says that it has moved, and the names do not say yet where to."""
+
+IDLE_NS: Final = 3_600 * SECOND_NS
+
+EXPIRED: Final = "expired"
+
+log = logging.getLogger("failover.drivers")
+
+
+class Sending:
+    """What one sender has to tell one driver, and the way there. `post` may be called by any thread, `turn` by one at a time."""
+
+    def __init__(self, here: Here, place: Place, outbox: Outbox) -> None:
+        """
+        Raises:
+            DriverError: the driver is on another robot that cannot be reached.
+        """
+        self.here = here
+        self.place = place
+        self.path = place.record.path
+        self._outbox = outbox
+        self._lock = threading.Lock()
+        self._skew = boottime.skew_ns()
+        self._epoch = place.record.epoch
+        """The highest of the driver of which this sender has heard."""
+        self._left = 0
+        """The highest number of a message that was sent."""
+        self._look_ns = self._heard_ns = 0
+        self._pause_ns = RESEND_FIRST_NS
+        self.address = address_of(here, place)
+        self._way = way_to(here, self.address, place.robot)
+
+    def now_ns(self) -> int:
+        """The clock of this process's hops."""
+        return boottime.now_ns(self._skew)
+
+    def close(self) -> None:
+        """Let the connection go."""
+        self._way.close()
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether every message has its answer."""
+        return not len(self._outbox)
+
+    def post(self, envelope: Envelope, now_ns: int) -> Envelope:
+        """Take a message that a later `turn` sends; it with its number and id.
+
+        Raises:
+            MailboxFullError: so many wait already as may.
+        """
+        with self._lock:
+            posted = self._outbox.post(envelope, now_ns)
+            self._outbox.committed()
+        return posted
+
+    def abandon(self) -> tuple[list[Envelope], list[Envelope]]:
+        """Messages without an answer, which are forgotten: those that may have left, and those that have not."""
+        with self._lock:
+            return self._outbox.abandoned()
+
+    def turn(self, until_ns: int, wake: int = -1) -> list[Envelope]:
+        """Send what is due, then take in what comes, once it comes, until then at most.
+
+        Args:
+            wake: a descriptor that ends the wait, too.
+
+        Returns:
+            Final answers; also that a message expired before it left, or had none until long after its deadline.
+        """
+        if over := self._over():
+            return over
+        if not self._is_open(until_ns, wake):
+            return []
+        self._send_due()
+        now_ns = self.now_ns()
+        with self._lock:
+            next_ns = self._outbox.next_ns()
+        until_ns = min(until_ns, next_ns if next_ns is not None else until_ns, now_ns + SLICE_NS)
+        content = self._way.await_message(max(until_ns - now_ns, 0), wake)
+        if content is None:
+            if self._way.is_lost:  # the driver has ended, or the network is cut: it is asked anew once it is there again
+                self._disconnected()
+            return []
+        self._heard_ns = self.now_ns()
+        answer = decoded(content)
+        if answer is None:
+            return []
+        if 0 < answer.epoch < self._epoch:
+            return []  # of a copy that was replaced: what it did is lost
+        self._epoch = max(self._epoch, answer.epoch)
+        kind = "" if answer.error is UNSET else answer.error.kind
+        if kind in MOVED:
+            self._moved()
+        with self._lock:
+            is_final = self._outbox.answered(answer, self._heard_ns)
+        return [answer] if is_final or kind == "busy" else []
+
+    def _moved(self) -> None:
+        """The driver is elsewhere: all that has no answer is sent there, in order."""
+        if self._heard_ns >= self._look_ns:
+            self._look_ns = self._heard_ns + MOVED_NS
+            if self._look_again(self._heard_ns + LOOK_NS):
+                self._disconnected()
+
+    def _over(self) -> list[Envelope]:
+        now_ns = self.now_ns()
+        with self._lock:
+            late, lost = self._outbox.expired(now_ns), self._outbox.given_up(now_ns)
+        why = f"{self.path} has not answered, also after the deadline; it may have carried it out"
+        return late + [envelopes.refusal(one, "no_answer", why) for one in lost]
+
+    def _is_open(self, until_ns: int, wake: int) -> bool:
+        """Whether there is a connection; without one it is waited for, and now and then the name is looked up anew."""
+        if self._outbox.is_connected:
+            return True
+        now_ns = self.now_ns()
+        with self._lock:
+            next_ns = self._outbox.next_ns() or until_ns
+        if self._way.await_open(max(min(until_ns, next_ns, self._look_ns) - now_ns, 0), wake):
+            with self._lock:
+                self._outbox.connected(self.now_ns())
+            self._pause_ns = RESEND_FIRST_NS
+            return True
+        if self.now_ns() >= self._look_ns:
+            self._look_again(until_ns)
+            self._look_ns = self.now_ns() + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, RESEND_MOST_NS)
+        return False
+
+    def _disconnected(self, unsent: int = 0) -> None:
+        with self._lock:
+            self._outbox.returned(unsent)
+        self._look_ns = self.now_ns() + self._pause_ns
+
+    def _send_due(self) -> None:
+        now_ns = self.now_ns()
+        with self._lock:
+            self._outbox.committed()  # this sender keeps nothing: each answer that it has is had
+            due = self._outbox.due(now_ns)
+        if due and due[0].seq <= self._left and now_ns >= max(self._look_ns, self._heard_ns + SLICE_NS):
+            self._look_again(now_ns + LOOK_NS)
+        for place, one in enumerate(due):
+            if not self._way.send(self._encoded(one)):
+                self._disconnected(len(due) - place)
+                return
+            self._left = max(self._left, one.seq)
+
+    def _encoded(self, one: Envelope) -> bytes:
+        """As it leaves now. Of one that is sent again the first stamp stays."""
+        if self._epoch:
+            one = msgspec.structs.replace(one, epoch=self._epoch)
+        return envelopes.encode(envelopes.left(one, self.now_ns()))
+
+    def _look_again(self, until_ns: int) -> bool:
+        """It does not answer: it may have been started anew, at another address; whether it was."""
+        limit_ns = min(until_ns - self.now_ns(), LOOK_NS)
+        with contextlib.suppress(NameUnknownError, DriverError):  # it is waited for where it was
+            place = lookup(self.here, self.path, limit_ns)
+            address = address_of(self.here, place)
+            if address != self.address:
+                way = way_to(self.here, address, place.robot)
+                self._way.close()
+                self.place, self.address, self._way = place, address, way
+                self._epoch = max(self._epoch, place.record.epoch)
+                return True
+        return False
+
+
+class Posting:
+    """The thread that sends what was posted, and gives each message's future its result."""
+
+    def __init__(self, sending: Sending) -> None:
+        self._sending = sending
+        self._futures: dict[str, Future[Any]] = {}
+        self._lock = threading.Lock()
+        self._is_over = False
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._thread = threading.Thread(target=self._run, name="failover posts", daemon=True)
+        self._thread.start()
+
+    def post(self, envelope: Envelope, now_ns: int) -> Future[Any]:
+        """Take a message; what comes of it.
+
+        Raises:
+            MailboxFullError: so many wait already as may.
+            DriverError: the proxy was closed.
+        """
+        future: Future[Any] = Future()
+        future.set_running_or_notify_cancel()  # what was sent cannot be taken back
+        with self._lock:
+            if self._is_over:
+                raise DriverError(f"cannot post to {self._sending.path}: the proxy is closed; make a new one")
+            self._futures[self._sending.post(envelope, now_ns).id] = future
+            os.eventfd_write(self._wake, 1)
+        return future
+
+    def waiting(self) -> list[Future[Any]]:
+        """Those without a result."""
+        with self._lock:
+            return list(self._futures.values())
+
+    def close(self) -> None:
+        """Send nothing more; futures without a result get an error that says whether the message may have been carried out."""
+        with self._lock:
+            if not self._is_over:
+                self._is_over = True
+                os.eventfd_write(self._wake, 1)
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        poller = select.poll()
+        poller.register(self._wake, select.POLLIN)
+        why = "the proxy was closed"
+        try:
+            while not self._is_over:
+                with contextlib.suppress(BlockingIOError):
+                    os.eventfd_read(self._wake)
+                if self._sending.is_idle:
+                    poller.poll()
+                    continue
+                for answer in self._sending.turn(self._sending.now_ns() + IDLE_NS, self._wake):
+                    self._done(answer)
+        except Exception as error:
+            log.exception("what was posted to %s is sent no more", self._sending.path)
+            why = f"the thread that sends failed: {type(error).__name__}: {error}"
+        self._end(why)
+
+    def _done(self, answer: Envelope) -> None:
+        if answer.error is not UNSET and answer.error.kind == "busy":
+            return
+        with self._lock:
+            future = self._futures.pop(answer.re, None)
+        if future is None:
+            return
+        if answer.error is UNSET:
+            future.set_result(None if answer.ok is UNSET else answer.ok)
+        elif answer.error.kind == "no_answer":
+            future.set_exception(NoAnswerError(answer.error.sentence))
+        else:
+            future.set_exception(refused(answer))
+
+    def _end(self, why: str) -> None:
+        with self._lock:
+            self._is_over = True
+            left, _ = self._sending.abandon()
+            futures, self._futures = self._futures, {}
+            os.close(self._wake)
+        may_be_done = {one.id for one in left}
+        for name, future in futures.items():
+            told = "it may have been carried out" if name in may_be_done else "it has not left"
+            future.set_exception(NoAnswerError(f"{self._sending.path} has not answered: {why}; {told}"))
+
+
+def refused(answer: Envelope) -> CallRefusedError:
+    """The error that an answer tells."""
+    assert answer.error is not UNSET
+    return CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
+
+
+def sending(here: Here, place: Place, sender: str, limit: int) -> Sending:
+    """To the driver of a place.
+
+    Args:
+        limit: messages that may wait for an answer.
+
+    Raises:
+        DriverError: it is on another robot that cannot be reached.
+    """
+    return Sending(here, place, Outbox(sender, new_boot(), limit=limit))
+
+
+def way_to(here: Here, address: str, robot: str) -> LocalWay | TeamWay:
+    """A way to a driver at this address; `DriverError`: the team's keys are not here."""
+    if address.startswith(SCHEME):
+        return LocalWay(address.removeprefix(SCHEME))
+    from failover.drivers.sockets import TeamWay  # ZeroMQ is loaded only by who needs other robots
+
+    return TeamWay(address, here, robot)
+
+
+def address_of(here: Here, place: Place) -> str:
+    """By which address this process reaches a driver: a unix socket on its own robot, else tcp.
+
+    Raises:
+        DriverError: by none.
+    """
+    scheme = SCHEME if place.robot == here.robot else "tcp://"
+    found = next((address for address in place.record.addresses if address.startswith(scheme)), "")
+    if not found:
+        why = here.alone or f"its driver on {place.robot} opened no port: the key of the team could not be read there"
+        raise DriverError(f"cannot reach {place.record.path} on {place.robot}: {why}")
+    return found
+
+
+def decoded(content: bytes) -> Envelope | None:
+    """A message that came; None: it is none."""
+    try:
+        return envelopes.decode(content)
+    except EnvelopeError:
+        return None
