@@ -77,11 +77,11 @@ class Exchange:
         """The name services of this robot, without this process."""
         return [path for path in sorted(self.here.directory.glob(f"*.{ENDING}")) if path != self._path]
 
-    def be_door(self, now_ns: int) -> bool:
-        """Try to become the door of this robot, now and then; whether it has become it just now."""
+    def be_door(self, now_ns: int, retry_ns: int = DOOR_RETRY_NS) -> bool:
+        """Try to become the door of this robot, once in ``retry_ns``; whether it has become it just now."""
         if self._door is not None or self.here.team is None:
             return False
-        if self._door_tried_ns is not None and now_ns - self._door_tried_ns < DOOR_RETRY_NS:
+        if self._door_tried_ns is not None and now_ns - self._door_tried_ns < retry_ns:
             return False
         self._door_tried_ns = now_ns
         with contextlib.suppress(DriverError):

@@ -22,6 +22,9 @@ TEAM_NS: Final = 5 * SECOND
 
 ASK_AGAIN_NS: Final = SECOND // 4
 
+DOOR_AGAIN_S: Final = 0.02
+"""Between two tries to be the door: a program that asks is it for some milliseconds."""
+
 _NUMBERS: Final = itertools.count(1)
 
 
@@ -74,9 +77,7 @@ class Lookup:
         return self._scan.tree(time.monotonic_ns())
 
     def _found(self, wanted: Callable[[], object | None]) -> Tree:
-        neighbours = self._ask()
-        if not neighbours:
-            self._exchange.be_door(time.monotonic_ns())
+        neighbours = self._ask() or self._await_door()
         if not neighbours and not self._exchange.is_door:
             raise NameUnknownError(f"no driver runs on {self._here.robot} for this user{self._alone()}")
         now_ns = time.monotonic_ns()
@@ -94,6 +95,17 @@ class Lookup:
         if not self._announced:
             raise NameUnknownError(f"no driver answers: none on {self._here.robot}, and none of another robot within 5 s")
         return self._tree()
+
+    def _await_door(self) -> int:
+        """Be the door, once other programs that ask have been it. Returns the number of drivers that have come meanwhile."""
+        now_ns = time.monotonic_ns()
+        until_ns = now_ns + min(TEAM_NS, self._limit_ns)
+        while self._here.team is not None and not self._exchange.be_door(now_ns, 0) and now_ns < until_ns:
+            time.sleep(DOOR_AGAIN_S)
+            if neighbours := self._ask():
+                return neighbours
+            now_ns = time.monotonic_ns()
+        return 0
 
     def _alone(self) -> str:
         return f", and other robots are not reached: {self._here.alone}" if self._here.alone else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,17 @@ def test_a_driver_is_found_and_called_from_another_robot(lab: Lab) -> None:
 def test_a_robot_without_a_driver_asks_the_others(lab: Lab) -> None:
     with serving(Engine, lab.here("robot1")), called(lab.here("robot2"), "engine") as proxy:
         assert proxy.call("read") == {"duty": 0.0}
+
+
+def test_several_programs_of_a_robot_without_a_driver_ask_at_once(lab: Lab) -> None:
+    found: list[str] = []
+    with serving(Engine, lab.here("robot1")):
+        threads = [threading.Thread(target=lambda: found.append(lookup(lab.here("robot2"), "engine").robot)) for _ in range(5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert found == ["robot1"] * 5
 
 
 def test_the_second_driver_of_a_robot_is_found_through_the_first(lab: Lab) -> None:
