@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from failover.cli.demo import robots as demo
-from failover.cli.demo.robots import CABLES, Means, RobotMachine, Stage, agent_command, ip_inside
+from failover.cli.demo.robots import CABLES, USUAL_PACE, Means, Pace, RobotMachine, Stage, agent_command, ip_inside
 from failover.client.control import Output, Result
 from failover.errors import LostAgentError, NoAgentError
 
@@ -52,6 +52,7 @@ def two_robots(
     own_network: bool = True,
     own_pids: bool = True,
     cables: Sequence[tuple[str, str]] = CABLES,
+    pace: Pace = USUAL_PACE,
 ) -> Iterator[tuple[RobotMachine, RobotMachine]]:
     """robot1 and robot2, beating and connected.
 
@@ -61,10 +62,11 @@ def two_robots(
         own_network: of each robot, where that can be had; else they share the loopback, and outlive each other's cable.
         own_pids: the same; else no two of their programs can have one PID.
         cables: between the two; needs networks of their own.
+        pace: of their heartbeats.
     """
     allowed = means()
     allowed = replace(allowed, own_network=allowed.own_network and own_network, own_pids=allowed.own_pids and own_pids)
-    with Stage(directory / "stage", allowed, settings, cables=cables) as stage:
+    with Stage(directory / "stage", allowed, settings, cables=cables, pace=pace) as stage:
         stage.directory.mkdir()
         prepare(stage.directory)
         stage.start()
