@@ -17,7 +17,7 @@ from checkpoint.program import cpu_baseline
 from checkpoint.store.retention import Retention
 from failover.config.quantities import size_bytes, span_ms
 from failover.core import types
-from failover.core.types import CARRY, DETACH, REFUSE, Launch, OnCrash, OnLoss, OnUnsupported, Rule, Rules, WhenAlone
+from failover.core.types import CARRY, DETACH, REFUSE, Launch, OnCrash, OnLoss, OnUnsupported, Restart, Rule, Rules, WhenAlone
 
 NO_LEVEL: Final = "no"
 """Of ``failover run --portable``: the program may use all features of this processor, also where the operator rules otherwise."""
@@ -40,11 +40,11 @@ def node_config(settings: Settings) -> types.Config:
         witnesses=_members(settings, "witness"),
         patience_ms=config.patience_s * 1_000,
         boot_patience_ms=config.boot_patience_s * 1_000,
-        components=tuple(_declared(settings, name, task) for name, task in config.tasks.items()),
+        components=tuple(declared(settings, name, task) for name, task in config.tasks.items()),
     )
 
 
-def _declared(settings: Settings, name: str, task: TaskConfig) -> types.ComponentSpec:
+def declared(settings: Settings, name: str, task: TaskConfig) -> types.ComponentSpec:
     """A component that the agent starts by itself, as if ``failover run`` had been told so."""
     from failover.client.control import SOCKET_NAME, SYSTEM_SOCKET  # here: an agent without tasks does not load it
 
@@ -75,7 +75,13 @@ def _declared(settings: Settings, name: str, task: TaskConfig) -> types.Componen
         shared=component.shared,
         shared_memory=component.shared_memory,
     )
-    return types.ComponentSpec(name, config.robot, launch, rules_for(config, component), owner)
+    rules = replace(
+        rules_for(config, component),
+        restart=Restart(task.restart),
+        restart_limit=task.restart_limit,
+        restart_window_ms=round(task.restart_window_s * 1000),
+    )
+    return types.ComponentSpec(name, config.robot, launch, rules, owner)
 
 
 def retention(config: Config) -> Retention:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
     from failover.core.schedule.terms import Declaration
+
+RESTART_LIMIT_MAX: Final = 100
+RESTART_WINDOW_S_MAX: Final = 3_600
+"""As `failover.core.types.Rules` has them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +24,8 @@ class TaskConfig:
         environment: variables besides PATH, HOME, USER and FAILOVER_SOCKET, or instead of them.
         engine: as of ``failover run``.
         period_ms: 0: it is started, and is no task of the schedule.
+        restart: after which ends the agent starts the program anew, from its beginning; restart_limit: so often inside
+            restart_window_s, 0 for as often as need be: see `failover.core.transitions.restarts`.
         phase_ms, deadline_ms, budget_ms, after, overrun, cpus, priority, strict: see `failover.core.schedule.terms.Terms`.
     """
 
@@ -28,6 +34,9 @@ class TaskConfig:
     directory: str = "/"
     environment: dict[str, str] = field(default_factory=dict)
     engine: Literal["auto", "ptrace", "cooperative"] = "auto"
+    restart: Literal["always", "on-failure", "never"] = "on-failure"
+    restart_limit: int = 5
+    restart_window_s: float = 60
     period_ms: float = 0
     phase_ms: float = 0
     deadline_ms: float = 0
@@ -48,6 +57,10 @@ class TaskConfig:
             raise ValueError("command, directory or environment holds a zero byte; no program can be given one")
         if not self.directory.startswith("/"):
             raise ValueError(f"directory = {self.directory!r} is not absolute; an agent has no directory of its own")
+        if not 0 <= self.restart_limit <= RESTART_LIMIT_MAX:
+            raise ValueError(f"restart_limit is {self.restart_limit}; at most {RESTART_LIMIT_MAX}, and 0 sets no limit")
+        if not 1 <= self.restart_window_s <= RESTART_WINDOW_S_MAX:
+            raise ValueError(f"restart_window_s is {self.restart_window_s:g}; at least 1 and at most {RESTART_WINDOW_S_MAX}")
         for name in self.environment:
             if not name or "=" in name:
                 raise ValueError(f"environment has a variable {name!r}; a name is not empty and has no '=' in it")

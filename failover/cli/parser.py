@@ -160,6 +160,19 @@ VERBS: Final = (
         "failover.cli.verbs.components:release",
     ),
     Verb(
+        "start",
+        "start a component that agent.toml declares, after its end",
+        """
+        Start a component that agent.toml declares, [tasks."NAME"], from its beginning: after failover stop, or after it has
+        failed or ended. Its starts are counted anew (restart_limit). Give this order at any robot; the robot that ran it last
+        carries it out.
+
+          failover start /lab/robot1/mapper
+        """,
+        "failover.cli.arguments.components:named",
+        "failover.cli.verbs.components:start",
+    ),
+    Verb(
         "stop",
         "end a component's program; no robot runs it again",
         """

@@ -22,6 +22,7 @@ verb           arguments                                                result, 
                ``portable`` "": a level, or "no"
 ``protect``    ``pid`` *must*, ``name`` *must*                          ``{name, pid, notes}``
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
+``start``      ``name`` *must*                                          ``{name, robot, notes}``: of agent.toml, after its end
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
 ``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
 ``why``        ``name`` "", ``robot`` "", ``age_ms_max`` 0               see `WHY`
@@ -84,7 +85,7 @@ peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others s
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
-    exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reasons,
+    restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reasons,
     output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
@@ -108,7 +109,8 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     contested: at its primary: which of its files others hold open for writing, so that a restore is refused; by sentence
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
-    state: starting | running | frozen | held | restoring | ended | degraded | failed | released
+    restarts: of a program that agent.toml declares: how often it was started anew after an end, in this life of the agent
+    state: starting | running | restarting | frozen | held | restoring | ended | degraded | failed | released
     lag_ms: age of what the standby holds: since its capture began, or, where a program keeps its state, since its commit
     commit_…: of a program that keeps its state, at its primary: age of its newest commit, the longest time that lay between two
         of the last ones, whether the newest is much older than that

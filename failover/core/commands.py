@@ -9,7 +9,7 @@ from failover.core.component import Cause, Component, Turn
 from failover.core.election import majority
 from failover.core.election.pair import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
-from failover.core.transitions import handover, promotion
+from failover.core.transitions import exits, handover, promotion, restarts
 from failover.core.types import ENDED, State
 
 _RUNNING = frozenset({State.PRIMARY, State.FROZEN})
@@ -58,6 +58,7 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
     component.spec = replace(command.spec, home=command.spec.home or turn.me)
     component.request, component.acked, component.acked_ns = command.request, None, -1
     component.crashes.clear()
+    component.restarts.clear()
     claim(component, turn, None, "an operator asked for it")
 
 
@@ -77,6 +78,7 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
         return f"cannot {verb} {name}: {votes}; start the others"
     if component.holding or component.state is State.STOPPING:
         how = "it runs here" if component.state is State.PRIMARY else f"here it is {component.state}"
+        how = "it is started anew in a moment" if restarts.waits(component) else how
         return f"cannot {verb} {name}: {how}; failover stop or release it first, or choose another name"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
@@ -95,10 +97,14 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
         return
     if component.state in _RUNNING:
         turn.order(acts.LetGo(component.name, component.epoch))
+    elif restarts.waits(component):
+        pass  # its program is cleared away already
     elif component.holding or component.state is State.STOPPING or not (component.state in ENDED or vacant(component, turn)):
         _elsewhere(component, turn, command.request, "release")
         return
-    component.reason = "" if component.state in ENDED else "released: it runs on, unprotected"
+    waited = "released: its program had ended, and is not started anew"
+    runs_on = waited if restarts.waits(component) else "released: it runs on, unprotected"
+    component.reason = "" if component.state in ENDED else runs_on
     component.move(Cause.RELEASE)
     component.primary = turn.me
     component.flight = None
@@ -108,6 +114,10 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
 
 
 def _stop(component: Component, turn: Turn, command: Stop) -> None:
+    if restarts.waits(component):
+        exits.end_waiting(component, turn)
+        turn.order(acts.Answer(command.request, True, f"{component.name} is not started anew"))
+        return
     if component.state not in _RUNNING:
         _elsewhere(component, turn, command.request, "stop")
         return

@@ -16,6 +16,7 @@ from failover.core.types import (
     EPOCH_MAX,
     HISTORY_MAX,
     HOLDING,
+    RESTARTS_MAX,
     ComponentSpec,
     Config,
     OnLoss,
@@ -46,6 +47,7 @@ class Cause(enum.StrEnum):
     LEASE_OVER = "freezes it: its lease is over"
     LEASE_BACK = "is heard again"
     CRASH = "saw it crash"
+    RESTART = "starts it anew"
     HAND_OVER = "hands it over"
     CALL_OFF = "calls the handover off"
     OUTBID = "gives its copy up"
@@ -65,6 +67,8 @@ _IDLE = (State.ABSENT, State.STANDBY, State.FINISHED, State.FAILED, State.RELEAS
 TABLE: dict[tuple[State, Cause], State] = {
     **{(state, Cause.CLAIM): State.CLAIMING for state in _IDLE},
     (State.CLAIMING, Cause.START): State.STARTING,
+    **{(state, Cause.RESTART): State.RECOVERING for state in _RUNNING},
+    (State.RECOVERING, Cause.START): State.STARTING,
     (State.CLAIMING, Cause.RESTORE): State.TAKING_OVER,
     (State.CLAIMING, Cause.YIELD_CLAIM): State.STANDBY,
     (State.STARTING, Cause.RUNS): State.PRIMARY,
@@ -140,6 +144,8 @@ class Component(Struct):
         stood: this copy stood still, or began without a word of the robots that ran it before, since all peers last agreed to it.
         rival_ns: when this copy, which never stopped acting, first heard of the present rival.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
+        restart_ns: its program has ended, and is started anew at this instant; 0: it is not. restarts: when that was ordered, the
+            last times; restarted: how often in this life of the agent. said: by the program that has ended.
         safe: on a primary, the newest position that counts as acknowledged and is not here alone. vouched: on any other member,
             the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
@@ -226,6 +232,10 @@ class Component(Struct):
     told_ns: int = 0
     crashes: deque[int] = field(default_factory=lambda: deque(maxlen=128))
     crashed: int = 0
+    restart_ns: int = 0
+    restarts: deque[int] = field(default_factory=lambda: deque(maxlen=RESTARTS_MAX))
+    restarted: int = 0
+    said: str = ""
     handing: Handing | None = None
     ending: bool = False
     needs_base: bool = False
@@ -298,6 +308,8 @@ class Component(Struct):
         arrow = (self.state, cause)
         assert arrow in TABLE, f"{self.name}: no arrow from {self.state} by {cause.name}"
         self.state = TABLE[arrow]
+        if cause is not Cause.RESTART:
+            self.restart_ns = 0
 
     def hold(self, position: Position) -> None:
         """Remember a position that this robot's store can restore."""

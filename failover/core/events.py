@@ -222,12 +222,16 @@ class Exited(Struct, frozen=True):
         status: waitpid(2)'s: low seven bits the signal (0: none), next byte the exit code.
         refusal: of a program that was started again to keep its state, and ended with an error before it kept any: a sentence. It
             did not go on from what it was given. "" for every other end.
+        keeps_state: it keeps its state itself, and has kept some.
+        said: to be added to a sentence about its end: the last line of its standard error; "" where there is none.
     """
 
     component: str
     epoch: int
     status: int
     refusal: str = ""
+    keeps_state: bool = False
+    said: str = ""
 
 
 class Noticed(Struct, frozen=True):

@@ -6,6 +6,8 @@ simulator (``tests/simulation``) does the same with many nodes. There is no sock
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from failover.core import acts, commands
 from failover.core.acts import Ready
 from failover.core.beat_builder import Speaker, entry_of
@@ -48,7 +50,20 @@ from failover.core.replication import servers, standby, warm_standby
 from failover.core.status import guarantee, view
 from failover.core.status.observations import Watch
 from failover.core.transitions import exits, failback, handover, promotion
-from failover.core.types import COMPONENTS_MAX, ENDED, MS, Config, Found, Held, Resumption, State, StatusView, VoteRecord
+from failover.core.types import (
+    COMPONENTS_MAX,
+    ENDED,
+    MS,
+    ComponentSpec,
+    Config,
+    Found,
+    Held,
+    Resumption,
+    Rules,
+    State,
+    StatusView,
+    VoteRecord,
+)
 from failover.core.wire.messages import Beat, Entry
 
 NS_PER_S = 1_000 * MS
@@ -196,7 +211,7 @@ class Node:
     def _configure(self, held: tuple[Held, ...]) -> None:
         for spec in self._config.components:
             component = self._components.setdefault(spec.name, Component(spec.name, spec=spec))
-            component.spec = component.spec or spec
+            component.spec = _as_declared(component.spec or spec, spec.rules)
             component.autostart = True
         for component in self._components.values():
             component.elects = self._config.by_majority
@@ -331,6 +346,13 @@ class Node:
         return max(min(instants), self._now_ns + REST_NS)
 
 
+def _as_declared(spec: ComponentSpec, said: Rules) -> ComponentSpec:
+    """What agent.toml says of its restarts now, also where the vote record remembers it from an earlier life."""
+    window_ms = said.restart_window_ms
+    rules = replace(spec.rules, restart=said.restart, restart_limit=said.restart_limit, restart_window_ms=window_ms)
+    return replace(spec, rules=rules)
+
+
 def _instants(component: Component) -> list[int]:
     """When something is due for a component before the next beat, perhaps."""
     match component.state:
@@ -352,7 +374,8 @@ def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
     component.standby = component.entrusted[0] if component.entrusted else ""
     pair.open_line(component, turn)
     if not found.running:
-        exits.exited(component, turn, Exited(component.name, component.epoch, found.status))
+        status, keeps_state = found.status, component.keeps_state
+        exits.exited(component, turn, Exited(component.name, component.epoch, status, keeps_state=keeps_state))
     elif lease.on_lease(component, turn):
         turn.order(acts.Freeze(component.name, component.epoch))
         turn.say(component, f"{turn.me} is back, and freezes it until a robot hears {turn.me}, or no other one runs it")

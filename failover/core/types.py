@@ -33,6 +33,19 @@ class OnCrash(enum.StrEnum):
     LEAVE = "leave"
 
 
+class Restart(enum.StrEnum):
+    """Which ends of its program a declared component is started anew after, from its beginning.
+
+    A failure is any end but exit status 0: another exit status, or a signal after which it is not resumed from a checkpoint.
+    """
+
+    ALWAYS = "always"
+    ON_FAILURE = "on-failure"
+    NEVER = "never"
+    UNDECLARED = ""
+    """No agent.toml declares it, an operator started it: its end is an end, whatever its exit status."""
+
+
 class WhenAlone(enum.StrEnum):
     """What a primary does when it hears no other robot: go on (available), or stand still (safe)."""
 
@@ -179,6 +192,8 @@ class Rules(Struct, frozen=True):
             the one after that is not made: the component has failed.
         prefer: robot that should run it whenever it can; "" leaves it where it runs.
         standby: robot that should protect it; "" lets the primary choose.
+        restart: the ends of a declared component after which it is started anew, ``restart_limit`` times (0: as often as need be)
+            inside ``restart_window_ms``; then it has failed.
     """
 
     period_ms: int = 100
@@ -190,8 +205,15 @@ class Rules(Struct, frozen=True):
     on_unsupported: OnUnsupported = OnUnsupported.KEEP_LAST
     prefer: str = ""
     standby: str = ""
+    restart: Restart = Restart.UNDECLARED
+    restart_limit: int = 5
+    restart_window_ms: int = 60_000
 
     def __post_init__(self) -> None:
+        if not 0 <= self.restart_limit <= RESTARTS_MAX:
+            raise RulesError(f"restart_limit = {self.restart_limit}: choose between 0 (no limit) and {RESTARTS_MAX}")
+        if not 1_000 <= self.restart_window_ms <= PERIOD_MS_MAX:
+            raise RulesError(f"restart_window_ms = {self.restart_window_ms}: the window lies between 1 s and an hour")
         if not 1 <= self.period_ms <= PERIOD_MS_MAX:
             raise RulesError(f"period_ms = {self.period_ms}: a capture period lies between 1 ms and an hour")
         if not 0 <= self.crash_limit <= 100:
@@ -346,6 +368,9 @@ EPOCH_SAID_MAX = EPOCH_MAX - (1 << 30)
 BEAT_MS_MAX = 10_000
 PERIOD_MS_MAX = 3_600_000
 
+RESTARTS_MAX = 100
+"""Starts of one component inside its window that are counted."""
+
 BEATS_IN_LEASE_MIN = 4
 """Three beats may be lost in a row before a robot acts on it."""
 
@@ -458,6 +483,7 @@ class ComponentView(Struct, frozen=True):
         cold: why it does not wait here, where it should and something went wrong.
         differs: its promise is another than the team's.
         unstored: why the last snapshot that came here was not stored.
+        restarting: its program has ended, and is started anew after a pause; restarted: so often in this life of the agent.
     """
 
     name: str
@@ -481,6 +507,8 @@ class ComponentView(Struct, frozen=True):
     cold: str = ""
     differs: bool = False
     unstored: str = ""
+    restarting: bool = False
+    restarted: int = 0
 
 
 class StatusView(Struct, frozen=True):

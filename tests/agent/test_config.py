@@ -81,6 +81,7 @@ def test_a_declared_task_is_a_component_that_the_core_starts_by_itself(directory
         ("/opt/controller", "--fast"),
     )
     assert spec.rules.on_crash == "leave"
+    assert (spec.rules.restart, spec.rules.restart_limit, spec.rules.restart_window_ms) == ("on-failure", 5, 60_000)
     told = dict(spec.launch.environment)
     assert (told["SPEED"], told["HOME"], told["FAILOVER_SOCKET"]) == ("2", user.pw_dir, "/run/other/control.sock")
     rights = msgspec.msgpack.decode(spec.launch.inheritance, type=Inheritance)
@@ -103,6 +104,8 @@ def test_a_task_without_a_period_runs_and_is_on_no_schedule(directory: Path) -> 
         ("period_ms = 10\nafter = ['/lab/robot1/controller']", "it is to run after itself"),
         ("period_ms = 10\ncpus = [99]", "cpus = [99]: processors have the numbers 0 to 63"),
         ("period_ms = 10\npriority = 100", "priority 100"),
+        ("restart_limit = 101", "restart_limit is 101; at most 100, and 0 sets no limit"),
+        ("restart_window_s = 0.5", "restart_window_s is 0.5; at least 1 and at most 3600"),
         ("user = 'no-such-user'", "user = 'no-such-user': this robot has no such user"),
         ("directory = 'here'", "directory = 'here' is not absolute"),
         ("command = ['']", "command is missing"),

@@ -173,12 +173,12 @@ def checkpoints(robot: RobotMachine, name: str) -> int:
     return int(component(robot, name).get("snapshots") or 0)
 
 
-def output(robot: RobotMachine, name: str) -> bytes:
-    """What the component wrote to its standard output, as far as no takeover takes it back."""
+def output(robot: RobotMachine, name: str, stream: int = 1) -> bytes:
+    """What the component wrote to its standard output (1) or error (2), as far as no takeover takes it back."""
     collected = bytearray()
     with robot.control() as link:
         for reply in link.stream("logs", name=name):
-            if isinstance(reply, Output) and reply.stream == 1:
+            if isinstance(reply, Output) and reply.stream == stream:
                 assert reply.offset == len(collected), "the stream has a gap or a repetition"
                 collected += reply.content
             elif isinstance(reply, Result):

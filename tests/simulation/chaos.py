@@ -5,9 +5,11 @@ from __future__ import annotations
 from random import Random
 from unittest.mock import patch
 
+from msgspec.structs import replace
+
 from failover.core import beat_builder
 from failover.core.frames.frame import beat_size_max
-from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Rule, Rules, WhenAlone
+from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Restart, Rule, Rules, WhenAlone
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
@@ -69,16 +71,19 @@ def life(
     faults: int = 0,
     *,
     liars: bool = False,
+    restart: Restart = Restart.UNDECLARED,
 ) -> World:
     """Play one seed to its end; raises ``Broken`` when an invariant does not hold.
 
     Args:
         team: of ``TEAMS``; None for what the seed says.
         faults: how many, in a life that is as long as they take and whose programs do not end; 0 for what the seed says.
+        restart: of all components, without a limit.
         liars: an attacker has the key of a member, and lies by it until the world is healed.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
+    specs = tuple(replace(spec, rules=replace(spec.rules, restart=restart, restart_limit=0)) for spec in specs)
     teams = LIARS_TEAMS if liars else TEAMS
     robots, servers, witnesses = team or teams[seed // HARSH % len(teams)]
     configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)

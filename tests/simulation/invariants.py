@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.types import ENDED, MS, ComponentView, OnLoss, Resumption, State, VoteRecord, WhenAlone
+from failover.core.types import ENDED, MS, ComponentView, OnLoss, Restart, Resumption, State, VoteRecord, WhenAlone
 from failover.core.wire.messages import ORDERED, Beat
 from tests.simulation.deeds import epoch_of
 from tests.simulation.liars import INVENTED_NAME
@@ -36,6 +36,8 @@ class Invariants:
         begun: where the copy of each epoch began.
         ordered: components and the epochs that an operator's order claimed: it may cost what was acknowledged.
         last: components whose end was reported as acknowledged.
+        over: (robot, component): its program has ended by itself, and was cleared away; the component is declared, perhaps.
+        former: positions of a declared component's program that had ended before the one that runs was started anew.
         liar: a robot whose key was stolen. It may give away, end or hold back what it runs and keeps itself; so then only that is
             looked at which no robot's word may break: the others run nothing twice, vote once, and no epoch falls.
     """
@@ -56,6 +58,8 @@ class Invariants:
     begun: dict[str, dict[int, int]] = field(default_factory=dict)
     last: set[str] = field(default_factory=set)
     crashing: set[tuple[str, str]] = field(default_factory=set)
+    over: set[tuple[str, str]] = field(default_factory=set)
+    former: dict[str, set[Position]] = field(default_factory=dict)
 
     def __call__(self, world: World, robot: str, what: object) -> None:
         """Look at one thing that happened, or (None) at the state of the world."""
@@ -82,8 +86,13 @@ class Invariants:
                 self._acknowledged(world, robot, what)
             case acts.Show():
                 self._shown(world, robot, what)
+            case acts.Stop():
+                program = world.robots[robot].programs.get(what.component)
+                if program is not None and program.exit_status is not None:
+                    self.over.add((robot, what.component))
             case acts.Start():
                 self._one_primary(world, robot, what)
+                self._begins_anew_after_its_end(world, robot, what)
                 self._nothing_is_held(world, robot, what)
                 self._after_what_was_seen(world, robot, what, 0 if what.component in self.acknowledged else -1)
             case acts.Restore():
@@ -180,6 +189,8 @@ class Invariants:
         """Readers see what was written up to there: it is in the past of every later copy, and of every copy that there is."""
         if act.position not in world.robots[robot].store.get(act.component, []):
             raise _broken(world, f"{robot} shows what {act.component} wrote up to {act.position}, which it does not hold")
+        if act.position in self.former.get(act.component, ()):
+            return
         epoch, value = epoch_of(act.position), world.values[act.position]
         for later, begin in self.begun.get(act.component, {}).items():
             if later > epoch and value > begin and act.component not in self.split:
@@ -207,6 +218,15 @@ class Invariants:
         values = [world.values[one] for other in world.robots.values() for one in other.store.get(component, [])]
         return max(values, default=-1) >= world.values[position]
 
+    def _begins_anew_after_its_end(self, world: World, robot: str, act: acts.Start) -> None:
+        """A declared program whose end the rules have taken in may begin anew: all before it is of another program."""
+        if (robot, act.component) in self.over and act.spec.rules.restart is not Restart.UNDECLARED:
+            kept = (one for other in world.robots.values() for one in other.store.get(act.component, []))
+            self.former.setdefault(act.component, set()).update(kept)
+            for facts in (self.acknowledged, self.seen, self.begun):
+                facts.pop(act.component, None)
+        self.over.discard((robot, act.component))
+
     def _nothing_is_held(self, world: World, robot: str, act: acts.Start) -> None:
         """A robot that begins anew loses no acknowledged state, but for state that was lost with its disks."""
         safe_from = self.acknowledged.get(act.component)
@@ -222,6 +242,10 @@ class Invariants:
         if (act.component, act.epoch) in self.ordered:
             self.acknowledged.pop(act.component, None)
         safe_from = self.acknowledged.get(act.component)
+        former = self.former.get(act.component, set())
+        at_work = world.robots[robot].programs.get(act.component)
+        if act.position in former and ((safe_from is not None and safe_from not in former) or at_work is not None):
+            raise _broken(world, f"{robot} resumes {act.component} from {act.position}, of a program that has ended")
         in_place = (
             any(
                 record.name == act.component and record.state is State.PRIMARY and record.primary == robot

@@ -14,8 +14,8 @@ from failover.core.component import Component, Turn
 from failover.core.election import lease, majority, pair, votes
 from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.replication import servers, standby, warm_standby
-from failover.core.transitions import exits, handover
-from failover.core.types import Config, State
+from failover.core.transitions import exits, handover, restarts
+from failover.core.types import Config, Restart, State
 from failover.core.wire.messages import Entry
 
 Mutant = Callable[[], Any]
@@ -447,6 +447,48 @@ def forgets_weeks() -> Any:
     return patch.object(peer_claims, "EPOCHS_AWAY_MAX", 0)
 
 
+# Mistakes in the starts of declared programs
+
+
+def restarts_for_ever() -> Any:
+    """No limit is looked at."""
+    return patch.object(restarts, "_may_once_more", lambda *_: True)
+
+
+def restarts_what_was_stopped() -> Any:
+    """An end counts as the program's own, also where an operator ordered it."""
+    honest = restarts.begin
+
+    def begin(component: Component, turn: Turn, cause: Any, status: int, why: str) -> bool:
+        component.ending = False
+        return honest(component, turn, cause, status, why)
+
+    return patch.object(restarts, "begin", begin)
+
+
+def restarts_after_every_end() -> Any:
+    """restart = on-failure is taken for always."""
+    return patch.dict(restarts.CAUSES, {Restart.ON_FAILURE: restarts.CAUSES[Restart.ALWAYS]})
+
+
+def gives_its_primacy_up_for_the_pause() -> Any:
+    """The end is a record, which all follow, and the robot where it ended is alone in knowing of the start to come."""
+    return patch.object(restarts, "begin", lambda *_: False)
+
+
+def resumes_what_has_ended() -> Any:
+    """The checkpoints of a program that has ended count as those of the next one."""
+    honest = restarts.begin
+
+    def begin(component: Component, turn: Turn, cause: Any, status: int, why: str) -> bool:
+        held = list(component.held)
+        begun = honest(component, turn, cause, status, why)
+        component.held = held
+        return begun
+
+    return patch.object(restarts, "begin", begin)
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
@@ -483,6 +525,11 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (never_mind_who_repeats, "a_robot_is_replaced_although_a_witness_lies"),
     (forgets_weeks, "a_robot_that_was_away_while_epochs_passed_takes_them_over"),
     (shown_when_stored, "what_is_stored_after_the_claim_is_not_shown"),
+    (restarts_for_ever, "a_declared_program_that_fails_is_started_anew_but_not_for_ever"),
+    (restarts_what_was_stopped, "a_declared_program_that_an_operator_stops_stays_stopped"),
+    (restarts_after_every_end, "an_end_of_a_declared_program_is_an_end_where_its_rule_says_so"),
+    (gives_its_primacy_up_for_the_pause, "a_robot_lost_in_the_pause_before_a_start_is_replaced"),
+    (resumes_what_has_ended, "a_program_that_crashes_right_after_its_start_resumes_nothing_older"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""

@@ -6,6 +6,7 @@ import os
 
 import pytest
 
+from failover.core.types import Restart
 from tests.simulation.__main__ import FAULTS_A_LIFE
 from tests.simulation.chaos import TEAMS, life
 from tests.simulation.invariants import Broken
@@ -15,6 +16,7 @@ SEEDS = int(os.environ.get("FAILOVER_SEEDS", "400"))
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
+RESTARTING = SEEDS // 8
 SEEDS_TO_CATCH = 650
 LONG_LIVES_TO_CATCH = 60
 ONCE_BROKEN = (98, 161, 368)
@@ -36,6 +38,15 @@ def test_every_promise_holds_whatever_goes_wrong(first: int) -> None:
 @pytest.mark.parametrize("seed", ONCE_BROKEN)
 def test_a_long_life_that_broke_a_promise_once_keeps_it_now(seed: int) -> None:
     life(seed, faults=FAULTS_A_LIFE)
+
+
+@pytest.mark.parametrize("restart", [Restart.ALWAYS, Restart.ON_FAILURE], ids=str)
+def test_every_promise_holds_where_programs_are_started_anew_after_their_ends(restart: Restart) -> None:
+    for seed in range(RESTARTING):
+        try:
+            life(seed, restart=restart)
+        except Broken as story:
+            raise Broken(f"seed {seed}: {story}") from None
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)

@@ -106,11 +106,11 @@ def refusal(component: Component, status: int) -> str:
     """
     if not component.goes_on or component.keeps or not os.WIFEXITED(status) or not os.WEXITSTATUS(status):
         return ""
-    said = _last_line(component) or "nothing"
+    said = last_line(component) or "nothing"
     return f"{component.name} did not take its state: exit code {os.WEXITSTATUS(status)} before its first commit{SAID}{said}"
 
 
-def _last_line(component: Component) -> str:
+def last_line(component: Component) -> str:
     """The last line that it wrote to its standard error since it was started; "" if none."""
     bounds = component.logs.bounds(2)
     piece = component.logs.read(2, max(bounds.committed, bounds.size - LINE_LIMIT), committed=False)

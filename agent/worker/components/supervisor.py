@@ -22,6 +22,7 @@ from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.system import clock
 from agent.system.adopted_process import Guest
 from agent.system.crash import end_worker_on_mistake
+from agent.system.permissions import SAID
 from agent.worker.components import launch, resume, under_way
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
@@ -562,4 +563,6 @@ class Supervisor:
             refusal = resume.refusal(component, status or 0)
             if refusal:
                 log.warning("%s", refusal)
-            self.around.tell(events.Exited(self.name, self.epoch, status or 0, refusal))
+            line = resume.last_line(component) if status else ""
+            said = f"{SAID}{line}" if line else ""
+            self.around.tell(events.Exited(self.name, self.epoch, status or 0, refusal, component.keeps, said))

@@ -35,7 +35,7 @@ SIGHT_PATIENCE_S: Final = 2.0
 LIVING: Final = ("live", "suspect")
 """States of peers that are asked: on a busy machine three beats may be late at any time."""
 
-WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "stop")
+WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "start", "stop")
 """What takes a program, its output, or a word that others obey."""
 
 QUESTIONS: Final = ("standing", "picture", "story")

@@ -38,6 +38,7 @@ RIGHT_OF: Final = {
     "prefer": "operate",
     "promote": "operate",
     "release": "operate",
+    "start": "operate",
     "stop": "operate",
 }
 """Verb of the control socket → right that it needs."""

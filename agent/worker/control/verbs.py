@@ -10,7 +10,7 @@ from typing import Any, Final, Protocol
 import msgspec
 from msgspec.structs import replace
 
-from agent.core_config import level_of, rules_for
+from agent.core_config import declared, level_of, rules_for
 from agent.errors import RefusedError
 from agent.hook_kinds import check_told
 from agent.system import clock
@@ -99,6 +99,7 @@ class Verbs(Questions):
             "failback": self.failback,
             "prefer": self.prefer,
             "release": self.release,
+            "start": self.start,
             "stop": self.stop,
         }
         return {name: functools.partial(self._permitted, act) for name, act in found.items()}
@@ -211,6 +212,18 @@ class Verbs(Questions):
         await self._command(by, lambda number: events.Release(number, name))
         await supervisor.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
+
+    async def start(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Start a component that this robot's agent.toml declares, from its beginning, after its end."""
+        name, settings = arguments_of(NameArguments, "start", arguments).name, self._worker.settings
+        task = settings.config.tasks.get(name)
+        if task is None:
+            raise RefusedError(
+                f'cannot start {name}: {settings.path} of {settings.config.robot} does not declare it ([tasks."{name}"]); '
+                f"failover run --name {name} -- COMMAND starts one that is not declared"
+            )
+        supervisor = await self._spec_begun(declared(settings, name, task), by)
+        return {"name": name, "robot": settings.config.robot, "notes": list(supervisor.figures.notes)}
 
     async def stop(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """End a component."""
@@ -396,13 +409,16 @@ class Verbs(Questions):
         """
         config = self._worker.settings.config
         rules = rules_for(config, self._worker.settings.component(name))
+        return await self._spec_begun(ComponentSpec(name, config.robot, launch, rules, owner), by, guest)
+
+    async def _spec_begun(self, spec: ComponentSpec, by: int, guest: Guest | None = None) -> Supervisor:
+        name, launch = spec.name, spec.launch
         supervisor = self._worker.supervisor(name)
         supervisor.guest = guest
         supervisor.started.clear()
         supervisor.ended = None
         end = supervisor.end()
         try:
-            spec = ComponentSpec(name, config.robot, launch, rules, owner)
             await self._command(by, lambda number: events.Run(number, spec))
         except RefusedError as refusal:
             raise RefusedError(str(refusal), refusal.kind, supervisor.figures.reasons) from refusal

@@ -19,7 +19,7 @@ Mood = Literal["good", "warning", "bad", "quiet"]
 
 COLUMNS: Final = ("", "role", "state", "engine", "epoch", "lag", "freeze", "standby", "links")
 
-UNSETTLED_STATES: Final = frozenset({"starting", "restoring", "held", "frozen"})
+UNSETTLED_STATES: Final = frozenset({"starting", "restarting", "restoring", "held", "frozen"})
 
 
 class Row(Struct, frozen=True):
@@ -107,7 +107,7 @@ def _component_row(component: Mapping[str, Any], branch: str) -> Row:
     cells = (
         branch + str(component["name"]),
         str(component.get("role") or ""),
-        _state(component),
+        state_of(component),
         str(component.get("engine") or ""),
         str(component.get("epoch") or ""),
         milliseconds(component.get("lag_ms")),
@@ -126,10 +126,11 @@ def _standby(component: Mapping[str, Any]) -> str:
     return f"{standby}, {'warm' if warm else 'cold'}"
 
 
-def _state(component: Mapping[str, Any]) -> str:
+def state_of(component: Mapping[str, Any]) -> str:
+    """Its state in words, with how it ended."""
     status = component.get("exit_status")
-    if component.get("state") == "ended" and status is not None:
-        return f"ended ({ending(status)})"
+    if component.get("state") in ("ended", "failed") and status is not None:
+        return f"{component['state']} ({ending(status)})"
     if component.get("state") == "running" and is_unprotected(component):
         return "running, unprotected"
     if component.get("state") == "running" and component.get("commit_overdue"):

@@ -198,6 +198,15 @@ def release(arguments: argparse.Namespace) -> int:
     return _tell(arguments, answer, f"{answer['name']} {what}")
 
 
+def start(arguments: argparse.Namespace) -> int:
+    """Start a declared component after its end."""
+    with connect(arguments) as agent:
+        answer = agent.ask("start", name=arguments.name)
+    if not arguments.json:
+        _notes(answer)
+    return _tell(arguments, answer, f"{answer['name']} runs at {answer['robot']}")
+
+
 def stop(arguments: argparse.Namespace) -> int:
     """End a component's program; no robot runs it again."""
     with connect(arguments) as agent:

@@ -43,6 +43,11 @@ def watch(component: Component, turn: Turn) -> None:
         component.stood = component.ordered = False
 
 
+def may_act(component: Component, turn: Turn) -> bool:
+    """Whether a program that is started now may act: by its lease, and by what the robots entrusted with it say."""
+    return not on_lease(component, turn) or _may_thaw(component, turn)
+
+
 def entrust(component: Component, turn: Turn, robot: str) -> bool:
     """Name the robot that may take over; from now on this robot acts on leases. False when it does not hear us now."""
     if robot in component.entrusted:

@@ -11,7 +11,7 @@ from failover.core.peer_claims import Testimony
 from failover.core.replication import standby
 from failover.core.replication.warm_standby import is_warm
 from failover.core.status import guarantee
-from failover.core.transitions import failback
+from failover.core.transitions import failback, restarts
 from failover.core.types import MS, ComponentView, Protection, State, StatusView
 
 NS_PER_S = 10**9
@@ -68,6 +68,8 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         component.cold,
         guarantee.differs(component, turn),
         component.unstored if component.state is State.STANDBY else "",
+        restarts.waits(component),
+        component.restarted,
     )
 
 
@@ -154,6 +156,8 @@ def _unread(turn: Turn) -> str:
 
 def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     notes = []
+    if waiting := restarts.note(component, turn.now_ns):
+        notes.append(waiting)
     if component.degraded and component.holding:
         notes.append(f"not captured: {component.degraded}; {_age(component, turn)}")
     elif component.awaited and component.holding:

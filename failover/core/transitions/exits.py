@@ -13,10 +13,9 @@ from failover.core.election.consent import state_of
 from failover.core.election.pair import refuse_request, restart_line
 from failover.core.events import ActFailed, Exited
 from failover.core.membership import Peer
+from failover.core.transitions import restarts
+from failover.core.transitions.restarts import SIGNAL_BITS
 from failover.core.types import ENDED, MS, OnCrash, State
-
-SIGNAL_BITS = 0x7F
-"""Of a wait status: the signal that ended the program, 0 for none."""
 
 TRIES_MAX = 3
 """Takeovers that fail here, one after the other without a checkpoint in between, before this robot leaves it alone."""
@@ -24,24 +23,35 @@ TRIES_MAX = 3
 PAUSES = (1, 10, 10)
 """Of ``retry_ms``, before a takeover that failed is tried again: an obstacle met once may be gone at once."""
 
+UNDECLARED_CURE = "look at its logs, then run it again, or release it to forget it"
+
 _WITH_PROCESS = frozenset({State.STARTING, State.TAKING_OVER, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING})
 
 
 def exited(component: Component, turn: Turn, event: Exited) -> None:
     """The program ended: by itself or as asked, that is its end; by a signal, a crash."""
-    if component.state not in _WITH_PROCESS or event.epoch < component.born:
+    if component.state not in _WITH_PROCESS or event.epoch < component.born or restarts.waits(component):
         return
-    signal = event.status & SIGNAL_BITS
+    signal, component.said = event.status & SIGNAL_BITS, event.said
     if event.refusal and not component.ending:
         _refused(component, turn, event)
+    elif not signal and not component.ending and restarts.is_failure(component, event.status):
+        if event.keeps_state and restarts.resumes_first(component):
+            crashed(component, turn, event.status)
+            return
+        _end(component, turn, Cause.FAIL, event.status, f"it ended with {restarts.how(event.status)}")
     elif not signal or component.ending:
         _end(component, turn, Cause.FINISH, event.status, "")
-        how = f"signal {signal}" if signal else f"exit code {event.status >> 8}"
-        turn.say(component, f"{turn.me} {Cause.FINISH}: {how}")
     elif component.rules.on_crash is OnCrash.LEAVE:
         _end(component, turn, Cause.FAIL, event.status, f"it died by signal {signal}; on_crash = leave")
     else:
         crashed(component, turn, event.status)
+
+
+def end_waiting(component: Component, turn: Turn) -> None:
+    """An operator stops a component whose program has ended and would be started anew."""
+    component.ending = True
+    _end(component, turn, Cause.FINISH, component.status, "")
 
 
 def _refused(component: Component, turn: Turn, event: Exited) -> None:
@@ -64,7 +74,7 @@ def crashed(component: Component, turn: Turn, status: int) -> None:
 
 def failed(component: Component, turn: Turn, event: ActFailed) -> None:
     """A start or a restore came to nothing."""
-    if event.epoch != component.epoch:
+    if event.epoch != component.epoch or restarts.waits(component):
         return
     if component.state is State.STARTING:
         told = bool(component.request)  # the operator is told; then nothing of it is remembered: its name is whose it was before
@@ -90,6 +100,8 @@ def cannot(component: Component, turn: Turn, why: str) -> None:
 
 def overdue(component: Component, turn: Turn) -> None:
     """A start or a restore that says nothing has failed; a Stop that says nothing is ordered again."""
+    if restarts.waits(component):
+        restarts.advance(component, turn)
     if turn.now_ns < component.until_ns:
         return
     if component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING):
@@ -137,7 +149,8 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     back = 1 if count <= limit else 2
     if count > limit + 1 or len(component.held) < back:
         why = "no checkpoint to resume it from" if len(component.held) < back else f"{count} crashes in {window_ns // 10**9} s"
-        _end(component, turn, Cause.FAIL, status, f"{why}; look at its logs, then run it again, or release it to forget it")
+        why = f"it died by {restarts.how(status)}; {why}" if restarts.is_declared(component) else f"{why}; {UNDECLARED_CURE}"
+        _end(component, turn, Cause.FAIL, status, why)
         return
     position = component.held[-back]
     component.move(Cause.CRASH)
@@ -159,9 +172,14 @@ def _end_handover(component: Component, turn: Turn, why: str) -> None:
 
 def _end(component: Component, turn: Turn, cause: Cause, status: int, reason: str) -> None:
     _end_handover(component, turn, f"{component.name} ended meanwhile")
+    if restarts.begin(component, turn, cause, status, reason):
+        return
+    if cause is Cause.FAIL:
+        reason = "; ".join((reason, *restarts.remarks(component)))
+        reason += component.said if restarts.is_declared(component) else ""
     component.move(cause)
     component.status, component.reason = status, reason
     component.flight = None
     component.reported = False
-    if reason:
-        turn.say(component, f"{turn.me} {cause}: {reason}")
+    if reason or cause is Cause.FINISH:
+        turn.say(component, f"{turn.me} {cause}: {reason or restarts.how(status)}")

@@ -14,6 +14,7 @@ UNDER_AN_AGENT = {
     "run": ["--", "/bin/true"],
     "protect": ["1"],
     "release": ["x"],
+    "start": ["x"],
     "stop": ["x"],
     "logs": ["x"],
     "status": [],

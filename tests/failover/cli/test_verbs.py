@@ -393,7 +393,7 @@ def test_completion_knows_every_verb(shell: str) -> None:
 @pytest.mark.command("bash")
 @pytest.mark.parametrize(
     ("typed", "offered"),
-    [("st", {"stop", "status"}), ("team en", {"enrol"}), ("run --na", {"--name"}), ("completion z", {"zsh"})],
+    [("st", {"start", "stop", "status"}), ("team en", {"enrol"}), ("run --na", {"--name"}), ("completion z", {"zsh"})],
 )
 def test_a_real_bash_completes(typed: str, offered: set[str], tmp_path: Path) -> None:
     (tmp_path / "failover.bash").write_text(failover("completion", "bash").stdout)
