@@ -64,7 +64,7 @@ def declared(settings: Settings, name: str, task: TaskConfig) -> types.Component
     level = level_of("", config, component)
     variables = cpu_baseline.environment(variables, level) if level else variables
     launch = Launch(
-        task.command,
+        task.argv(name),
         tuple({**variables, **task.environment}.items()),
         task.directory,
         engine=task.engine,

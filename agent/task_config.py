@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -23,6 +25,8 @@ class TaskConfig:
         directory: an absolute path.
         environment: variables besides PATH, HOME, USER and FAILOVER_SOCKET, or instead of them.
         engine: as of ``failover run``.
+        wake: "self": it waits for its activations itself. "signal": it is sent ``wake_signal`` at each of them: it can do no more
+            than wait for a signal. CONT: it stops itself to wait (`failover.cli.verbs.task_programs`).
         period_ms: 0: it is started, and is no task of the schedule.
         restart: after which ends the agent starts the program anew, from its beginning; restart_limit: so often inside
             restart_window_s, 0 for as often as need be: see `failover.core.transitions.restarts`.
@@ -37,6 +41,8 @@ class TaskConfig:
     restart: Literal["always", "on-failure", "never"] = "on-failure"
     restart_limit: int = 5
     restart_window_s: float = 60
+    wake: Literal["self", "signal"] = "self"
+    wake_signal: str = "CONT"
     period_ms: float = 0
     phase_ms: float = 0
     deadline_ms: float = 0
@@ -61,9 +67,19 @@ class TaskConfig:
             raise ValueError(f"restart_limit is {self.restart_limit}; at most {RESTART_LIMIT_MAX}, and 0 sets no limit")
         if not 1 <= self.restart_window_s <= RESTART_WINDOW_S_MAX:
             raise ValueError(f"restart_window_s is {self.restart_window_s:g}; at least 1 and at most {RESTART_WINDOW_S_MAX}")
+        if not hasattr(signal, f"SIG{self.wake_signal}"):
+            raise ValueError(f"wake_signal is {self.wake_signal!r}; give the name of a signal, such as CONT or USR1")
+        if self.wake == "signal" and not self.period_ms:
+            raise ValueError('wake = "signal" without period_ms: a program is sent a signal at each activation of its task')
         for name in self.environment:
             if not name or "=" in name:
                 raise ValueError(f"environment has a variable {name!r}; a name is not empty and has no '=' in it")
+
+    def argv(self, name: str) -> tuple[str, ...]:
+        """The command that is started: its own, or one that wakes it."""
+        if self.wake == "self":
+            return self.command
+        return (sys.executable, "-m", "failover", "task", "run", "--signal", self.wake_signal, name, "--", *self.command)
 
 
 def declaration(name: str, task: TaskConfig) -> Declaration | None:

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import pwd
 import re
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -88,6 +89,12 @@ def test_a_declared_task_is_a_component_that_the_core_starts_by_itself(directory
     assert (rights.uid, rights.gid) == (user.pw_uid, user.pw_gid)
 
 
+def test_a_task_that_is_woken_by_a_signal_is_started_by_the_command_that_sends_it(directory: Path) -> None:
+    (spec,) = node_config(configuration.load(written(directory, *TASK, "period_ms = 10", 'wake = "signal"'))).components
+    sends = ("-m", "failover", "task", "run", "--signal", "CONT", "/lab/robot1/controller", "--")
+    assert spec.launch.argv == (sys.executable, *sends, "/opt/controller", "--fast")
+
+
 def test_a_task_without_a_period_runs_and_is_on_no_schedule(directory: Path) -> None:
     settings = configuration.load(written(directory, *TASK))
     assert len(node_config(settings).components) == 1
@@ -104,6 +111,8 @@ def test_a_task_without_a_period_runs_and_is_on_no_schedule(directory: Path) -> 
         ("period_ms = 10\nafter = ['/lab/robot1/controller']", "it is to run after itself"),
         ("period_ms = 10\ncpus = [99]", "cpus = [99]: processors have the numbers 0 to 63"),
         ("period_ms = 10\npriority = 100", "priority 100"),
+        ("wake = 'signal'", 'wake = "signal" without period_ms'),
+        ("period_ms = 10\nwake = 'signal'\nwake_signal = 'BELL'", "wake_signal is 'BELL'; give the name of a signal"),
         ("restart_limit = 101", "restart_limit is 101; at most 100, and 0 sets no limit"),
         ("restart_window_s = 0.5", "restart_window_s is 0.5; at least 1 and at most 3600"),
         ("user = 'no-such-user'", "user = 'no-such-user': this robot has no such user"),

@@ -7,7 +7,6 @@ import shlex
 from typing import Final
 
 from checkpoint.program import cpu_baseline
-from checkpoint.sentences import near
 from failover.cli.arguments.resources import (
     REFUSES,
     RESETS,
@@ -17,7 +16,7 @@ from failover.cli.arguments.resources import (
     add_shared_files,
     add_shared_memory,
 )
-from failover.cli.arguments.shared import add_agent, add_name, add_pid
+from failover.cli.arguments.shared import add_agent, add_name, add_pid, signal_number
 
 HOOKS: Final = {
     "before_capture": "before the agent takes a whole snapshot of it, and before the last one of a handover",
@@ -128,14 +127,3 @@ def prefer(room: argparse.ArgumentParser) -> None:
     add_name(room)
     room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
     add_agent(room)
-
-
-def signal_number(text: str) -> int:
-    """A signal's number, from a number or a name with or without SIG."""
-    import signal
-
-    try:
-        return signal.Signals(int(text)) if text.isdecimal() else signal.Signals["SIG" + text.upper().removeprefix("SIG")]
-    except (ValueError, KeyError):
-        meant = near(text.upper(), (one.name.removeprefix("SIG") for one in signal.Signals))
-        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM{meant}") from None

@@ -6,6 +6,7 @@ import argparse
 from textwrap import dedent
 from typing import Any, Final
 
+from checkpoint.sentences import near
 from failover.config.choices import none_of
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
@@ -105,3 +106,14 @@ def whole(text: str) -> int:
     if not text.isascii() or not text.isdigit() or not 0 < int(text[:10]) <= NUMBER_MAX:
         raise argparse.ArgumentTypeError(f"{text!r} is no number from 1 to {NUMBER_MAX}")
     return int(text)
+
+
+def signal_number(text: str) -> int:
+    """A signal's number, from a number or a name with or without SIG."""
+    import signal
+
+    try:
+        return signal.Signals(int(text)) if text.isdecimal() else signal.Signals["SIG" + text.upper().removeprefix("SIG")]
+    except (ValueError, KeyError):
+        meant = near(text.upper(), (one.name.removeprefix("SIG") for one in signal.Signals))
+        raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM{meant}") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Final
 
-from failover.cli.arguments.shared import add_act, add_json, add_place_of_board, add_repeated
+from failover.cli.arguments.shared import add_act, add_json, add_place_of_board, add_repeated, signal_number
 
 
 def ps(room: argparse.ArgumentParser) -> None:
@@ -48,7 +48,10 @@ def task(room: argparse.ArgumentParser) -> None:
         act.add_argument("task", metavar="TASK", help="the task's name")
         act.add_argument("words", metavar="KEY=VALUE … -- CMD", nargs="+", help="settings as of add; then the command, after --")
         if name == "run":
-            act.add_argument("--loop", action="store_true", help="start CMD once; it calls failover wait-activation")
+            how = act.add_mutually_exclusive_group()
+            how.add_argument("--loop", action="store_true", help="start CMD once; it calls failover wait-activation")
+            said = "start CMD once, and send it signal N at each activation (CONT: it stops itself to wait for the next one)"
+            how.add_argument("--signal", metavar="N", type=signal_number, default=0, help=said)
         else:
             act.add_argument("--in-ms", metavar="MS", type=float, default=0, help="not before so many milliseconds (default: 0)")
         act.set_defaults(function=f"failover.cli.verbs.task_programs:{function}")
@@ -99,10 +102,13 @@ REMOVE_DESCRIPTION: Final = """
 
 RUN_TASK_DESCRIPTION: Final = """
     Run a task whose program knows nothing of the schedule. CMD is run at each activation, which ends when CMD does. With --loop
-    CMD is started once, and calls failover wait-activation for each. Without settings the task is one that is declared already.
+    CMD is started once, and calls failover wait-activation for each. With --signal CONT it is started once, and stops itself
+    (SIGSTOP) to wait; its activation ends when it stops again. With another signal, for which it must have a handler, the
+    activation ends when it is sent. Without settings the task is one that is declared already.
 
       failover task run logger period_ms=1000 -- sh -c 'df / >> disk.log'
       failover task run --loop logger period_ms=1000 -- sh -c 'while failover wait-activation -q; do df / >> disk.log; done'
+      failover task run --signal CONT logger period_ms=1000 -- sh -c 'while kill -STOP $$; do df / >> disk.log; done'
     """
 
 RUN_ONCE_DESCRIPTION: Final = """

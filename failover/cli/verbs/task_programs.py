@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -29,6 +30,9 @@ VARIABLE: Final = "FAILOVER_ACTIVATION_FD"
 the next activation, and receives one: number, instant at which it was due, lateness (ns), activations missed before it. The end
 of the socket: there is none."""
 PACKET_SIZE: Final = 256
+READY_POLL_S: Final = 0.01
+READY_LOOKS: Final = 3
+"""Looks in a row, and the time between two, that must say that a program has its handler: a shell that forks blocks signals."""
 KILLED: Final = 128
 """Added to a signal's number, as shells do."""
 
@@ -50,11 +54,13 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run a command at each activation of a task; with --loop run it once, and let it ask for them."""
+    """Run a command at each activation of a task; with --loop or --signal start it once, and let it ask, or send it a signal."""
     settings, command = _split(arguments.words)
     fields, after, _ = parsed(settings)
     terms = terms_of(fields) if settings else Terms()
     with _running(arguments, terms, after or ()) as task:
+        if arguments.signal:
+            return _signalled(task, command, arguments.signal)
         return _looped(task, command) if arguments.loop else _each(task, command)
 
 
@@ -102,6 +108,7 @@ def _started(command: Sequence[str], **options: object) -> Iterator[subprocess.P
     finally:
         if process.poll() is None:
             process.terminate()
+            process.send_signal(signal.SIGCONT)  # one that has stopped takes no other signal
             process.wait()
 
 
@@ -124,28 +131,86 @@ def _each(task: ScheduledTask, command: Sequence[str]) -> int:
 def _looped(task: ScheduledTask, command: Sequence[str]) -> int:
     """Run a command that asks for each activation; its exit status."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    before = signal.getsignal(signal.SIGCHLD)
     try:
         with _started(command, pass_fds=(theirs.fileno(),), env={**os.environ, VARIABLE: str(theirs.fileno())}) as process:
             theirs.close()
             with contextlib.suppress(_ProgramEnded, BrokenPipeError, ConnectionResetError):
-                try:
-                    signal.signal(signal.SIGCHLD, _notice)  # a task may sleep for long: it is woken when its program ends
+                with _woken_by_its_end(process):
                     while process.poll() is None and ours.recv(PACKET_SIZE) and (tick := task.wait_activation()) is not None:
                         ours.send(_told(tick).encode())
-                finally:
-                    signal.signal(signal.SIGCHLD, before)
             task.end()
             ours.close()
             return _status(process)
     finally:
-        signal.signal(signal.SIGCHLD, before)
         ours.close()
         theirs.close()
 
 
-def _notice(number: int, frame: FrameType | None) -> None:
-    raise _ProgramEnded
+def _signalled(task: ScheduledTask, command: Sequence[str], number: int) -> int:
+    """Run a command once and send it a signal at each activation; its exit status, 0 where the task comes to an end first.
+
+    With SIGCONT an activation ends when the program stops itself again; with any other signal, of which a program shows no end,
+    when it has been sent.
+    """
+    with _started(command) as process:
+        try:
+            with _woken_by_its_end(process):
+                _wait_until_stopped(process) if number == signal.SIGCONT else _wait_until_taken(process, number)
+                while task.wait_activation() is not None:
+                    os.kill(process.pid, number)
+                    if number == signal.SIGCONT:
+                        _wait_until_stopped(process)
+                    task.end()
+                return 0
+        except _ProgramEnded:
+            task.end()
+            return _status(process)
+
+
+@contextlib.contextmanager
+def _woken_by_its_end(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """A task may sleep for long: the body is left by `_ProgramEnded` when its program ends."""
+
+    def notice(number: int, frame: FrameType | None) -> None:
+        if _has_ended(process):
+            raise _ProgramEnded
+
+    before = signal.signal(signal.SIGCHLD, notice)
+    try:
+        if _has_ended(process):
+            raise _ProgramEnded
+        yield
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
+def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether it has; its exit status stays for `Popen`."""
+    try:
+        return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+    except ChildProcessError:
+        return True
+
+
+def _wait_until_stopped(process: subprocess.Popen[bytes]) -> None:
+    """Until it has stopped itself: it waits for SIGCONT. Source: waitid(2)."""
+    found = os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+    if found is None or found.si_code != os.CLD_STOPPED:
+        raise _ProgramEnded
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOHANG)
+
+
+def _wait_until_taken(process: subprocess.Popen[bytes], number: int) -> None:
+    """Until it has a handler for the signal, or blocks or ignores it: the first one would end it before.
+
+    Source: proc_pid_status(5).
+    """
+    looks = 0
+    while looks < READY_LOOKS:
+        lines = dict(line.split(":", 1) for line in Path(f"/proc/{process.pid}/status").read_text().splitlines() if ":" in line)
+        is_taken = any(int(lines[key], 16) >> (number - 1) & 1 for key in ("SigBlk", "SigIgn", "SigCgt"))
+        looks = looks + 1 if is_taken else 0
+        time.sleep(READY_POLL_S)
 
 
 def _told(tick: Tick) -> str:

@@ -70,6 +70,7 @@ USAGE = (
     *(["board", "record", "x", *rest] for rest in (["--rate", "0"], ["--rate", "2000"], ["--for", "soon"], ["--max-size", "9"])),
     *(["board", "serve", "--foxglove", port] for port in ("-1", "65536", "x")),
     *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
+    ["task", "run", "--signal", "BELL", "x", "period_ms=20", "--", "true"],
     *(["board", "fly"], ["board", "get"], ["board", "--every-ms", "0"], ["board", "import", "f", "--robot", "a"]),
     *(["check", pid] for pid in NO_PIDS),
     ["check", "1", "--table"],
