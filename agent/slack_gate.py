@@ -7,7 +7,7 @@ The kernel tells which tasks a program runs: the process that runs a task holds 
 Two keepers whose programs share a processor do not freeze at the same time: each locks the processors of its program in the
 schedule.
 
-Source: proc_pid_fdinfo(5), "lock:"; SCHEDULE.md.
+Source: SCHEDULE.md.
 """
 
 from __future__ import annotations
@@ -20,17 +20,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from msgspec import Struct
-
 from checkpoint.keeper.messages import Slack
-from failover.boards import SCHEDULE_NAME, boottime, futex, locks
+from failover.boards import boottime, futex, locks
 from failover.boards.fence import FENCE
+from failover.boards.openings import Opening, openings_of
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout
 from failover.core.schedule.activation import State
-from failover.core.schedule.layout import CPU_LOCKS, ROW_LOCKS, SETTLED_FIELD
+from failover.core.schedule.layout import CPU_LOCKS, SETTLED_FIELD
 from failover.core.schedule.slack import Choice, Freezes, TaskSeen, Wait
-from failover.core.schedule.terms import CPUS_MAX, TASKS_MAX, Kind
+from failover.core.schedule.terms import CPUS_MAX, Kind
 from failover.errors import FailoverError
 
 LOOK_NS: Final = 1_000_000_000
@@ -44,14 +43,6 @@ READINGS: Final = 8
 
 UNKNOWN: Final = (State.IDLE, State.DONE)
 """States without a next activation that could be foreseen."""
-
-
-class Opening(Struct, frozen=True):
-    """An open file of a process that is its schedule, and the rows that the process runs there."""
-
-    pid: int
-    path: str
-    rows: tuple[int, ...]
 
 
 class SlackGate:
@@ -232,38 +223,6 @@ def _seen(file: ScheduleFile, row: int) -> TaskSeen:
 def _next_to_end(tasks: dict[int, TaskSeen]) -> int:
     """The row whose end to wait for: of one that runs, else of the one that is due first."""
     return min(tasks, key=lambda row: (not tasks[row].is_running, tasks[row].due_ns or 1 << 63))
-
-
-def openings_of(pid: int) -> list[Opening]:
-    """The schedules of which a process runs rows."""
-    found: list[Opening] = []
-    try:
-        names = os.listdir(f"/proc/{pid}/fd")
-    except OSError:  # it has ended
-        return found
-    for name in names:
-        path = f"/proc/{pid}/fd/{name}"
-        with contextlib.suppress(OSError):  # it was closed meanwhile
-            if os.readlink(path).removesuffix(" (deleted)").endswith(f"/{SCHEDULE_NAME}"):
-                rows = held_rows(Path(f"/proc/{pid}/fdinfo/{name}").read_text())
-                if rows:
-                    found.append(Opening(pid, path, rows))
-    return found
-
-
-def held_rows(fdinfo: str) -> tuple[int, ...]:
-    """The rows whose locks an opening holds.
-
-    Args:
-        fdinfo: as "lock:\\t1: OFDLCK ADVISORY  WRITE -1 00:1a:77 2199023255552 2199023255552", among other lines.
-    """
-    rows: set[int] = set()
-    for line in fdinfo.splitlines():
-        words = line.split()
-        if line.startswith("lock:") and "WRITE" in words and words[-2].isdigit() and words[-1].isdigit():
-            first, last = int(words[-2]) - ROW_LOCKS, int(words[-1]) - ROW_LOCKS
-            rows.update(range(max(first, 0), min(last, TASKS_MAX - 1) + 1))
-    return tuple(sorted(rows))
 
 
 def _opened(opening: Opening) -> ScheduleFile | None:

@@ -49,6 +49,11 @@ class SharedFile:
         self._map(area)
         self.header = self.read_header()
 
+    @property
+    def identity(self) -> tuple[int, int]:
+        """Device and inode of the file that is mapped."""
+        return self._identity
+
     def _map(self, area: mmap.mmap) -> None:
         self.area = area
         self.view = memoryview(area)

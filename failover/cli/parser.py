@@ -340,14 +340,16 @@ VERBS: Final = (
     ),
     Verb(
         "ps",
-        "the tasks of this robot's schedule: state, period, lateness, duration, misses",
+        "robots, components and their tasks as a tree: state, period, phase, misses, lateness",
         """
-        Shows the tasks that programs of this robot run at their times (docs/tasks.md), the most urgent first. Lateness is
-        the span from the instant at which an activation was due to its beginning: half of the activations, and 99 of 100, were
-        below the bound that is shown. No agent is needed. Exit status 1: no process runs one of them.
+        Shows the robots, below each its components, and below each component of this robot the tasks that its program runs at
+        their times (docs/tasks.md), the most urgent first. Lateness is the span from the instant at which an activation was due
+        to its beginning: half of the activations, and 99 of 100, were below the bound that is shown. Without an agent it shows
+        the tasks alone. Exit status 1: no process runs a task, a task is past its deadline, or a component here has failed.
 
           failover ps
           failover ps --watch
+          failover ps --json | jq '.tasks[] | {task, component, late_p99_ms}'
         """,
         "failover.cli.arguments.tasks:ps",
         "failover.cli.verbs.tasks:show",

@@ -78,6 +78,11 @@ def open_schedule(place: Path | None = None) -> ScheduleFile:
         ) from None
 
 
+def is_none_there() -> bool:
+    """Whether this robot has no schedule: no program has run a task yet."""
+    return not (directory.find_schedule() / SCHEDULE_NAME).exists()
+
+
 def overview(file: ScheduleFile) -> list[Seen]:
     """All tasks, most urgent first.
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from agent import slack_gate
-from agent.slack_gate import SlackGate, held_rows, openings_of
+from agent.slack_gate import SlackGate
 from failover.boards import SCHEDULE_NAME, directory
+from failover.boards.openings import held_rows, openings_of, rows_of
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.schedule import layout
 
@@ -128,6 +129,8 @@ def test_the_kernel_tells_which_rows_a_process_runs(steady: subprocess.Popen[str
     (opening,) = openings_of(steady.pid)
     file = ScheduleFile.open(place / SCHEDULE_NAME)
     assert opening.rows == (file.row_of("steady"),)
+    assert rows_of(os.getpid(), file.identity) == set(opening.rows), "of its descendants, too"
+    assert rows_of(steady.pid, (0, 0)) == set(), "of another schedule"
     file.close()
     assert held_rows("pos:\t0\nlock:\t1: OFDLCK ADVISORY  WRITE -1 00:1a:77 2199023255554 2199023255555\n") == (2, 3)
     assert held_rows("lock:\t1: OFDLCK ADVISORY  READ -1 00:1a:77 2199023255554 2199023255555\n") == ()

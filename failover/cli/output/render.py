@@ -6,6 +6,7 @@ import codecs
 import json
 import re
 import sys
+import textwrap
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -29,6 +30,11 @@ BORDER: Final = 1
 PADDING: Final = 2
 """Columns that a framed table takes besides its cells: one on each side of every cell, and its lines."""
 
+BRANCHES: Final = "├└│─`|- "
+BELOW: Final = str.maketrans({"├": "│", "└": " ", "─": " ", "`": " ", "-": " "})
+"""What stands before a row in a tree, and what stands below that."""
+STACKED_INDENT: Final = 3
+
 ASCII: Final = str.maketrans({"└": "`", "├": "|", "─": "-", "–": "-", "…": "~"})
 """For a terminal or a file that is not in UTF-8."""
 
@@ -37,6 +43,11 @@ def spoken(text: str) -> str:
     """The text in characters that standard output has."""
     encoding = codecs.lookup(getattr(sys.stdout, "encoding", None) or "ascii").name
     return text if encoding.startswith("utf") else text.translate(ASCII).encode(encoding, "replace").decode(encoding)
+
+
+def room() -> int:
+    """Columns of the terminal; as many as are wanted where no person looks."""
+    return _console().width if is_terminal() else sys.maxsize
 
 
 def is_terminal() -> bool:
@@ -232,7 +243,7 @@ def _drawn(width: int, columns: Sequence[str], lines: Sequence[tuple[Sequence[st
     cells = [[columns[index], *(line[index] for line, _ in lines)] for index in kept]
     widths = _widths(cells, width - BORDER - (BORDER + PADDING) * len(kept))
     if widths is None:
-        told = [Text(told, style=style) for line, style in lines for told in _stacked(columns, line)]
+        told = [Text(told, style=style) for line, style in lines for told in _stacked(columns, line, width)]
         return Group(*([Text(title, style="italic")] if title else []), *told)
     drawn = Table(title=title or None, title_justify="left", box=box.ROUNDED, border_style="dim", header_style="bold")
     for index, column_width in zip(kept, widths, strict=True):
@@ -258,7 +269,9 @@ def _widths(cells: Sequence[Sequence[str]], room: int) -> list[int] | None:
     return widths
 
 
-def _stacked(columns: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """One row for a narrow terminal: its name, and below it the known values, with the columns' names."""
-    told = [f"{column} {cell}".strip() for column, cell in zip(columns[1:], cells[1:], strict=True) if cell.strip(" -–")]
-    return [cells[0], *([f"     {', '.join(told)}"] if told else [])]
+def _stacked(columns: Sequence[str], cells: Sequence[str], width: int) -> list[str]:
+    """One row for a narrow terminal: its name, and below it, inside the lines of a tree, the known values with their columns."""
+    told = ", ".join(f"{column} {cell}".strip() for column, cell in zip(columns[1:], cells[1:], strict=True) if cell.strip(" -–"))
+    branch = cells[0][: len(cells[0]) - len(cells[0].lstrip(BRANCHES))]
+    below = branch.translate(BELOW) + " " * (STACKED_INDENT if branch else 2 * STACKED_INDENT - 1)
+    return [cells[0], *textwrap.wrap(told, max(width, width_of(below) + 1), initial_indent=below, subsequent_indent=below)]

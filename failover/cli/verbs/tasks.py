@@ -9,21 +9,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from failover.boards import boottime
+from failover.boards.openings import rows_of
 from failover.boards.schedule_file import Order, ScheduleFile
-from failover.cli.output import render
-from failover.cli.output.board_tree import ms, span
-from failover.cli.output.team_tree import Mood, Row
+from failover.cli.output import render, task_tree
+from failover.cli.output.board_tree import span
+from failover.client.control import Control
 from failover.core.schedule import layout, orders
 from failover.core.schedule.course import Overrun
 from failover.core.schedule.orders import Change
 from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
-from failover.errors import ScheduleError
-from failover.schedule.overview import Seen, judged, open_schedule, overview
+from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, ScheduleError
+from failover.schedule.overview import Seen, is_none_there, judged, open_schedule, overview
 
-COLUMNS: Final = ("task", "state", "period", "late p50", "p99", "took p50", "p99", "misses", "overruns", "after")
 SPANS: Final = {
     "period_ms": "period_ns",
     "phase_ms": "phase_ns",
@@ -46,39 +46,59 @@ def opened(arguments: argparse.Namespace) -> Iterator[ScheduleFile]:
 
 
 def show(arguments: argparse.Namespace) -> int:
-    """The tasks; with --watch again and again until Ctrl-C. Exit status 1: a task is idle, or past its deadline."""
-    with opened(arguments) as file:
-        with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
-            while True:
-                seen = overview(file)
-                if arguments.json:
-                    render.as_json({"robot": file.header.robot, "tasks": [_told(one) for one in seen]})
-                else:
-                    draw(COLUMNS, [_row(one) for one in seen], f"tasks of {file.header.robot}")
-                if not arguments.watch:
-                    return 1 if any(one.state == "idle" or one.past_deadline_ns for one in seen) else 0
-                time.sleep(arguments.every_ms / 1000)
+    """Robots, components, tasks; with --watch again and again until Ctrl-C.
+
+    Exit status 1: a task is idle, or past its deadline, or a component has failed.
+    """
+    with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
+        while True:
+            here, seen, tree = _looked_at(arguments)
+            if arguments.json:
+                render.as_json(task_tree.told(here, seen, tree))
+            else:
+                draw(*task_tree.fitting(tree, render.room()), f"tasks of {here}")
+            if not arguments.watch:
+                return 0 if task_tree.is_well(tree) else 1
+            time.sleep(arguments.every_ms / 1000)
     return 0  # Ctrl-C ended the watch
 
 
-def _told(one: Seen) -> dict[str, Any]:
-    """A task as JSON: spans in milliseconds."""
-    return {
-        name.removesuffix("_ns") + "_ms" if name.endswith("_ns") else name: ms(value) if name.endswith("_ns") else value
-        for name, value in asdict(one).items()
-    }
+def _looked_at(arguments: argparse.Namespace) -> tuple[str, list[Seen], tuple[task_tree.Robot, ...]]:
+    """This robot, its tasks and the tree; of a robot whose agent answers, also where no program has run a task yet.
+
+    Raises:
+        ScheduleError: there is no schedule, and no agent.
+    """
+    status = team_status()
+    try:
+        with opened(arguments) as file:
+            seen, here = overview(file), file.header.robot
+            return here, seen, task_tree.robots(here, seen, status, owners(file, seen, status))
+    except ScheduleError:
+        if status is None or arguments.board or not is_none_there():
+            raise
+        here = str(status["robot"])
+        return here, [], task_tree.robots(here, [], status, {})
 
 
-def _row(one: Seen) -> Row:
-    mood: Mood = "bad" if one.past_deadline_ns else "warning" if one.state in ("idle", "held") or one.misses else "good"
-    state = f"{one.state}, {span(one.past_deadline_ns)} past its deadline" if one.past_deadline_ns else one.state
-    after = ", ".join(f"{name} (not declared)" if name in one.missing else name for name in one.after)
-    cells = (
-        *(one.task, state, span(one.period_ns) if one.period_ns else one.kind, span(one.late_p50_ns or None)),
-        *(span(one.late_p99_ns or None), span(one.took_p50_ns or None), span(one.took_p99_ns or None)),
-        *(f"{one.misses} ({one.blamed} was late)" if one.blamed else str(one.misses), str(one.overruns), after),
-    )
-    return Row(cells, mood)
+def team_status() -> dict[str, Any] | None:
+    """What the agent of this robot says of the team; None where none answers."""
+    try:
+        with Control.open() as agent:
+            return agent.ask("status", team=True)
+    except (NoAgentError, LostAgentError, AgentRefusedError):
+        return None
+
+
+def owners(file: ScheduleFile, seen: Sequence[Seen], status: Mapping[str, Any] | None) -> dict[str, str]:
+    """Task → the component whose program runs it here: by the locks of its processes, else by its name."""
+    found = {}
+    here = [one for one in (status or {}).get("components", ()) if one.get("primary") == (status or {}).get("robot")]
+    names = {one["name"] for one in here}
+    for one in here:
+        rows = rows_of(one["pid"], file.identity) if one.get("pid") else set()
+        found.update({row.name: one["name"] for index, row in file.rows().items() if index in rows})
+    return {**{one.task: one.task for one in seen if one.task in names}, **found}
 
 
 # --- Orders ----------------------------------------------------------------------------------------------------------

@@ -13,15 +13,24 @@ import pytest
 
 import failover
 from failover.cli import main
+from failover.client.control import Result
 from failover.core.schedule import layout
 from failover.schedule.overview import open_schedule
 from failover.schedule.task import ScheduledTask
 from tests.failover.boards.conftest import place
 from tests.failover.boards.programs import program
+from tests.failover.cli.stand_in import StandIn
 
 __all__ = ["place"]
 
 MS = 1_000_000
+ODOMETRY = """
+with failover.scheduled("odometry", period=0.02) as task:
+    task.wait_activation()
+    say("begun")
+    for tick in task:
+        pass
+"""
 
 
 @pytest.fixture
@@ -54,6 +63,27 @@ def test_ps_shows_each_task_and_what_is_missing(task: ScheduledTask, capsys: pyt
     told = tasks(capsys)["mapper"]
     assert (told["state"], told["period_ms"], told["deadline_ms"], told["ended"]) == ("waiting", 5.0, 4.0, 3)
     assert told["late_p50_ms"] > 0
+
+
+def test_ps_shows_a_task_below_the_component_whose_program_runs_it(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the locks of the component's processes: names do not tell."""
+    with failover.scheduled("keep", period=1), program(ODOMETRY) as odometry:
+        odometry.hear()
+        facts = {"primary": "robot1", "role": "primary", "epoch": 1, "standby": "robot2", "protection": "protected"}
+        driving = {**facts, "name": "/lab/robot1/driving", "state": "running", "pid": odometry.pid}
+        status = {"robot": "robot1", "peers": [{"name": "robot2", "state": "live"}], "components": [driving]}
+        agent = StandIn(tmp_path / "control.sock", lambda request: [Result(status)])
+        monkeypatch.setenv("FAILOVER_SOCKET", str(agent.path))
+        try:
+            told = json.loads(said(capsys, "ps", "--json")[1])
+            assert {one["task"]: one["component"] for one in told["tasks"]} == {"odometry": driving["name"], "keep": ""}
+            assert [robot["robot"] for robot in told["robots"]] == ["robot1", "robot2"]
+            _, out, _ = said(capsys, "ps")
+            assert "└─ odometry" in out and "├─ driving" in out and "└─ other programs" in out
+        finally:
+            agent.close()
 
 
 def test_ps_ends_with_1_if_nobody_runs_a_task(task: ScheduledTask, capsys: pytest.CaptureFixture[str]) -> None:
