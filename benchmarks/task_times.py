@@ -26,7 +26,8 @@ PRIORITY: Final = 50
 BARE: Final = "clock_nanosleep in a bare loop"
 EARLY_S: Final = 0.0002
 EARLY: Final = f"{OURS}, early={EARLY_S}"
-"""Of Python alone: C has little to do after it has woken."""
+ON_TIME: Final = f"{OURS}, early=0"
+"""Of Python alone: C has little to do after it has woken. Without ``early`` a task learns how early to wake."""
 
 
 def task_times(quick: bool, directory_: Path) -> Findings:
@@ -48,17 +49,24 @@ def task_times(quick: bool, directory_: Path) -> Findings:
         absent.append(Absent("SCHED_FIFO", "this user, or this control group, may not have it"))
     count, place = (100 if quick else COUNT // ROUNDS), f"/dev/shm/failover-benchmark{secrets.token_hex(4)}-robot1"
     late: dict[tuple[str, str, str], list[int]] = {}
+    processor: dict[tuple[str, str], list[int]] = {}
     for turn in range(1 if quick else ROUNDS):
         for language, command in programs.items():
             for priority, before in classes.items():
-                early = ((EARLY, f"early{turn}", str(EARLY_S)),) if language == "Python" else ()
+                early = ((EARLY, f"early{turn}", str(EARLY_S)), (ON_TIME, f"at{turn}", "0")) if language == "Python" else ()
                 for who, name, *more in ((OURS, f"task{turn}"), (BARE, "-"), *early):
-                    found = _measured([*before, *command, name, str(PERIOD_NS), str(count), *more], place)
+                    found, took_ns = _measured([*before, *command, name, str(PERIOD_NS), str(count), *more], place)
                     late.setdefault((f"{language}, {priority}", who, language), []).extend(found)
+                    processor.setdefault((f"{language}, {priority}", who), []).extend(took_ns)
     figures = [
         Figure(case, f"p{share * 100:g}", "µs", (percentile(values, share) / 1000,), who)
         for (case, who, _), values in late.items()
         for share in (0.5, 0.99)
+    ]
+    figures += [
+        Figure(case, "processor, an activation", "µs", (sum(found) / len(found) / 1000,), who)
+        for (case, who), found in processor.items()
+        if found
     ]
     return Findings(
         "Tasks at their times",
@@ -77,9 +85,11 @@ def may_be_fifo() -> bool:
     )
 
 
-def _measured(command: Sequence[str], place: str) -> list[int]:
+def _measured(command: Sequence[str], place: str) -> tuple[list[int], list[int]]:
+    """Lateness of each activation; where the program tells it, what each took of a processor."""
     environment = {**os.environ, directory.VARIABLE: place, "PYTHONPATH": str(HERE.parent)}
     told = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if told.returncode != 0:
         raise BenchmarkError(f"task_times: {told.stderr.strip()}")
-    return [int(line) for line in told.stdout.split()]
+    words = told.stdout.split()
+    return [int(word) for word in words if word[0] != "#"], [int(word[1:]) for word in words if word[0] == "#"]

@@ -33,6 +33,13 @@ TURNS: Final = 100
 """Of opening a schedule that is made anew each time."""
 EARLY_MAX_S: Final = 0.001
 """Longer would take a processor from others for no gain: to fill the caches takes some ten microseconds."""
+LEARNT_NS_MAX: Final = 200_000
+LEARNT_SHARE: Final = 50
+"""A task that learns by itself how early to wake does so no earlier than this, and than this part of its period."""
+LEARNT_MARGIN_NS: Final = 20_000
+"""More than the wake-up takes: the look at the row after it, in cold caches."""
+LEARNT_WEIGHT: Final = 8
+"""A wake-up counts for one part in so many of what was learnt."""
 FORMER_LIFE_S: Final = 5.0
 FORMER_LIFE_POLL_S: Final = 0.01
 """A program that resumes where it has just died: the kernel gives locks back when its last thread has ended."""
@@ -125,9 +132,15 @@ class ScheduledTask:
         notes: what is otherwise than it was asked for.
     """
 
-    def __init__(self, declaration: Declaration, place: Path | None, program: str, early_ns: int = 0) -> None:
+    def __init__(self, declaration: Declaration, place: Path | None, program: str, early_ns: int | None = 0) -> None:
+        """
+        Args:
+            early_ns: None: as early as its wake-ups have been late.
+        """
         self.name = declaration.name
-        self._early_ns = early_ns
+        self._learns = early_ns is None
+        self._early_ns = early_ns or 0
+        self._early_ns_max = self._asked_ns = 0
         self.notes: tuple[str, ...] = ()
         self._declaration = declaration
         self._known: Declaration | None = None
@@ -178,7 +191,10 @@ class ScheduledTask:
             serial = table.ints[self._serial]
             if serial != self._adopted and not self._take_order(opened):
                 return None
-            told = task.poll(boottime.now_monotonic_ns() - opened.skew_ns, self._look, self._lives)
+            now_ns = boottime.now_monotonic_ns() - opened.skew_ns
+            if self._asked_ns:
+                self._learn(now_ns)
+            told = task.poll(now_ns, self._look, self._lives)
             if isinstance(told, Tick):
                 return self._begin(opened, told)
             if task.state is State.DONE and task.terms.kind is Kind.ONE_SHOT:
@@ -245,6 +261,7 @@ class ScheduledTask:
                 until_ns -= self._early_ns
                 if boottime.now_monotonic_ns() - opened.skew_ns >= until_ns:
                     return  # to look again at once: so all that is needed at the instant is in the processor's caches
+            self._asked_ns = until_ns if self._learns and told.until_ns is not None else 0
             futex.wait_until(opened.base + row + SERIAL_FIELD, serial, until_ns + opened.skew_ns)
             return
         self._publish(opened)
@@ -257,6 +274,14 @@ class ScheduledTask:
         latest_ns = boottime.now_monotonic_ns() - opened.skew_ns + SLICE_NS
         until_ns = latest_ns if told.until_ns is None else min(told.until_ns, latest_ns)
         futex.wait_until(opened.base + at, settled, until_ns + opened.skew_ns)
+
+    def _learn(self, now_ns: int) -> None:
+        """How late this task was woken: from the instant that it has asked for to its next look at the clock."""
+        late_ns, self._asked_ns = now_ns - self._asked_ns, 0
+        if late_ns < 0:
+            return  # woken by a change of its row
+        wanted_ns = min(late_ns + LEARNT_MARGIN_NS, self._early_ns_max)
+        self._early_ns += (wanted_ns - self._early_ns) // LEARNT_WEIGHT if self._early_ns else wanted_ns
 
     def _look(self, row: int) -> Any:
         return layout.read_predecessor(self._present().file.table, row)
@@ -404,6 +429,8 @@ class ScheduledTask:
     def _be_as(self, terms: Terms) -> None:
         """Processors, priority and timer slack of this thread, as far as this user may set them."""
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+        self._early_ns_max = min(LEARNT_NS_MAX, terms.period_ns // LEARNT_SHARE)
+        self._early_ns = min(self._early_ns, self._early_ns_max) if self._learns else self._early_ns
         if terms.cpus:
             places = {place for place in range(terms.cpus.bit_length()) if terms.cpus >> place & 1}
             with contextlib.suppress(OSError):
@@ -459,7 +486,7 @@ def scheduled(
     cpus: tuple[int, ...] = (),
     priority: int = 0,
     strict: bool = False,
-    early: float = 0,
+    early: float | None = None,
     place: str | os.PathLike[str] | None = None,
 ) -> ScheduledTask:
     """Run a task of this robot's schedule in this process.
@@ -484,7 +511,8 @@ def scheduled(
         priority: of SCHED_FIFO; 0: this process's.
         strict: a predecessor that does not run holds this task for ever, not until its deadline.
         early: seconds, up to 0.001: wake so long before the instant, and be busy until it has come. Then the activation begins
-            microseconds late instead of some hundred, for so much of a processor.
+            microseconds late instead of some hundred, for so much of a processor. None: as long as its own wake-ups have been
+            late, and 0.02 ms; at most 0.2 ms, and a fiftieth of the period. 0: wake at the instant.
         place: the directory of the board; None: as `failover.board`.
 
     Raises:
@@ -495,7 +523,7 @@ def scheduled(
         kind, at_ns = Kind.ONE_SHOT, boottime.machine_ns() + nanoseconds(once_in, "once_in")
     elif distance is not None:
         kind = Kind.SPORADIC
-    if not 0 <= early <= EARLY_MAX_S:
+    if early is not None and not 0 <= early <= EARLY_MAX_S:
         raise ScheduleError(
             f"early = {early!r} s: a task wakes at most {EARLY_MAX_S} s before its instant, and is busy meanwhile"
         )
@@ -517,7 +545,8 @@ def scheduled(
     named = (after,) if isinstance(after, str) else tuple(after)
     program = os.path.basename(sys.argv[0] if sys.argv else "") or "python"
     where = None if place is None else Path(place)
-    return ScheduledTask(Declaration(name, terms, named), where, program, nanoseconds(early, "early"))
+    early_ns = None if early is None else nanoseconds(early, "early")
+    return ScheduledTask(Declaration(name, terms, named), where, program, early_ns)
 
 
 def _processor(number: int) -> int:

@@ -75,6 +75,17 @@ def test_a_task_that_wakes_early_begins_at_its_instant(place: Path) -> None:
             failover.scheduled("a", period=0.005, early=early)
 
 
+def test_a_task_learns_how_early_to_wake_within_its_bounds_and_begins_at_no_instant_too_soon(place: Path) -> None:
+    with failover.scheduled("a", period=0.005) as task:
+        assert task._early_ns == 0, "there is nothing to learn from before its first wake-up"
+        ticks = [tick for tick, _ in zip(task, range(20), strict=False)]
+        assert all(tick.late_ns >= 0 for tick in ticks)
+        assert 0 < task._early_ns <= 5 * MS // 50
+    with failover.scheduled("b", period=0.005, early=0) as task:
+        assert [tick for tick, _ in zip(task, range(5), strict=False)]
+        assert task._early_ns == 0
+
+
 def test_a_one_shot_task_runs_once_and_its_loop_ends(place: Path) -> None:
     with failover.scheduled("once", once_in=0.001) as task:
         assert [tick.number for tick in task] == [0]
