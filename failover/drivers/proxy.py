@@ -18,10 +18,10 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from failover.boards import boottime
 from failover.config import accounts
@@ -45,6 +45,20 @@ TIMEOUT_S: Final = 5.0
 SECOND_NS: Final = 1_000_000_000
 
 _NUMBERS: Final = itertools.count(1)
+
+T = TypeVar("T")
+
+
+class _Role(Struct, frozen=True):
+    """Of one verb, as ``_describe`` tells it."""
+
+    role: str = ""
+
+
+class _Described(Struct, frozen=True):
+    """What is read of an answer to ``_describe``."""
+
+    verbs: dict[str, _Role] = {}
 
 
 def proxy(name: str) -> Proxy:
@@ -125,6 +139,22 @@ class Proxy:
             raise CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
         return None if answer.ok is UNSET else answer.ok
 
+    def told(self, verb: str, kind: type[T] | Any, body: Any = None, /, *, timeout: float = TIMEOUT_S) -> T:
+        """`call` for a verb whose answer has a form of failover's own: the answer, checked. Fields of newer drivers are left out.
+
+        Raises:
+            DriverError: the answer has another form; names the verb and what is wrong.
+            CallRefusedError, NoAnswerError: as `call`.
+        """
+        found = self.call(verb, body, timeout=timeout)
+        try:
+            return msgspec.convert(found, kind)
+        except (msgspec.ValidationError, RecursionError) as error:
+            raise DriverError(
+                f"{self.path} answered {verb} in a form that failover does not know: {error}; "
+                "end that driver, or start it with the failover of this robot"
+            ) from error
+
     def _body(self, body: Any, fields: Mapping[str, Any]) -> Any:
         if fields and body is not None:
             raise EnvelopeError("write the body as a table, or each field by its name, and not both")
@@ -189,8 +219,9 @@ class Proxy:
 
         Raises:
             CallRefusedError: the driver has no such stream, or it failed at it.
+            DriverError: it does not say which streams it has.
         """
-        if self.call("_describe")["verbs"].get(name, {}).get("role") != "stream":
+        if self.told("_describe", _Described).verbs.get(name, _Role()).role != "stream":
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
         way = way_to(self.here, self._address, self.place.robot)
         asked = Envelope(

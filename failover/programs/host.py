@@ -30,7 +30,7 @@ from failover.core.messaging.envelope import Envelope, answer, refusal
 from failover.core.messaging.mailbox import Mailbox, Stream
 from failover.core.messaging.pacing import SECOND, Pace, merged
 from failover.core.programs import states, versions
-from failover.core.programs.states import Shelf
+from failover.core.programs.states import Shelf, Standing
 from failover.core.programs.trial import Command, Trial, Verdict
 from failover.drivers.actor import Actor, Whose
 from failover.drivers.declare import Declaration, Marked, Verb
@@ -373,20 +373,21 @@ class HostActor(Actor):
         """What there is, and what was said last."""
         shelf = self._place.store.find(self._place.name) if not self._place.directory else None
         running = self._running
-        said = {
-            "name": self._place.name,
-            "path": self._declaration.path,
-            "active": self.version,
-            "pid": running.pid if running is not None else 0,
-            "on_trial": self._trial is not None,
-            "is_coming": self._is_coming,
-            "said": self._said,
-            "gap_ms": round(self._gap_ms, 3),
-            "enforced": list(running.hello.enforced) if running is not None else [],
-            "not_enforced": list(running.hello.not_enforced) if running is not None else [],
-            "before": self._old.source.manifest.version if self._old is not None else "",
-        }
-        return said | {"versions": msgspec.to_builtins(shelf.versions) if shelf is not None else []}
+        standing = Standing(
+            name=self._place.name,
+            path=self._declaration.path,
+            active=self.version,
+            pid=running.pid if running is not None else 0,
+            on_trial=self._trial is not None,
+            is_coming=self._is_coming,
+            said=self._said,
+            gap_ms=round(self._gap_ms, 3),
+            enforced=running.hello.enforced if running is not None else (),
+            not_enforced=running.hello.not_enforced if running is not None else (),
+            before=self._old.source.manifest.version if self._old is not None else "",
+            versions=shelf.versions if shelf is not None else (),
+        )
+        return msgspec.to_builtins(standing)
 
     def _switch(self, body: Mapping[str, Any]) -> Any:
         """Begin to start a version; what comes of it, ``_versions`` tells."""

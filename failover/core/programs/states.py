@@ -72,6 +72,33 @@ class Version(Struct, frozen=True):
     why: str = ""
 
 
+class Standing(Struct, frozen=True):
+    """What a host tells of its program: the answer to ``_versions``.
+
+    Attributes:
+        active: the version that carries out messages; "" while none does.
+        pid: of its process; 0: none.
+        is_coming: another version is being started. said: what happened last, for people.
+        gap_ms: how long no version could take a message at the last switch.
+        enforced, not_enforced: one sentence each.
+        before: the version whose process waits for a rollback; "": none does.
+        versions: all of the shelf; none for a program that runs from a directory.
+    """
+
+    name: str
+    path: str
+    active: str
+    pid: int
+    on_trial: bool
+    is_coming: bool
+    said: str
+    gap_ms: float
+    enforced: tuple[str, ...]
+    not_enforced: tuple[str, ...]
+    before: str
+    versions: tuple[Version, ...] = ()
+
+
 def _moved(one: Version, state: State, why: str, *, is_committed: bool = False) -> Version:
     if state not in ARROWS[one.state]:
         raise ProgramError(f"version {one.version} is {one.state}, and cannot become {state}")
