@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,16 +27,17 @@ from typing import Any, Final
 import msgspec
 from msgspec import UNSET, Struct
 
-from failover.core.messaging.envelope import Envelope, answer, refusal
+from failover.core.messaging.envelope import Envelope, Fault, answer, refusal
 from failover.core.messaging.mailbox import Mailbox, Stream
 from failover.core.messaging.pacing import SECOND, Pace, merged
 from failover.core.programs import states, versions
 from failover.core.programs.states import Shelf, Standing
 from failover.core.programs.trial import Command, Trial, Verdict
-from failover.drivers.actor import Actor, Whose
+from failover.drivers.actor import Actor, Publish, Whose
 from failover.drivers.declare import Declaration, Marked, Verb
 from failover.drivers.server import Hand, Near
 from failover.errors import FailoverError, ProgramError
+from failover.kept_state.api import RESTARTED, SWITCHED, Resumed
 from failover.programs.channel import Hello
 from failover.programs.running import Answered, Running, Source
 from failover.programs.sources import Place, before, source_of_directory, source_of_store, version_of
@@ -94,11 +96,20 @@ class HostActor(Actor):
         self._coming: Running | None = None
         self._is_coming = False
         self._said = ""
+        self._last = first.source
+        self._why_lost = ""
+        self._owed: tuple[Command, ...] = ()
+        """What the version that is started anew must carry out before anything else."""
+        self._anew: Running | None = None
+        self._is_starting_anew = False
         self._restart_ns = 0
         self._gap_ms = 0.0
         self._state = first.state
         self._is_changed = True
         self._starter = ThreadPoolExecutor(1, "starts versions")
+        self._reviver = ThreadPoolExecutor(1, "starts versions anew")
+        self._loading: set[Running] = set()
+        self._is_closing = False
         self.wake: Callable[[], None] = lambda: None
         self.renew: Callable[[Declaration], None] = lambda _: None
         if kept is not None:
@@ -114,17 +125,30 @@ class HostActor(Actor):
             self._keep()
         return answers
 
+    def following(self, now_ns: int) -> Envelope | None:
+        """While no version runs, only what is the host's own is carried out."""
+        if self._running is None:
+            self._mailbox.bring_forward(_is_hosts, now_ns)
+        first = super().following(now_ns)
+        return first if first is None or self._running is not None or _is_hosts(first) else None
+
+    def sample(self, publish: Publish, clock: Callable[[], int]) -> None:
+        """Streams pause while no version runs."""
+        if self._running is None:
+            self._samples_ns = dict.fromkeys(self._samples_ns, clock() + LOOK_NS)
+        super().sample(publish, clock)
+
     def wait_ns(self, now_ns: int) -> int | None:
         """Not longer than until something of the versions is due."""
         waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
-        if self._coming is not None:
+        if self._coming is not None or self._anew is not None:
             waits.append(0)
         if self._trial is not None:
             due = self._trial.wait_ns(now_ns)
             waits.append(LOOK_NS if due is None else due)
         if self._old is not None and self._trial is None:
             waits.append(max(self._old_until_ns - now_ns, 0))
-        if self._running is None:
+        if self._running is None and not self._is_starting_anew:
             waits.append(max(self._restart_ns - now_ns, 0))
         return min(waits, default=None)
 
@@ -136,19 +160,28 @@ class HostActor(Actor):
                 return answer(message, orders(message.body if isinstance(message.body, dict) else {}))
             except (FailoverError, ValueError) as error:  # ValueError: a name of a file with NUL
                 return refusal(message, "refused", str(error))
-        if message.verb.startswith("_"):
+        if _is_hosts(message):
             return super().carried_out(run)
         return self._forwarded(message)
 
-    def forbidden(self, envelope: Envelope, whose: Whose) -> str:
-        """Orders come from the host's own user or root on this robot, as the kernel says."""
+    def refused(self, envelope: Envelope, whose: Whose) -> Fault | None:
+        """Orders come from the host's own user or root on this robot, as the kernel says.
+
+        Messages for a version come while one runs: its sender's proxy sends what is refused as busy again. One past its deadline
+        is taken, and answered as such: its sender's next ones follow it.
+        """
+        is_late = envelope.deadline_ms is not None and envelope.deadline_ms <= 0
+        if self._running is None and not _is_hosts(envelope) and not is_late:
+            version = self._last.manifest.version
+            return Fault("busy", f"{self._place.name} {version} is being started anew: {self._why_lost}; send it again")
         if envelope.verb not in ("_switch", "_rollback"):
-            return ""
+            return None
         if not isinstance(whose, Near | Hand):
-            return f"give this order on the robot itself: {envelope.sender} is on another one"
+            return Fault("refused", f"give this order on the robot itself: {envelope.sender} is on another one")
         if whose.uid not in (0, os.geteuid()):
-            return f"this order is for uid {os.geteuid()}, whose host this is, and root: uid {whose.uid} is neither"
-        return ""
+            mine = os.geteuid()
+            return Fault("refused", f"this order is for uid {mine}, whose host this is, and root: uid {whose.uid} is neither")
+        return None
 
     def called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
         """A stream's value."""
@@ -157,7 +190,8 @@ class HostActor(Actor):
     def _forwarded(self, message: Envelope) -> Envelope:
         message = msgspec.structs.replace(message, hops=(), rest={})
         if self._running is None:
-            return refusal(message, "no_version", f"no version of {self._place.name} runs now: {self._said}")
+            text = f"no version of {self._place.name} runs now: {self._why_lost}; {message.verb} may have been carried out"
+            return refusal(message, "no_version", text)
         try:
             found = self._running.call(message)
             why = found.answer.error.sentence if found.answer.error is not UNSET and found.answer.error.kind == "failed" else ""
@@ -197,7 +231,7 @@ class HostActor(Actor):
 
     def _write(self, *, is_lasting: bool = False) -> None:
         streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
-        kept = Kept(self._number + 1, self.version, self._state, streams)
+        kept = Kept(self._number + 1, self.version, self._state, streams, time.time())
         self._place.store.keep(self._declaration.path, kept, is_lasting=is_lasting)
         self._number += 1  # only now: while the disk is full, the newest whole one is never written over
 
@@ -212,7 +246,9 @@ class HostActor(Actor):
         now_ns = clock()
         if self._running is not None and not self._running.lives:
             self._ended()
-        if self._running is None and self._coming is None and now_ns >= self._restart_ns:
+        if self._anew is not None:
+            self._revived()
+        if self._running is None and self._coming is None and not self._is_starting_anew and now_ns >= self._restart_ns:
             self._restart(now_ns)
         if self._coming is not None:
             coming, self._coming = self._coming, None
@@ -230,9 +266,9 @@ class HostActor(Actor):
             if old is not None:
                 old.pause()
                 self._state = old.state
-            new.begin(self._state)
+            new.begin(self._state, self._resumed(SWITCHED))
             if old is not None:
-                switched = Kept(self._number, old.source.manifest.version, old.state, {})
+                switched = Kept(self._number, old.source.manifest.version, old.state, {}, time.time())
                 self._place.store.keep(before(self._declaration.path), switched)
             self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
         except FailoverError as error:
@@ -251,17 +287,14 @@ class HostActor(Actor):
         self._say(f"{version} took over within {self._gap_ms:.1f} ms, on trial{notes}")
         self._keep()
 
-    def _resume(self, old: Running, state: Any) -> None:
-        """A version that was paused goes on with this state; started anew if its process does not."""
-        try:
-            old.begin(state)
-            self._running = old
-        except FailoverError as error:
-            self._say(f"{old.source.manifest.version} did not go on: {error}; it is started anew")
-            old.end()
-            self._state, self._running = state, None
-            self._last = old.source
-            self._restart(0)
+    def _resume(self, old: Running, state: Any) -> bool:
+        """A version that was paused goes on with this state; False: its process does not, and it is started anew."""
+        self._state = state
+        if self._began_with(old, state):
+            return True
+        old.end()
+        self._running, self._last, self._restart_ns = None, old.source, 0
+        return False
 
     def _judge(self, now_ns: int) -> None:
         assert self._trial is not None and self._running is not None
@@ -291,46 +324,44 @@ class HostActor(Actor):
         failed.end()
         version = failed.source.manifest.version
         if old is None:
-            self._running = None
+            self._running, self._last, self._why_lost = None, failed.source, why
             self._say(f"{version} failed, and no version was active before it: {why}")
-            self._last = failed.source
             return
         self._record_anyway(lambda shelf: states.fall_back(shelf, why))
         if failed.source.manifest.on_rollback == "newest" and self._began_with(old, newest):
-            told = f"with the state of {version}"
+            told = f"goes on with the state of {version}"
+        elif self._resume(old, self._switched_with):
+            told = f"goes on with its state at the switch, and {self._replayed(trial.replay)} commands since then once more"
         else:
-            self._resume(old, self._switched_with)
-            told = f"with its state at the switch, and {self._replayed(trial)} commands since then once more"
+            self._owed = trial.replay
+            told = f"is started anew with its state at the switch, and gets {len(self._owed)} commands since then once more"
         if self._running is not None:
             self._state = self._running.state
         self._renew(old)
-        self._say(f"{version} is rolled back: {why}; {old.source.manifest.version} goes on {told}")
+        self._say(f"{version} is rolled back: {why}; {old.source.manifest.version} {told}")
         self._keep()
 
     def _began_with(self, old: Running, state: Any) -> bool:
         try:
-            old.begin(state)
-        except FailoverError:
+            old.begin(state, self._resumed(SWITCHED))
+        except FailoverError as error:
+            self._why_lost = str(error)
             return False
         self._running = old
         return True
 
-    def _replayed(self, trial: Trial) -> int:
+    def _replayed(self, commands: Sequence[Command]) -> int:
         """How many commands were carried out again; their answers have left before."""
-        count = 0
+        assert self._running is not None
         self._state = self._switched_with
-        for command in trial.replay:
-            if self._running is None:
-                self._restart(0)
-            if self._running is None:
-                break
+        for count, command in enumerate(commands):
             try:
-                found = self._running.call(Envelope(verb=command.verb, body=command.body))
-                self._running.state = self._state = found.state
-                count += 1
+                self._running.state = self._state = _again(self._running, command)
             except FailoverError as error:
                 self._lost(f"at {command.verb}, which is left out: {error}")
-        return count
+                self._owed = tuple(commands[count + 1 :])
+                return count
+        return len(commands)
 
     def _let_go(self) -> None:
         old, self._old = self._old, None
@@ -348,24 +379,81 @@ class HostActor(Actor):
     def _lost(self, why: str) -> None:
         """The active version is gone, not on trial: it is started anew with its last state."""
         lost, self._running = self._running, None
+        self._why_lost = why
         if lost is not None:
             lost.end()
             self._last = lost.source
             self._say(f"{lost.source.manifest.version}: {why}; it is started anew")
 
     def _restart(self, now_ns: int) -> None:
+        """Start the last version anew, in a thread: it may import for a minute, and the host answers meanwhile."""
         self._restart_ns = now_ns + RESTART_NS
+        self._is_starting_anew = True
+        self._reviver.submit(self._start_anew, self._last, self._state, self._owed)
+
+    def _start_anew(self, source: Source, state: Any, owed: Sequence[Command]) -> None:
+        """In the thread."""
+        left = list(owed)
         try:
-            running = Running(self._last, lambda: self.wake())
-            try:
-                running.begin(self._state)
-            except FailoverError:
-                running.end()
-                raise
+            running = self._begun(source, state)
+            while left:
+                command = left.pop(0)
+                try:
+                    running.state = _again(running, command)
+                except FailoverError as error:
+                    self._note(f"{command.verb} is left out: {error}")
+                    running.end()
+                    running = self._begun(source, running.state)
+            self._anew = running
         except FailoverError as error:
+            self._why_lost = str(error)
             self._say(f"it cannot be started anew: {error}")
+        except Exception as error:  # the sentence must not be lost in a thread
+            log.exception("a version could not be started anew")
+            self._say(f"it cannot be started anew: {type(error).__name__}: {error}")
+        finally:
+            self._is_starting_anew = False
+            self.wake()
+
+    def _begun(self, source: Source, state: Any) -> Running:
+        """A new process of a version, with this state.
+
+        Raises:
+            ProgramError: it cannot be loaded, or cannot read the state.
+        """
+        running = self._loaded(source)
+        try:
+            running.begin(state, self._resumed(RESTARTED))
+        except FailoverError:
+            running.end()
+            raise
+        return running
+
+    def _loaded(self, source: Source) -> Running:
+        """A new process of a version, warm; `close` ends it before that."""
+        running = Running(source, lambda: self.wake())
+        self._loading.add(running)
+        try:
+            if self._is_closing:
+                running.end()
+            return running.load()
+        finally:
+            self._loading.discard(running)
+
+    def _revived(self) -> None:
+        """The version that was started anew takes messages, unless another one does by now."""
+        anew, self._anew = self._anew, None
+        assert anew is not None
+        if self._running is not None:
+            anew.end()
             return
-        self._running = running
+        self._running, self._state, self._owed = anew, anew.state, ()
+        self._say(f"{anew.source.manifest.version} goes on: it was started anew as pid {anew.pid}")
+        self._keep()
+
+    def _resumed(self, why: str) -> Resumed:
+        """Where a state comes from that a version gets from this host."""
+        return Resumed(self._who.partition("/")[0], 0, self._number, why, 0.0)
 
     # --- Orders -----------------------------------------------------------------------------------------------------------
 
@@ -421,7 +509,7 @@ class HostActor(Actor):
 
         def started() -> None:
             try:
-                self._coming = Running(source(), lambda: self.wake())
+                self._coming = self._loaded(source())
             except FailoverError as error:
                 self._say(f"it stays as it was: {error}")
             except Exception as error:  # the sentence must not be lost in a thread
@@ -436,7 +524,7 @@ class HostActor(Actor):
     def _rollback(self, body: Mapping[str, Any]) -> Any:
         """Back to the version before, whose process still waits."""
         old, new = self._old, self._running
-        if old is None or new is None:
+        if old is None:
             raise ProgramError(
                 f"{self._place.name} cannot be rolled back: the version before is kept for {ROLLBACK_S} s after a switch; "
                 "send the older program as a bundle with a higher version"
@@ -444,29 +532,34 @@ class HostActor(Actor):
         if self._trial is not None:
             self._fall_back("a person took it back")
             return {"active": self.version}
-        try:
-            new.pause()
-        except FailoverError as error:
-            self._note(f"{self.version} did not let its device go: {error}")
-        if not self._began_with(old, new.state):
+        source, newest = (new.source, new.state) if new is not None else (self._last, self._state)
+        version = source.manifest.version
+        if new is not None:
+            try:
+                new.pause()
+            except FailoverError as error:
+                self._note(f"{version} did not let its device go: {error}")
+            newest = new.state
+        if not self._began_with(old, newest):
             if not body.get("old_state"):
-                self._resume(new, new.state)
+                if new is not None:
+                    self._resume(new, newest)
                 raise ProgramError(
-                    f"{old.source.manifest.version} cannot read the state of {self.version}; with --old-state it goes "
+                    f"{old.source.manifest.version} cannot read the state of {version}; with --old-state it goes "
                     "on with its own state at the switch, and what came since then is lost"
                 )
             self._resume(old, self._switched_with)
         self._record_anyway(lambda shelf: states.fall_back(shelf, "a person took it back"))
-        new.end()
+        if new is not None:
+            new.end()
         self._old, self._state = None, old.state
         self._renew(old)
-        self._say(f"{new.source.manifest.version} is rolled back by a person; {self.version} goes on")
+        self._say(f"{version} is rolled back by a person; {old.source.manifest.version} goes on")
         self._keep()
         return {"active": self.version}
 
     # --- What others see --------------------------------------------------------------------------------------------------
 
-    _last: Source
     _switched_with: Any = None
 
     def _renew(self, running: Running) -> None:
@@ -515,6 +608,9 @@ class HostActor(Actor):
 
     def close(self) -> None:
         """End all processes; the state stays."""
+        self._is_closing = True
+        for one in tuple(self._loading):
+            one.end()
         if self._running is not None and self._running.lives:
             try:
                 self._running.pause()
@@ -525,10 +621,25 @@ class HostActor(Actor):
             self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
-        self._starter.shutdown(wait=True)  # not before: a version dies with the thread that started it
-        for one in (self._running, self._old, self._coming):
+        for thread in (self._starter, self._reviver):
+            thread.shutdown(wait=True)  # not before: a version dies with the thread that started it
+        for one in (self._running, self._old, self._coming, self._anew):
             if one is not None:
                 one.end()
+
+
+def _is_hosts(message: Envelope) -> bool:
+    """Whether the host itself answers it."""
+    return message.verb.startswith("_")
+
+
+def _again(running: Running, command: Command) -> Any:
+    """The state after a command that is carried out once more.
+
+    Raises:
+        ProgramError: its process ended, hangs, or said what is no answer.
+    """
+    return running.call(Envelope(verb=command.verb, body=command.body)).state
 
 
 def _cut(one: Stream) -> Stream:

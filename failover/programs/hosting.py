@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import msgspec
@@ -15,9 +16,11 @@ from failover.drivers.here import Here, refuse_second
 from failover.drivers.here import here as drivers_here
 from failover.drivers.server import Serving
 from failover.errors import FailoverError
+from failover.kept_state.api import RESTARTED, Resumed
 from failover.programs.host import HostActor, declared
 from failover.programs.running import Running
 from failover.programs.sources import Place, before, end_trial, source_of_directory, source_of_store, version_of
+from failover.programs.store import Kept
 
 
 class Hosting(Serving):
@@ -39,7 +42,7 @@ class Hosting(Serving):
             end_trial(place)
         source = source_of_directory(place.directory) if place.directory is not None else source_of_store(place, version)
         self._source = source
-        first = Running(source, lambda: self.wake())
+        first = Running(source, lambda: self.wake()).load()
         try:
             path = f"{first.hello.path}@{source.manifest.version}" if place.beside else ""
             declaration = declared(first.hello, path)
@@ -53,19 +56,24 @@ class Hosting(Serving):
         place, first = self._host
         kept = place.store.kept(declaration.path)
         try:
-            first.begin(kept.state if kept is not None else None)
+            first.begin(kept.state if kept is not None else None, self._resumed(kept))
         except FailoverError:
             switched = place.store.kept(before(declaration.path))
             if switched is None or switched.version != first.source.manifest.version:
                 raise
-            first.begin(switched.state)
+            first.begin(switched.state, self._resumed(switched))
             place.store.log(place.name, "it goes on with its state at the switch; what came after is lost")
         actor = HostActor(place, first, declaration, who, kept)
         actor.wake, actor.renew = self.wake, self._renew
         self.actor = actor
-        actor._last = self._source
         self._began(place, first)
         return None, actor
+
+    def _resumed(self, kept: Kept | None) -> Resumed:
+        """Where the first version's state comes from."""
+        if kept is None:
+            return Resumed(self.here.robot, 0, 0, RESTARTED, 0.0)
+        return Resumed(self.here.robot, 0, kept.number, RESTARTED, max(time.time() - kept.at_s, 0.0))
 
     def _began(self, place: Place, first: Running) -> None:
         version = first.source.manifest.version

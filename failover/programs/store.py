@@ -47,12 +47,13 @@ _CHECK_SIZE: Final = 32
 
 
 class Kept(Struct, frozen=True):
-    """What outlives a host. ``number``: of this writing."""
+    """What outlives a host. ``number``: of this writing; ``at_s``: when, in seconds since 1970."""
 
     number: int
     version: str
     state: KeptState | None
     streams: dict[str, Stream]
+    at_s: float = 0.0
 
 
 def default_place() -> Path:

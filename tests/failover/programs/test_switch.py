@@ -21,12 +21,13 @@ from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs.states import State
 from failover.drivers.server import Near, Peer
-from failover.errors import BundleRefusedError, CallRefusedError, DriverError, ProgramError
+from failover.errors import BundleRefusedError, CallRefusedError, DriverError, NoAnswerError, ProgramError
 from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.running import Running
 from failover.programs.sources import Place
 from failover.programs.store import Kept
+from tests.failover.drivers.serving import taking_messages
 from tests.failover.programs.senders import Lab, engine, switched, until
 
 LEAST = 100
@@ -172,6 +173,67 @@ def test_mailbox_and_state_outlive_the_host_and_its_version(lab: Lab) -> None:
         assert proxy.call("read", timeout=60) == [0, 1, 2, 3]
     with lab.hosting() as host, lab.proxy() as proxy:
         assert proxy.call("read") == [0, 1, 2, 3]
+
+
+SLOW = """
+import os, pathlib, time
+place = pathlib.Path({place!r})
+if (place / "slow").exists():
+    (place / "loading").touch()
+    while (place / "slow").exists():
+        time.sleep(0.01)
+"""
+
+
+def test_while_a_lost_version_is_started_anew_the_host_answers_and_refuses_with_a_sentence(lab: Lab) -> None:
+    first = lab.source("1", engine(before=SLOW.format(place=str(lab.folder))))
+    second = lab.source("2", seconds=0)
+    hosting = taking_messages(Hosting(Place(lab.store, lab.team, "engine", first), "", lab.here))
+    with hosting as host, lab.proxy() as proxy:
+        assert proxy.call("step", number=0) == 0
+        (lab.folder / "slow").touch()
+        process = host.actor._running._process  # type: ignore[union-attr]
+        process.kill()
+        until(proxy, lambda found: not found["active"] and (lab.folder / "loading").exists())
+        assert [proxy.call("_describe")["path"], proxy.call("_graph")[0]["verb"]] == ["Lab/robot1/Engine", "step"]
+        with pytest.raises(NoAnswerError, match="busy: engine 1 is being started anew: its process ended; send it again"):
+            proxy.call("step", number=1, timeout=0.2)
+        assert proxy.call("_versions")["active"] == "", "its import still goes on"
+        (lab.folder / "slow").unlink()
+        assert proxy.call("step", number=2, timeout=60) == 2 and proxy.call("read") == [0, 2]
+        (lab.folder / "slow").touch()
+        (lab.folder / "loading").unlink()
+        host.actor._running._process.kill()  # type: ignore[union-attr]
+        until(proxy, lambda found: not found["active"] and (lab.folder / "loading").exists())
+        proxy.call("_switch", {"directory": str(second)})
+        until(proxy, lambda found: found["active"] == "2")  # it need not wait for the lost one
+        assert proxy.call("step", number=3, timeout=60) == 3 and proxy.call("read") == [0, 2, 3]
+        (lab.folder / "slow").touch()  # and the host's end does not wait either
+
+
+RESUMES = """numbers: list[int] = failover.kept(default=[])
+    told = "nothing"
+    def on_resume(self, resumed):
+        self.told = [resumed.why, resumed.robot, resumed.age_s >= 0, list(self.numbers), list(resumed.notes)]"""
+
+
+def test_a_version_that_begins_with_a_kept_state_is_told_where_it_comes_from(lab: Lab) -> None:
+    text = engine(kept=RESUMES, extra="return self.told")
+    lab.send("1", text)
+    lab.send(
+        "2", text.replace("failover.kept(default=[])", "failover.kept(default=[])\n    more: int = failover.kept(default=7)")
+    )
+    with lab.hosting("1") as host, lab.proxy() as proxy:
+        assert proxy.call("fly") == "nothing", "its state begins here"
+        proxy.call("step", number=1)
+        host.actor._running._process.kill()  # type: ignore[union-attr]
+        host.actor._running._process.wait()  # type: ignore[union-attr]
+        assert proxy.call("fly", timeout=60) == ["restarted", "robot1", True, [1], []]
+        switched(proxy, "2")
+        why, _, _, numbers, notes = proxy.call("fly")
+        assert (why, numbers) == ("switched", [1]) and "more" in notes[0]
+    with lab.hosting(), lab.proxy() as proxy:
+        assert proxy.call("fly")[0] == "restarted"
 
 
 def test_a_host_that_ends_during_a_trial_goes_back(lab: Lab) -> None:
