@@ -14,7 +14,7 @@ from typing import Any, Final
 from failover.core.messaging.mailbox import Mailbox, unpacked
 from failover.drivers.declare import Declaration
 from failover.kept_state import component
-from failover.kept_state.api import PROCESS, Task, open_task
+from failover.kept_state.api import PROCESS, Resumed, Task, open_task
 from failover.kept_state.component import kept_of, schema_of
 from failover.kept_state.state import KeptState
 from failover.state import Field, Schema
@@ -57,6 +57,11 @@ class Keeping:
     def epoch(self) -> int:
         """Of the primacy under which the driver runs; 0 without an agent."""
         return self._task.epoch
+
+    @property
+    def came_from(self) -> Resumed | None:
+        """Where the state came from; None where it begins here."""
+        return self._task.resumed
 
     def fileno(self) -> int:
         """Can be read when `safe` may have something new."""

@@ -35,9 +35,11 @@ from failover.core.programs.states import Shelf, Standing
 from failover.core.programs.trial import Command, Trial, Verdict
 from failover.drivers.actor import Actor, Publish, Whose
 from failover.drivers.declare import Declaration, Marked, Verb
+from failover.drivers.keeping import Keeping
 from failover.drivers.server import Hand, Near
 from failover.errors import FailoverError, ProgramError
 from failover.kept_state.api import RESTARTED, SWITCHED, Resumed
+from failover.programs.carried import Carried
 from failover.programs.channel import Hello
 from failover.programs.running import Answered, Running, Source
 from failover.programs.sources import Place, before, source_of_directory, source_of_store, version_of
@@ -85,8 +87,20 @@ def declared(hello: Hello, beside: str) -> Described:
 class HostActor(Actor):
     """The mailbox of one program, and the versions that carry out its messages."""
 
-    def __init__(self, place: Place, first: Running, declaration: Declaration, who: str, kept: Kept | None) -> None:
-        super().__init__(object(), declaration, who)
+    def __init__(
+        self,
+        place: Place,
+        first: Running,
+        declaration: Declaration,
+        who: str,
+        kept: Kept | None,
+        keeping: Keeping | None = None,
+    ) -> None:
+        """
+        Args:
+            kept: what outlived the last host. keeping: of a host under an agent, its mailbox and `Carried`; else the store keeps.
+        """
+        super().__init__(object(), declaration, who, keeping)
         self._place = place
         self._running: Running | None = first
         self._old: Running | None = None
@@ -112,7 +126,10 @@ class HostActor(Actor):
         self._is_closing = False
         self.wake: Callable[[], None] = lambda: None
         self.renew: Callable[[Declaration], None] = lambda _: None
-        if kept is not None:
+        self._switched: Kept | None = None
+        """State and version before the last switch."""
+        self._is_shelf_new = True
+        if kept is not None and keeping is None:
             self._mailbox = Mailbox(kept.streams)
 
     # --- One message ------------------------------------------------------------------------------------------------------
@@ -124,6 +141,12 @@ class HostActor(Actor):
         if self._is_changed:
             self._keep()
         return answers
+
+    def _handle(self, now_ns: int, clock: Callable[[], int]) -> None:
+        """Under an agent, what a message did and that it was handled is one commit."""
+        super()._handle(now_ns, clock)
+        if self._keeping is not None and self._is_changed:
+            self._carry(self._keeping)
 
     def following(self, now_ns: int) -> Envelope | None:
         """While no version runs, only what is the host's own is carried out."""
@@ -141,7 +164,7 @@ class HostActor(Actor):
     def wait_ns(self, now_ns: int) -> int | None:
         """Not longer than until something of the versions is due."""
         waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
-        if self._coming is not None or self._anew is not None:
+        if self._coming is not None or self._anew is not None or self._is_changed:
             waits.append(0)
         if self._trial is not None:
             due = self._trial.wait_ns(now_ns)
@@ -229,7 +252,25 @@ class HostActor(Actor):
                 self._said = str(error)
                 log.warning("%s", error)
 
+    def _carry(self, keeping: Keeping) -> None:
+        """State and versions into what the next commit takes to the standby."""
+        carried: Carried = keeping.instance
+        self._is_changed = False
+        self._number += 1
+        carried.newest = msgspec.msgpack.encode(Kept(self._number, self.version, self._state, {}, time.time()))
+        if self._is_shelf_new:
+            self._is_shelf_new = False
+            carried.switched = msgspec.msgpack.encode(self._switched) if self._switched is not None else b""
+            try:
+                carried.take_shelf(self._place.store.shelf(self._place.name), self._place)
+            except ProgramError as error:
+                self._say(f"a standby cannot take {self.version} over: {error}")
+
     def _write(self, *, is_lasting: bool = False) -> None:
+        if self._keeping is not None:
+            with self._keeping.message():
+                self._carry(self._keeping)
+            return
         streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
         kept = Kept(self._number + 1, self.version, self._state, streams, time.time())
         self._place.store.keep(self._declaration.path, kept, is_lasting=is_lasting)
@@ -262,6 +303,7 @@ class HostActor(Actor):
         """The new version takes over, or the old one goes on as if nothing had been."""
         began_ns = clock()
         old, version = self._running, new.source.manifest.version
+        switched: Kept | None = None
         try:
             if old is not None:
                 old.pause()
@@ -269,7 +311,8 @@ class HostActor(Actor):
             new.begin(self._state, self._resumed(SWITCHED))
             if old is not None:
                 switched = Kept(self._number, old.source.manifest.version, old.state, {}, time.time())
-                self._place.store.keep(before(self._declaration.path), switched)
+                if self._keeping is None:
+                    self._place.store.keep(before(self._declaration.path), switched)
             self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
         except FailoverError as error:
             new.end()
@@ -279,13 +322,13 @@ class HostActor(Actor):
             return
         self._let_go()
         self._running, self._old, self._state = new, old, new.state
-        self._switched_with = old.state if old is not None else None
+        self._switched = switched
         self._trial = Trial(new.source.manifest.health, clock())
         self._gap_ms = (clock() - began_ns) / 1e6
         self._renew(new)
         notes = "".join(f"; {note}" for note in new.notes)
         self._say(f"{version} took over within {self._gap_ms:.1f} ms, on trial{notes}")
-        self._keep()
+        self._is_changed = True
 
     def _resume(self, old: Running, state: Any) -> bool:
         """A version that was paused goes on with this state; False: its process does not, and it is started anew."""
@@ -330,7 +373,7 @@ class HostActor(Actor):
         self._record_anyway(lambda shelf: states.fall_back(shelf, why))
         if failed.source.manifest.on_rollback == "newest" and self._began_with(old, newest):
             told = f"goes on with the state of {version}"
-        elif self._resume(old, self._switched_with):
+        elif self._resume(old, (self._switched.state if self._switched is not None else None)):
             told = f"goes on with its state at the switch, and {self._replayed(trial.replay)} commands since then once more"
         else:
             self._owed = trial.replay
@@ -339,7 +382,7 @@ class HostActor(Actor):
             self._state = self._running.state
         self._renew(old)
         self._say(f"{version} is rolled back: {why}; {old.source.manifest.version} {told}")
-        self._keep()
+        self._is_changed = True
 
     def _began_with(self, old: Running, state: Any) -> bool:
         try:
@@ -353,7 +396,7 @@ class HostActor(Actor):
     def _replayed(self, commands: Sequence[Command]) -> int:
         """How many commands were carried out again; their answers have left before."""
         assert self._running is not None
-        self._state = self._switched_with
+        self._state = self._switched.state if self._switched is not None else None
         for count, command in enumerate(commands):
             try:
                 self._running.state = self._state = _again(self._running, command)
@@ -449,11 +492,12 @@ class HostActor(Actor):
             return
         self._running, self._state, self._owed = anew, anew.state, ()
         self._say(f"{anew.source.manifest.version} goes on: it was started anew as pid {anew.pid}")
-        self._keep()
+        self._is_changed = True
 
     def _resumed(self, why: str) -> Resumed:
         """Where a state comes from that a version gets from this host."""
-        return Resumed(self._who.partition("/")[0], 0, self._number, why, 0.0)
+        epoch = self._keeping.epoch if self._keeping is not None else 0
+        return Resumed(self._who.partition("/")[0], epoch, self._number, why, 0.0)
 
     # --- Orders -----------------------------------------------------------------------------------------------------------
 
@@ -548,19 +592,17 @@ class HostActor(Actor):
                     f"{old.source.manifest.version} cannot read the state of {version}; with --old-state it goes "
                     "on with its own state at the switch, and what came since then is lost"
                 )
-            self._resume(old, self._switched_with)
+            self._resume(old, (self._switched.state if self._switched is not None else None))
         self._record_anyway(lambda shelf: states.fall_back(shelf, "a person took it back"))
         if new is not None:
             new.end()
         self._old, self._state = None, old.state
         self._renew(old)
         self._say(f"{version} is rolled back by a person; {old.source.manifest.version} goes on")
-        self._keep()
+        self._is_changed = True
         return {"active": self.version}
 
     # --- What others see --------------------------------------------------------------------------------------------------
-
-    _switched_with: Any = None
 
     def _renew(self, running: Running) -> None:
         """Verbs, aliases and pace are those of this version."""
@@ -585,6 +627,7 @@ class HostActor(Actor):
             try:
                 with store.locked():
                     store.put(change(store.shelf(self._place.name)), is_lasting=False)
+                self._is_shelf_new = self._is_changed = True
             except OSError as error:
                 raise ProgramError(
                     f"cannot write the versions of {self._place.name} in {store.place}: {error.strerror}"

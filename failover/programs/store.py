@@ -30,7 +30,7 @@ from failover.core.programs import manifest, states, versions
 from failover.core.programs.archive import Member
 from failover.core.programs.bundle import Program
 from failover.core.programs.states import Shelf, State, Version
-from failover.errors import ProgramError
+from failover.errors import BundleRefusedError, ProgramError
 from failover.programs import packing
 from failover.programs.admission import Admitted, admit
 from failover.programs.channel import State as KeptState
@@ -138,7 +138,7 @@ class Store:
             aside.mkdir(mode=0o755)
             for one in program.files:
                 _write_new(aside, one)
-            _replace(folder.with_suffix(".bundle"), content)
+            _replace(self._bundle(program.digest), content)
             if not _is_whole(folder, program):
                 shutil.rmtree(folder, ignore_errors=True)
                 aside.rename(folder)
@@ -147,9 +147,38 @@ class Store:
         finally:
             shutil.rmtree(aside, ignore_errors=True)
 
+    def bring(self, digest: str, content: bytes, team: Path) -> None:
+        """Check a bundle that came with a program's state, and unpack it; the shelf is not changed.
+
+        Raises:
+            BundleRefusedError: it may not run here.
+            ProgramError: it cannot be unpacked.
+        """
+        found = admit(content, team)
+        if found.program.digest != digest:
+            other = found.program.digest
+            raise BundleRefusedError(f"the bundle {digest[:12]} that came with the state has the content of {other[:12]}")
+        with self.locked():
+            self._unpack(found.program, content)
+
     def tree(self, digest: str) -> Path:
         """Where a bundle's files are."""
         return self.place / "bundles" / digest
+
+    def has(self, digest: str) -> bool:
+        """Whether a bundle is here; `admitted` says whether it may run."""
+        return bool(digest) and self._bundle(digest).exists()
+
+    def bundle(self, digest: str) -> bytes:
+        """A bundle's bytes.
+
+        Raises:
+            ProgramError: it cannot be read.
+        """
+        return packing.read_file(self._bundle(digest))
+
+    def _bundle(self, digest: str) -> Path:
+        return self.tree(digest).with_suffix(".bundle")
 
     def admitted(self, digest: str, team: Path) -> Admitted:
         """A staged bundle, once everything about it was checked anew, and its files are those of the bundle.
@@ -158,7 +187,7 @@ class Store:
             BundleRefusedError: it may not run any more.
             ProgramError: its files were changed.
         """
-        content = packing.read_file(self.tree(digest).with_suffix(".bundle"))
+        content = self.bundle(digest)
         found = admit(content, team)
         if found.program.digest != digest:
             raise ProgramError(f"the bundle {digest[:12]} was replaced in {self.place}; send it again")
