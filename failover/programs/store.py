@@ -25,6 +25,7 @@ import msgspec
 from blake3 import blake3
 from msgspec import Struct
 
+from checkpoint.store.whole_file import write_whole
 from failover.core.messaging.mailbox import Stream
 from failover.core.programs import manifest, states, versions
 from failover.core.programs.archive import Member
@@ -138,7 +139,7 @@ class Store:
             aside.mkdir(mode=0o755)
             for one in program.files:
                 _write_new(aside, one)
-            _replace(self._bundle(program.digest), content)
+            write_whole(self._bundle(program.digest), content)
             if not _is_whole(folder, program):
                 shutil.rmtree(folder, ignore_errors=True)
                 aside.rename(folder)
@@ -234,9 +235,8 @@ class Store:
         """Keep it; to be called in `locked`. ``is_lasting``: it outlives a power cut; else only after `settle`."""
         if not shelf.uid:
             shelf = msgspec.structs.replace(shelf, uid=self._free_uid(shelf.name))
-        _replace(
-            self.place / f"{shelf.name}.json", msgspec.json.format(msgspec.json.encode(shelf)) + b"\n", is_lasting=is_lasting
-        )
+        content = msgspec.json.format(msgspec.json.encode(shelf)) + b"\n"
+        write_whole(self.place / f"{shelf.name}.json", content, lasts="content" if is_lasting else "process")
 
     def settle(self, name: str) -> None:
         """Have the disk keep what was put."""
@@ -270,7 +270,7 @@ class Store:
             with path.open("a") as file:
                 file.write(line)
             if path.stat().st_size > LOG_SIZE_MAX:
-                _replace(path, path.read_bytes()[-LOG_SIZE_MAX // 2 :].partition(b"\n")[2])
+                write_whole(path, path.read_bytes()[-LOG_SIZE_MAX // 2 :].partition(b"\n")[2])
 
     def lines(self, name: str) -> list[dict[str, object]]:
         """The log, oldest first.
@@ -296,7 +296,7 @@ class Store:
         body = msgspec.msgpack.encode(kept)
         file = self._kept(path, kept.number % 2)
         try:
-            _replace(file, blake3(body).digest(_CHECK_SIZE) + body, is_lasting=is_lasting)
+            write_whole(file, blake3(body).digest(_CHECK_SIZE) + body, lasts="content" if is_lasting else "process")
         except OSError as error:
             raise ProgramError(f"cannot keep the state of {path} in {file}: {error.strerror}") from error
 
@@ -332,13 +332,3 @@ def _is_as_unpacked(folder: Path, one: Member) -> bool:
         return not path.is_symlink() and packing.read_file(path) == bytes(one.content)
     except ProgramError:
         return False
-
-
-def _replace(path: Path, content: bytes, *, is_lasting: bool = True) -> None:
-    aside = path.with_name(path.name + ".aside")
-    with open(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600), "wb") as file:
-        file.write(content)
-        file.flush()
-        if is_lasting:
-            os.fdatasync(file.fileno())
-    aside.replace(path)

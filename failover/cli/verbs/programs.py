@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
+from checkpoint.store.whole_file import write_whole
 from failover.cli.output import render
 from failover.core.naming.tree import Place as NamedPlace
 from failover.core.programs import bundle, states
@@ -73,10 +74,8 @@ def _until(day: str | None) -> int:
 
 def _written(arguments: argparse.Namespace, path: Path, content: bytes) -> int:
     program = bundle.read(bundle.split(content)[1])
-    aside = path.with_name(path.name + ".new")
     try:
-        aside.write_bytes(content)
-        aside.replace(path)
+        write_whole(path, content, mode=0o666, lasts="process")
     except OSError as error:
         raise ProgramError(f"cannot write {path}: {error.strerror}") from error
     said = program.manifest
