@@ -128,7 +128,9 @@ class HostActor(Actor):
         self.renew: Callable[[Declaration], None] = lambda _: None
         self._switched: Kept | None = None
         """State and version before the last switch."""
+        self._is_switch_unwritten = False
         self._is_shelf_new = True
+        self._is_unsettled = False
         if kept is not None and keeping is None:
             self._mailbox = Mailbox(kept.streams)
 
@@ -140,6 +142,8 @@ class HostActor(Actor):
         answers = super().handle(clock)
         if self._is_changed:
             self._keep()
+        if self._is_unsettled:
+            self._settle()
         return answers
 
     def _handle(self, now_ns: int, clock: Callable[[], int]) -> None:
@@ -271,6 +275,9 @@ class HostActor(Actor):
             with self._keeping.message():
                 self._carry(self._keeping)
             return
+        if self._switched is not None and self._is_switch_unwritten:
+            self._place.store.keep(before(self._declaration.path), self._switched)
+            self._is_switch_unwritten = False
         streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
         kept = Kept(self._number + 1, self.version, self._state, streams, time.time())
         self._place.store.keep(self._declaration.path, kept, is_lasting=is_lasting)
@@ -300,31 +307,38 @@ class HostActor(Actor):
             self._let_go()
 
     def _switch_to(self, new: Running, clock: Callable[[], int]) -> None:
-        """The new version takes over, or the old one goes on as if nothing had been."""
-        began_ns = clock()
+        """The new version takes over, or the old one goes on as if nothing had been.
+
+        No file is written between `pause` and the new version's `begin`, when no version can take a message. Before, the shelf
+        is: if the host ends from then on, the next one finds a trial, and goes back to the old version, whose state is the newest
+        kept. After, state, mailbox and the state at the switch are, before the first answer of the new version leaves.
+        """
         old, version = self._running, new.source.manifest.version
+        earlier: Shelf | None = None
         switched: Kept | None = None
         try:
+            earlier = self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
+            began_ns = clock()
             if old is not None:
                 old.pause()
                 self._state = old.state
-            new.begin(self._state, self._resumed(SWITCHED))
-            if old is not None:
                 switched = Kept(self._number, old.source.manifest.version, old.state, {}, time.time())
-                if self._keeping is None:
-                    self._place.store.keep(before(self._declaration.path), switched)
-            self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
+            new.begin(self._state, self._resumed(SWITCHED))
         except FailoverError as error:
+            if earlier is not None:
+                found = earlier
+                self._record_anyway(lambda shelf: states.undone(shelf, found))
             new.end()
             self._say(f"{version} could not take over: {error}")
             if old is not None:
                 self._resume(old, self._state)
             return
+        now_ns = clock()
         self._let_go()
         self._running, self._old, self._state = new, old, new.state
-        self._switched = switched
-        self._trial = Trial(new.source.manifest.health, clock())
-        self._gap_ms = (clock() - began_ns) / 1e6
+        self._switched, self._is_switch_unwritten = switched, switched is not None
+        self._trial = Trial(new.source.manifest.health, now_ns)
+        self._gap_ms = (now_ns - began_ns) / 1e6
         self._renew(new)
         notes = "".join(f"; {note}" for note in new.notes)
         self._say(f"{version} took over within {self._gap_ms:.1f} ms, on trial{notes}")
@@ -409,7 +423,7 @@ class HostActor(Actor):
     def _let_go(self) -> None:
         old, self._old = self._old, None
         if old is not None:
-            old.end()
+            self._starter.submit(old.end)  # it may take its time, and no version waits for it
 
     # --- An end that no person ordered ------------------------------------------------------------------------------------
 
@@ -616,23 +630,28 @@ class HostActor(Actor):
         except FailoverError as error:
             self._note(f"its names were not told: {error}")
 
-    def _record(self, change: Callable[[Shelf], Shelf]) -> None:
-        """Change the shelf, for programs that have one.
+    def _record(self, change: Callable[[Shelf], Shelf]) -> Shelf | None:
+        """Change the shelf, for programs that have one; the shelf before that.
 
         Raises:
             ProgramError: it cannot be written.
         """
-        if self._place.directory is None and not self._place.beside:
-            store = self._place.store
-            try:
-                with store.locked():
-                    store.put(change(store.shelf(self._place.name)), is_lasting=False)
-                self._is_shelf_new = self._is_changed = True
-            except OSError as error:
-                raise ProgramError(
-                    f"cannot write the versions of {self._place.name} in {store.place}: {error.strerror}"
-                ) from error
-            self._starter.submit(store.settle, self._place.name)  # the disk is not waited for between two messages
+        if self._place.directory is not None or self._place.beside:
+            return None
+        store = self._place.store
+        try:
+            with store.locked():
+                earlier = store.shelf(self._place.name)
+                store.put(change(earlier), is_lasting=False)
+        except OSError as error:
+            raise ProgramError(f"cannot write the versions of {self._place.name} in {store.place}: {error.strerror}") from error
+        self._is_shelf_new = self._is_changed = self._is_unsettled = True
+        return earlier
+
+    def _settle(self) -> None:
+        """Have the disk keep the shelf, without a wait: not between two messages, nor before an answer."""
+        self._is_unsettled = False
+        self._starter.submit(self._place.store.settle, self._place.name)
 
     def _record_anyway(self, change: Callable[[Shelf], Shelf]) -> None:
         """The same where what was done is done; a disk that is full is told."""

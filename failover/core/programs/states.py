@@ -219,6 +219,14 @@ def fall_back(shelf: Shelf, why: str) -> Shelf:
     return msgspec.structs.replace(put(shelf, back), before="")
 
 
+def undone(shelf: Shelf, earlier: Shelf) -> Shelf:
+    """The shelf as it was at a moment before, with what has come since: a version that was to become active could not begin."""
+    known = {versions.order(one.version) for one in earlier.versions}
+    came = [one for one in shelf.versions if versions.order(one.version) not in known]
+    both = sorted((*earlier.versions, *came), key=lambda one: versions.order(one.version))
+    return msgspec.structs.replace(shelf, versions=tuple(both), floor=earlier.floor, before=earlier.before)
+
+
 def carried_over(shelf: Shelf, here: Shelf | None, present: Collection[str]) -> Shelf:
     """The shelf of a program that goes on here: as it was where it ran, with the versions that are on this robot besides.
 

@@ -13,12 +13,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec import UNSET
 
 from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.mailbox import SENDERS_MAX
+from failover.core.programs import states
 from failover.core.programs.states import State
 from failover.drivers.server import Near, Peer
 from failover.errors import BundleRefusedError, CallRefusedError, DriverError, NoAnswerError, ProgramError
@@ -26,7 +28,7 @@ from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.running import Running
 from failover.programs.sources import Place
-from failover.programs.store import Kept
+from failover.programs.store import Kept, Store
 from tests.failover.drivers.serving import taking_messages
 from tests.failover.programs.senders import Lab, engine, switched, until
 
@@ -247,6 +249,43 @@ def test_a_host_that_ends_during_a_trial_goes_back(lab: Lab) -> None:
     with lab.hosting(), lab.proxy() as proxy:
         assert proxy.call("_versions")["active"] == "1" and proxy.call("read") == [1, 2]
     assert states_of(lab) == {"1": "active", "2": "rolled back"}
+
+
+def test_a_host_that_ends_between_the_shelf_and_the_switch_goes_on_with_the_old_version_and_its_newest_state(lab: Lab) -> None:
+    lab.send("1")
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("step", number=1)
+    lab.send("2", engine(kept="numbers: list[str] = failover.kept(default=[])"))
+    shelf = lab.store.shelf("engine")
+    lab.store.put(states.succeed(shelf, states.warm(shelf.find("2")), "on trial"))  # type: ignore[arg-type]
+    with lab.hosting(), lab.proxy() as proxy:
+        assert proxy.call("_versions")["active"] == "1" and proxy.call("read") == [1]
+    assert states_of(lab) == {"1": "active", "2": "rolled back"}
+
+
+def test_no_file_is_written_while_no_version_can_take_a_message(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send("1")
+    lab.send("2", seconds=0)
+    said: list[str] = []
+
+    def noted(owner: object, name: str) -> None:
+        real = getattr(owner, name)
+
+        def called(*arguments: Any, **named: Any) -> Any:
+            said.append(name)
+            return real(*arguments, **named)
+
+        monkeypatch.setattr(owner, name, called)
+
+    with lab.hosting("1"), lab.proxy() as proxy:
+        for owner, names in ((Running, ("pause", "begin", "end")), (Store, ("put", "keep", "settle", "log"))):
+            for name in names:
+                noted(owner, name)
+        assert switched(proxy, "2")["active"] == "2"
+        until(proxy, lambda _: said.count("put") > 1)
+        first = said.index("pause")
+        assert "put" in said[:first] and said[first : first + 2] == ["pause", "begin"], said
+        assert {"keep", "log"} <= set(said[first + 2 :]) and not {"settle", "end"} & set(said[: first + 2]), said
 
 
 def test_two_versions_run_side_by_side_under_two_names(lab: Lab) -> None:
