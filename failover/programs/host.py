@@ -114,8 +114,10 @@ class HostActor(Actor):
         self._why_lost = ""
         self._owed: tuple[Command, ...] = ()
         """What the version that is started anew must carry out before anything else."""
-        self._anew: Running | None = None
         self._is_starting_anew = False
+        """Until `_revived` has taken what came of it."""
+        self._started: tuple[Running | None] | None = None
+        """What came of it, from the thread."""
         self._restart_ns = 0
         self._gap_ms = 0.0
         self._state = first.state
@@ -168,7 +170,7 @@ class HostActor(Actor):
     def wait_ns(self, now_ns: int) -> int | None:
         """Not longer than until something of the versions is due."""
         waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
-        if self._coming is not None or self._anew is not None or self._is_changed:
+        if self._coming is not None or self._started is not None or self._is_changed:
             waits.append(0)
         if self._trial is not None:
             due = self._trial.wait_ns(now_ns)
@@ -294,8 +296,9 @@ class HostActor(Actor):
         now_ns = clock()
         if self._running is not None and not self._running.lives:
             self._ended()
-        if self._anew is not None:
-            self._revived()
+        if self._started is not None:
+            (anew,), self._started = self._started, None
+            self._revived(anew)
         if self._running is None and self._coming is None and not self._is_starting_anew and now_ns >= self._restart_ns:
             self._restart(now_ns)
         if self._coming is not None:
@@ -314,11 +317,15 @@ class HostActor(Actor):
         kept. After, state, mailbox and the state at the switch are, before the first answer of the new version leaves.
         """
         old, version = self._running, new.source.manifest.version
-        earlier: Shelf | None = None
         switched: Kept | None = None
         try:
             earlier = self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
-            began_ns = clock()
+        except FailoverError as error:
+            new.end()
+            self._say(f"{version} could not take over: {error}")
+            return
+        began_ns = clock()
+        try:
             if old is not None:
                 old.pause()
                 self._state = old.state
@@ -326,8 +333,7 @@ class HostActor(Actor):
             new.begin(self._state, self._resumed(SWITCHED))
         except FailoverError as error:
             if earlier is not None:
-                found = earlier
-                self._record_anyway(lambda shelf: states.undone(shelf, found))
+                self._record_anyway(lambda shelf: states.undone(shelf, earlier))
             new.end()
             self._say(f"{version} could not take over: {error}")
             if old is not None:
@@ -450,18 +456,17 @@ class HostActor(Actor):
 
     def _start_anew(self, source: Source, state: Any, owed: Sequence[Command]) -> None:
         """In the thread."""
-        left = list(owed)
+        running: Running | None = None
         try:
             running = self._begun(source, state)
-            while left:
-                command = left.pop(0)
+            for command in owed:
                 try:
                     running.state = _again(running, command)
                 except FailoverError as error:
                     self._note(f"{command.verb} is left out: {error}")
-                    running.end()
-                    running = self._begun(source, running.state)
-            self._anew = running
+                    left, running = running, None
+                    left.end()
+                    running = self._begun(source, left.state)
         except FailoverError as error:
             self._why_lost = str(error)
             self._say(f"it cannot be started anew: {error}")
@@ -469,7 +474,7 @@ class HostActor(Actor):
             log.exception("a version could not be started anew")
             self._say(f"it cannot be started anew: {type(error).__name__}: {error}")
         finally:
-            self._is_starting_anew = False
+            self._started = (running,)
             self.wake()
 
     def _begun(self, source: Source, state: Any) -> Running:
@@ -497,10 +502,11 @@ class HostActor(Actor):
         finally:
             self._loading.discard(running)
 
-    def _revived(self) -> None:
-        """The version that was started anew takes messages, unless another one does by now."""
-        anew, self._anew = self._anew, None
-        assert anew is not None
+    def _revived(self, anew: Running | None) -> None:
+        """The version that was started anew takes messages, unless it could not, or another one does by now."""
+        self._is_starting_anew = False
+        if anew is None:
+            return
         if self._running is not None:
             anew.end()
             return
@@ -540,6 +546,11 @@ class HostActor(Actor):
         version, directory = body.get("version"), body.get("directory")
         if self._is_coming or self._trial is not None:
             raise ProgramError(f"{self._place.name} is in the middle of a switch; wait until its trial is over, or roll it back")
+        if self._owed:
+            version, count = self._last.manifest.version, len(self._owed)
+            raise ProgramError(
+                f"{version} is being started anew, and gets {count} commands once more; order the switch after that"
+            )
         if isinstance(directory, str) and self._place.directory is not None:
             source = source_of_directory(Path(directory))
             if source.manifest.name != self._place.name or source.manifest.path != self._declaration.path:
@@ -685,7 +696,8 @@ class HostActor(Actor):
             log.warning("%s", error)
         for thread in (self._starter, self._reviver):
             thread.shutdown(wait=True)  # not before: a version dies with the thread that started it
-        for one in (self._running, self._old, self._coming, self._anew):
+        anew = self._started[0] if self._started is not None else None
+        for one in (self._running, self._old, self._coming, anew):
             if one is not None:
                 one.end()
 

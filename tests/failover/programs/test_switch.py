@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import resource
@@ -286,6 +287,22 @@ def test_no_file_is_written_while_no_version_can_take_a_message(lab: Lab, monkey
         first = said.index("pause")
         assert "put" in said[:first] and said[first : first + 2] == ["pause", "begin"], said
         assert {"keep", "log"} <= set(said[first + 2 :]) and not {"settle", "end"} & set(said[: first + 2]), said
+
+
+def test_a_switch_that_cannot_be_recorded_leaves_the_old_version_untouched(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send("1", engine(kept=RESUMES, extra="return self.told"))
+    lab.send("2")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with lab.hosting("1"), lab.proxy() as proxy:
+        with monkeypatch.context() as patch:
+            patch.setattr(Store, "put", full)
+            found = switched(proxy, "2")
+        assert found["active"] == "1" and "No space left on device" in str(found["said"]), found
+        assert proxy.call("fly") == "nothing", "it was neither paused nor begun again"
+    assert states_of(lab) == {"1": "active", "2": "staged"}
 
 
 def test_two_versions_run_side_by_side_under_two_names(lab: Lab) -> None:
