@@ -139,7 +139,7 @@ class Proxy:
             raise CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
         return None if answer.ok is UNSET else answer.ok
 
-    def told(self, verb: str, kind: type[T] | Any, body: Any = None, /, *, timeout: float = TIMEOUT_S) -> T:
+    def told(self, verb: str, kind: type[T], body: Any = None, /, *, timeout: float = TIMEOUT_S) -> T:
         """`call` for a verb whose answer has a form of failover's own: the answer, checked. Fields of newer drivers are left out.
 
         Raises:

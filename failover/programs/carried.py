@@ -101,12 +101,13 @@ def unpack(carried: Carried, place: Place) -> None:
                 f"{shelf.name} cannot go on here: the bundle of its active version did not come with its state"
             )
         store.put(found)
-    for digest, error in refused.items():
-        store.log(shelf.name, f"{digest[:12]}, which came with the state, may not run here: {error}")
+    for digest, why in refused.items():
+        store.log(shelf.name, f"{digest[:12]}, which came with the state, may not run here: {why}")
 
 
 def _read(content: bytes, kind: type[T]) -> T:
     try:
-        return (msgspec.json if kind is Shelf else msgspec.msgpack).decode(content, type=kind)
+        found: T = (msgspec.json if kind is Shelf else msgspec.msgpack).decode(content, type=kind)
     except msgspec.MsgspecError as error:
         raise ProgramError(f"what came with the program's state is damaged: {error}") from error
+    return found

@@ -682,8 +682,8 @@ class HostActor(Actor):
     def close(self) -> None:
         """End all processes; the state stays."""
         self._is_closing = True
-        for one in tuple(self._loading):
-            one.end()
+        for loading in tuple(self._loading):
+            loading.end()
         if self._running is not None and self._running.lives:
             try:
                 self._running.pause()

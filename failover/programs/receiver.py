@@ -30,7 +30,6 @@ FINISH_S: Final = 60.0
 """How long checking and unpacking may take."""
 
 Size = Annotated[int, msgspec.Meta(ge=1, le=BUNDLE_SIZE_MAX)]
-Offset = Annotated[int, msgspec.Meta(ge=0, le=BUNDLE_SIZE_MAX)]
 Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
@@ -107,11 +106,16 @@ def send(proxy: Proxy, content: bytes) -> Staged:
         NoAnswerError: it does not answer.
     """
     digest = bundle.digest_of(content)
-    at = proxy.told("offer", Offset, {"digest": digest, "size": len(content)})
+    at = proxy.told("offer", int, {"digest": digest, "size": len(content)})
+    _check_at(proxy, at, max(0, min(at, len(content))))
     while at < len(content):
         part = content[at : at + PART]
         expected = at + len(part)
-        at = proxy.told("part", Offset, {"digest": digest, "at": at, "content": base64.b64encode(part).decode()})
-        if at != expected:
-            raise DriverError(f"{proxy.path} has {at} bytes of the bundle, and {expected} were sent; send the bundle again")
+        at = proxy.told("part", int, {"digest": digest, "at": at, "content": base64.b64encode(part).decode()})
+        _check_at(proxy, at, expected)
     return proxy.told("finish", Staged, {"digest": digest}, timeout=FINISH_S)
+
+
+def _check_at(proxy: Proxy, at: int, expected: int) -> None:
+    if at != expected:
+        raise DriverError(f"{proxy.path} has {at} bytes of the bundle, and {expected} were sent; send the bundle again")

@@ -68,7 +68,8 @@ class Loaded:
         Raises whatever the program raises, and FitError: it cannot read the state.
         """
         values: dict[str, Any] = {}
-        resumed, notes = order.resumed, ()
+        resumed = order.resumed
+        notes: tuple[str, ...] = ()
         if self._schema is not None and order.state is not None:
             regions = tuple(Region(name, memoryview(content)) for name, content in order.state.regions)
             decoded = self._schema.decode(Encoded(order.state.data, regions))

@@ -8,7 +8,7 @@ import json
 import sys
 import time
 from collections import defaultdict
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import msgspec
 
@@ -190,7 +190,7 @@ def _remembered(here: Here, tree: Tree, wanted: str) -> tuple[Hop, ...]:
     for place in _live(tree):
         try:
             with Proxy(here, place) as driver:
-                hops = driver.told("_path", Hops, {"id": wanted}, timeout=ASK_S)
+                hops = driver.told("_path", cast("type[tuple[Hop, ...] | None]", Hops), {"id": wanted}, timeout=ASK_S)
             envelopes.check_hops(hops or ())
         except (NoAnswerError, CallRefusedError, DriverError, EnvelopeError):
             continue

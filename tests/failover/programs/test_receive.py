@@ -65,7 +65,11 @@ def test_a_driver_that_answers_as_no_robot_that_takes_bundles_does_gets_one_sent
     with serving(Odd, lab.here), called(lab.here, "robot1/programs") as proxy:
         with pytest.raises(DriverError, match="has 0 bytes of the bundle"):
             receiver.send(proxy, content)
-        for verb, answer in (("finish", {"name": 7}), ("part", "all"), ("offer", -1)):
+        Odd.answers["offer"] = -1
+        with pytest.raises(DriverError, match="has -1 bytes of the bundle, and 0 were sent"):
+            receiver.send(proxy, content)
+        Odd.answers["offer"] = 0
+        for verb, answer in (("finish", {"name": 7}), ("part", "all"), ("offer", None)):
             Odd.answers |= {"part": len(content), verb: answer}
             with pytest.raises(DriverError, match=f"robot1/programs answered {verb} in a form that failover does not know"):
                 receiver.send(proxy, content)
