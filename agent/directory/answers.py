@@ -19,6 +19,7 @@ from agent.directory.messages import Answer, Question, spelled_age
 from agent.directory.server import EMPTY_PASSWORD, UnknownUserError, WrongPasswordError
 from agent.errors import DirectoryError
 from checkpoint.errors import UNDECODABLE
+from checkpoint.store.whole_file import write_whole
 from failover.config.rights import LdapConfig
 from failover.core.rights.rules import NEVER_BY_DEFAULT
 
@@ -156,14 +157,8 @@ class Answers:
 
     def _write(self) -> None:
         """Keep the copies; a disk that takes none costs the copies alone."""
-        aside = self._path.with_name(self._path.name + ".new")
         with contextlib.suppress(OSError):
-            descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-            with open(descriptor, "wb") as file:
-                file.write(msgspec.msgpack.encode(self._copies))
-                file.flush()
-                os.fsync(descriptor)
-            aside.replace(self._path)
+            write_whole(self._path, msgspec.msgpack.encode(self._copies))
 
 
 def _read(path: Path) -> dict[str, Copy]:

@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 
 from agent.errors import BallotError
+from checkpoint.store.whole_file import write_whole
 
 FILE_NAME: Final = "ballot"
 RESERVE_NAME: Final = "ballot.reserve"
@@ -121,14 +122,9 @@ class VoteRecordFile:
 
     def _write(self, record: Record) -> None:
         body = msgspec.json.encode(record)
-        aside = self._path.with_suffix(".new")
         try:
-            self._write_aside(aside, body + b"\n" + _digest(body).encode() + b"\n")
-            aside.rename(self._path)
-            sync_directory(self._directory)
+            self._write_whole(body + b"\n" + _digest(body).encode() + b"\n")
         except OSError as error:
-            with contextlib.suppress(OSError):
-                aside.unlink(missing_ok=True)
             raise BallotError(
                 f"cannot write an epoch to {self._path}: {error.strerror}; "
                 "until then this robot gives no vote and takes nothing over"
@@ -136,14 +132,14 @@ class VoteRecordFile:
         self._record = record
         self._take_reserve()
 
-    def _write_aside(self, aside: Path, content: bytes) -> None:
+    def _write_whole(self, content: bytes) -> None:
         """Write durably, if need be into the room that was kept for this."""
         try:
-            write_durably(aside, content)
+            write_whole(self._path, content, lasts="name")
         except OSError as error:
             if error.errno not in FULL or not self._give_reserve():
                 raise
-            write_durably(aside, content)
+            write_whole(self._path, content, lasts="name")
 
     def _give_reserve(self) -> bool:
         """The disk is full: let the room go that was kept; False if there is none."""
@@ -166,26 +162,6 @@ class VoteRecordFile:
                 path.unlink()  # an empty one would be no reserve
             finally:
                 os.close(descriptor)
-
-
-def write_durably(path: Path, content: bytes) -> None:
-    """Write a new file, 0600, and wait until the disk has it."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-    try:
-        with open(descriptor, "wb", closefd=False) as file:
-            file.write(content)
-        os.fdatasync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def sync_directory(directory: Path) -> None:
-    """Wait until the disk has the directory's names, so that a rename survives a power cut."""
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _digest(body: bytes) -> str:

@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 from msgspec.structs import replace
 
+from checkpoint.store.whole_file import write_whole
 from failover.boards.directory import OWN_NAME, PRIVATE_NAME
 from failover.config.board import BoardConfig, as_toml, board_of
 from failover.core.board import layout
@@ -56,13 +57,7 @@ def write(state: Path, items: tuple[Item, ...]) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    path = state / FILE_NAME
-    aside = path.with_suffix(".new")
-    with aside.open("w") as file:
-        file.write(HEADING + as_toml(Board(items)))
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    write_whole(state / FILE_NAME, (HEADING + as_toml(Board(items))).encode(), mode=0o666)
 
 
 def found_in(place: Path) -> tuple[Item, ...]:

@@ -9,6 +9,8 @@ import os
 from pathlib import Path
 from typing import Final
 
+from checkpoint.store.whole_file import sync_directory
+
 FILE_MODE = 0o600
 FOLDER_MODE = 0o700
 """Memory is secret: no other user may read a snapshot."""
@@ -72,11 +74,7 @@ class Disk:
 
     def sync_folder(self, path: Path) -> None:
         """Return when the names in a folder would survive a power cut."""
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync_directory(path)
 
     def remove(self, path: Path) -> None:
         """Remove a file; one that is gone already is fine."""

@@ -5,6 +5,7 @@ A file of its own beside team.toml: an agent reads it again when it has changed,
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,9 +14,12 @@ from typing import Final, Literal
 from failover.config import strict_toml
 from failover.core.rights import hours
 from failover.core.rights.rules import RULES_MAX, Rule, make_rule
-from failover.errors import FileMistakeError, RightsError
+from failover.errors import FailoverError, FileMistakeError, RightsError
 
 RIGHTS_FILE: Final = "rights.toml"
+UNREADABLE: Final = (0, 0, 0)
+"""In place of when, where and how large the file is."""
+
 _ATTRIBUTE: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]*")
 
 
@@ -97,7 +101,7 @@ class RightsConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class RightsFile:
+class _Tables:
     """The whole file."""
 
     rights: RightsConfig = field(default_factory=RightsConfig)
@@ -120,7 +124,7 @@ def read(directory: Path) -> Rights | None:
     path = directory / RIGHTS_FILE
     if not path.exists():
         return None
-    config = strict_toml.read(path, RightsFile).rights
+    config = strict_toml.read(path, _Tables).rights
     if len(config.rules) > RULES_MAX:
         raise FileMistakeError(f"{strict_toml.place_of(path, ('rights', 'rules', str(RULES_MAX)))}: at most {RULES_MAX} rules")
     if config.source == "ldap" and not config.ldap.server:
@@ -132,6 +136,45 @@ def read(directory: Path) -> Rights | None:
             f'{strict_toml.place_of(path, ("rights", "groups"))}: with source = "ldap" the server tells groups'
         )
     return Rights(config, tuple(_rule(path, number, said) for number, said in enumerate(config.rules)))
+
+
+class RightsFile:
+    """A team directory's ``rights.toml``, read again when it has changed.
+
+    Attributes:
+        path: of the file.
+        exists: whether it was there at the last look, mistaken or not.
+        rights: what it says; None where it is not there, or mistaken.
+        mistake: why it cannot be read; "" where it can, or is not there.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / RIGHTS_FILE
+        self.exists = False
+        self.rights: Rights | None = None
+        self.mistake = ""
+        self._read_at: tuple[int, int, int] | None = None
+
+    def look(self) -> bool:
+        """Read it if it is another one than the last that was read; whether anything is different now."""
+        try:
+            found = os.stat(self.path)
+            at: tuple[int, int, int] | None = (found.st_mtime_ns, found.st_ino, found.st_size)
+        except FileNotFoundError:
+            at = None
+        except OSError as error:
+            before = self.mistake
+            self._read_at, self.exists, self.rights = UNREADABLE, True, None
+            self.mistake = f"{self.path}: cannot be read: {error.strerror}"
+            return self.mistake != before
+        if at == self._read_at:
+            return False
+        self._read_at, self.exists, self.rights, self.mistake = at, at is not None, None, ""
+        try:
+            self.rights = read(self.path.parent)
+        except (FailoverError, OSError) as error:
+            self.mistake = str(error)
+        return True
 
 
 def _rule(path: Path, number: int, said: RuleConfig) -> Rule:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
+from checkpoint.store.whole_file import write_whole
 from failover.config import strict_toml
 from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
 from failover.core.frames.roster import Roster, roster
@@ -151,9 +152,8 @@ def for_lookup(host: str) -> str | bytes:
 def write(directory: Path, team: Team) -> None:
     """Write the team file whole: aside, then renamed. The operator's lines below ``[board]`` stay as they are."""
     directory.mkdir(parents=True, exist_ok=True)
-    path, aside = directory / TEAM_FILE, directory / (TEAM_FILE + ".new")
-    aside.write_text(_as_toml(team) + _board_text(path, team.board))
-    aside.replace(path)
+    path = directory / TEAM_FILE
+    write_whole(path, (_as_toml(team) + _board_text(path, team.board)).encode(), mode=0o666, lasts="process")
 
 
 def _board_text(path: Path, board: BoardConfig) -> str:

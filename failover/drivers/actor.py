@@ -17,7 +17,7 @@ import msgspec
 from msgspec import UNSET, Struct
 
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import Envelope, Hop, answer, refusal
+from failover.core.messaging.envelope import Envelope, Fault, Hop, answer, refusal
 from failover.core.messaging.mailbox import SENDERS_MAX, Mailbox
 from failover.core.messaging.pacing import SECOND, Pace, merged
 from failover.core.messaging.traffic import Traffic
@@ -108,8 +108,8 @@ class Actor:
         if not self._is_meant(envelope.to):
             here = f"this is {self._declaration.path}, and not {envelope.to}: look the name up anew"
             return [refusal(envelope, "wrong_driver", here)]
-        if why := self.forbidden(envelope, whose):
-            return [refusal(envelope, "refused", why)]
+        if fault := self.refused(envelope, whose):
+            return [refusal(envelope, fault.kind, fault.sentence)]
         try:
             envelope = envelopes.came(envelope, self._who, now_ns)
         except EnvelopeError as error:
@@ -126,9 +126,9 @@ class Actor:
         """Answers to all messages that wait: they are for a later copy of the driver."""
         return [refusal(one, "moved", why) for one in self._mailbox.give_back()]
 
-    def forbidden(self, envelope: Envelope, whose: Whose) -> str:
-        """Why a message may not come over this way; "" if it may. Asked as it comes: later the way may be forgotten."""
-        return ""
+    def refused(self, envelope: Envelope, whose: Whose) -> Fault | None:
+        """Why a message is not taken that came this way; None if it is. Asked as it comes: later the way may be forgotten."""
+        return None
 
     def _is_meant(self, to: str) -> bool:
         """Whether a name is this driver's; an address is: the message has come there."""
@@ -153,7 +153,7 @@ class Actor:
         waits = [max(sample_ns - now_ns, 0) for sample_ns in self._samples_ns.values()]
         if self._keeping is not None and (again_ns := self._keeping.wait_ns()) is not None:
             waits.append(again_ns)
-        if (first := self._mailbox.first()) is not None and not self._mailbox.is_ahead:
+        if (first := self.following(now_ns)) is not None and not self._mailbox.is_ahead:
             waits.append(self._pace.wait_ns(now_ns) if self._is_paced(first) else 0)
         return min(waits, default=None)
 
@@ -161,12 +161,16 @@ class Actor:
         verb = self._declaration.verbs.get(envelope.verb)
         return verb is not None and verb.marked.role == "command"
 
+    def following(self, now_ns: int) -> Envelope | None:
+        """The next message of the mailbox, if it can be carried out now."""
+        return self._mailbox.first()
+
     def handle(self, clock: Callable[[], int]) -> list[Envelope]:
         """Carry out the next message, if there is one and it is its turn; answers that leave now."""
         now_ns = clock()
-        first = self._mailbox.first()
-        if first is not None and (why := self.fence(0)):
+        if self._mailbox.first() is not None and (why := self.fence(0)):
             return self.give_back(why)
+        first = self.following(now_ns)
         is_turn = first is not None and not (self._is_paced(first) and self._pace.wait_ns(now_ns))
         if self._keeping is None:
             if not is_turn:

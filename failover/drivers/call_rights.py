@@ -14,11 +14,11 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from failover.config import accounts, rights
-from failover.config.rights import Rights
+from failover.config import accounts
+from failover.config.rights import Rights, RightsFile
 from failover.core.rights import hours
 from failover.core.rights.rules import Decision, Subject, decide
-from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError, RightsError
+from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, RightsError
 
 RIGHT: Final = "call"
 
@@ -42,12 +42,9 @@ class CallRights:
         Args:
             directory: where ``rights.toml`` may lie.
         """
-        self._file = directory / rights.RIGHTS_FILE
+        self._file = RightsFile(directory)
         self._path = path
         self._looked_ns: int | None = None
-        self._read_at: tuple[int, int, int] | None = None
-        self._rights: Rights | None = None
-        self._mistake = ""
         self._answers: dict[tuple[int | None, str | None, str], tuple[str, int]] = {}
 
     def refusal(self, uid: int | None, robot: str | None, by: str) -> str:
@@ -59,8 +56,9 @@ class CallRights:
         now_ns = time.monotonic_ns()
         if self._looked_ns is None or now_ns - self._looked_ns > LOOK_NS:
             self._looked_ns = now_ns
-            self._refresh()
-        if self._read_at is None:
+            if self._file.look():
+                self._answers.clear()
+        if not self._file.exists:
             return ""
         key = (uid, robot, by if robot is not None else "")
         found = self._answers.get(key)
@@ -76,27 +74,27 @@ class CallRights:
         """The refusal or "", and whether the agent was asked."""
         if uid == 0:
             return "", False  # root on the robot itself could change the file
-        if self._rights is None:
-            return f"no right can be given: {self._mistake}", False
+        found = self._file.rights
+        if found is None:
+            return f"no right can be given: {self._file.mistake}", False
         try:
             if robot is not None and not by:
-                return self._decided(Subject(f"robot:{robot}")), False
-            if self._rights.config.source == "ldap":
+                return self._decided(found, Subject(f"robot:{robot}")), False
+            if found.config.source == "ldap":
                 return self._by_agent(by if robot is not None else accounts.name_of(uid or 0)), True
-            groups = self._rights.config.groups
+            groups = found.config.groups
             if robot is not None:
                 person = accounts.subject_named(by, groups)
-                return self._decided(replace(person, stands_above=False)), False  # root of another robot is not root here
+                return self._decided(found, replace(person, stands_above=False)), False  # root of another robot is not root here
             subject = accounts.subject_of(uid or 0, groups)
-            return self._decided(replace(subject, is_owner=uid == os.geteuid())), False
+            return self._decided(found, replace(subject, is_owner=uid == os.geteuid())), False
         except RightsError as error:
             return str(error), False
 
-    def _decided(self, subject: Subject) -> str:
-        assert self._rights is not None
+    def _decided(self, found: Rights, subject: Subject) -> str:
         now = datetime.now()
         minute = hours.minute_of(now.weekday(), now.hour, now.minute)
-        answer: Decision = decide(self._rights.rules, subject, RIGHT, self._path, minute)
+        answer: Decision = decide(found.rules, subject, RIGHT, self._path, minute)
         return "" if answer else answer.because
 
     def _by_agent(self, user: str) -> str:
@@ -109,23 +107,3 @@ class CallRights:
         except (NoAgentError, LostAgentError, AgentRefusedError) as error:
             return f"no right can be given to {user}: the agent asks the directory server, and {error}"
         return "" if told["allow"] else str(told["because"])
-
-    def _refresh(self) -> None:
-        """Read the file if it is another one than the last that was read."""
-        try:
-            found = os.stat(self._file)
-            at = (found.st_mtime_ns, found.st_ino, found.st_size)
-        except FileNotFoundError:
-            at = None
-        except OSError as error:
-            self._read_at, self._rights, self._mistake = (0, 0, 0), None, f"{self._file}: cannot be read: {error.strerror}"
-            self._answers.clear()
-            return
-        if at == self._read_at:
-            return
-        self._answers.clear()
-        self._read_at, self._rights, self._mistake = at, None, ""
-        try:
-            self._rights = rights.read(self._file.parent)
-        except (FailoverError, OSError) as error:
-            self._mistake = str(error)

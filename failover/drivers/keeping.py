@@ -14,7 +14,7 @@ from typing import Any, Final
 from failover.core.messaging.mailbox import Mailbox, unpacked
 from failover.drivers.declare import Declaration
 from failover.kept_state import component
-from failover.kept_state.api import PROCESS, Task, open_task
+from failover.kept_state.api import PROCESS, Resumed, Task, open_task
 from failover.kept_state.component import kept_of, schema_of
 from failover.kept_state.state import KeptState
 from failover.state import Field, Schema
@@ -54,6 +54,11 @@ class Keeping:
         self._waiting: deque[tuple[int, int]] = deque()
         """(commit, messages handled by then): their answers leave when the commit is safe."""
         self.instance: Any = component.instance_of(cls, self._task)
+
+    @property
+    def came_from(self) -> Resumed | None:
+        """Where the state came from; None where it begins here."""
+        return self._task.resumed
 
     def fileno(self) -> int:
         """Can be read when `safe` may have something new."""

@@ -19,10 +19,10 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
@@ -39,6 +39,20 @@ TIMEOUT_S: Final = 5.0
 """How long a call waits unless told otherwise; and the end of a ``with`` block for what was posted in it."""
 
 _NUMBERS: Final = itertools.count(1)
+
+T = TypeVar("T")
+
+
+class _Role(Struct, frozen=True):
+    """Of one verb, as ``_describe`` tells it."""
+
+    role: str = ""
+
+
+class _Described(Struct, frozen=True):
+    """What is read of an answer to ``_describe``."""
+
+    verbs: dict[str, _Role] = {}
 
 
 def proxy(name: str, *, queue: int = WINDOW, sender: str = "") -> Proxy:
@@ -180,6 +194,22 @@ class Proxy:
         hops = (Hop(self.sender, self.now_ns()),)
         return Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
 
+    def told(self, verb: str, kind: type[T], body: Any = None, /, *, timeout: float = TIMEOUT_S) -> T:
+        """`call` for a verb whose answer has a form of failover's own: the answer, checked. Fields of newer drivers are left out.
+
+        Raises:
+            DriverError: the answer has another form; names the verb and what is wrong.
+            CallRefusedError, NoAnswerError: as `call`.
+        """
+        found = self.call(verb, body, timeout=timeout)
+        try:
+            return msgspec.convert(found, kind)
+        except (msgspec.ValidationError, RecursionError) as error:
+            raise DriverError(
+                f"{self.path} answered {verb} in a form that failover does not know: {error}; "
+                "end that driver, or start it with the failover of this robot"
+            ) from error
+
     def _body(self, body: Any, fields: Mapping[str, Any]) -> Any:
         if fields and body is not None:
             raise EnvelopeError("write the body as a table, or each field by its name, and not both")
@@ -222,8 +252,9 @@ class Proxy:
 
         Raises:
             CallRefusedError: the driver has no such stream, or it failed at it.
+            DriverError: it does not say which streams it has.
         """
-        if self.call("_describe")["verbs"].get(name, {}).get("role") != "stream":
+        if self.told("_describe", _Described).verbs.get(name, _Role()).role != "stream":
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
         way = way_to(self.here, self._sending.address, self.place.robot)
         asked = Envelope(

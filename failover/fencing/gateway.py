@@ -24,6 +24,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from checkpoint.store.whole_file import write_whole
 from failover.errors import GatewayError, StaleEpochError
 
 MAGIC: Final = b"FOEPOCH1"
@@ -145,21 +146,9 @@ class Gateway:
 
     def _write(self, epoch: int) -> None:
         """The file is the old one or the new one, whenever the power goes."""
-        aside = self._path.with_name(self._path.name + ".new")
         begin = struct.pack("<8sQ", MAGIC, epoch)
         try:
-            descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-            try:
-                os.write(descriptor, begin + struct.pack("<I", zlib.crc32(begin)))
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-            os.rename(aside, self._path)
-            directory = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            try:
-                os.fsync(directory)
-            finally:
-                os.close(directory)
+            write_whole(self._path, begin + struct.pack("<I", zlib.crc32(begin)), lasts="name")
         except OSError as error:
             raise GatewayError(
                 f"cannot make epoch {epoch} durable in {self._path}: {error.strerror}; nothing is obeyed"

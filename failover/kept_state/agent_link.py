@@ -227,6 +227,11 @@ class Guarded:
         self._end.close()
 
 
+def has_guard() -> bool:
+    """Whether the environment names a guard that keeps the state of this program; `guarded` connects to it."""
+    return NAME.fullmatch(os.environ.get(VARIABLE, "")) is not None
+
+
 def guarded() -> Guarded | None:
     """Our end of the guard's socket; None where this program has no guard that keeps its state.
 

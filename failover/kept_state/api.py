@@ -43,6 +43,7 @@ FOLDER_VARIABLE: Final = "FAILOVER_STATE"
 """The folder in which states without an agent are kept; the working directory unless set."""
 
 RESTARTED: Final = "restarted"
+SWITCHED: Final = "switched"
 
 _UNCHANGING: Final = (int, float, complex, str, bytes, bool, type(None), tuple, frozenset)
 
@@ -55,7 +56,8 @@ class Resumed(Struct, frozen=True):
         epoch: number of the primacy under which this program runs now: the fencing token. 0 without an agent.
         generation: of this run; every resume opens a new one. Under an agent: of the checkpoint that it goes on from.
         why: "restarted" on the same robot, from its agent's store or the folder beside the program; "taken over" from another
-            that was lost; "handed over" by another, as an operator ordered: nothing was lost.
+            that was lost; "handed over" by another, as an operator ordered: nothing was lost; "switched" from another version of
+            a program (docs/programs.md).
         age_s: seconds since that commit.
         notes: what does not come back as it was: fields that were added or dropped, a damaged file that was passed over.
     """

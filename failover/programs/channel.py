@@ -19,6 +19,7 @@ import msgspec
 from msgspec import Struct
 
 from failover.errors import ProgramError
+from failover.kept_state.api import Resumed
 
 FRAME_SIZE_MAX: Final = 64 << 20
 """Bytes; a state and a message stay below it."""
@@ -75,9 +76,10 @@ class Hello(Struct, frozen=True, tag="hello"):
 
 
 class Begin(Struct, frozen=True, tag="begin"):
-    """Take this state, None: the first one, and be ready for messages."""
+    """Take this state, None: the first one, and be ready for messages. ``resumed``: where the state comes from."""
 
     state: State | None
+    resumed: Resumed | None = None
 
 
 class Ready(Struct, frozen=True, tag="ready"):

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,16 +27,20 @@ from typing import Any, Final
 import msgspec
 from msgspec import UNSET, Struct
 
-from failover.core.messaging.envelope import Envelope, answer, refusal
+from failover.core.messaging.envelope import Envelope, Fault, answer, refusal
 from failover.core.messaging.mailbox import Mailbox, Stream
 from failover.core.messaging.pacing import SECOND, Pace, merged
 from failover.core.programs import states, versions
-from failover.core.programs.states import Shelf
+from failover.core.programs.states import Shelf, Standing
 from failover.core.programs.trial import Command, Trial, Verdict
-from failover.drivers.actor import Actor, Whose
+from failover.drivers.actor import Actor, Publish, Whose
 from failover.drivers.declare import Declaration, Marked, Verb
+from failover.drivers.keeping import Keeping
 from failover.drivers.server import Hand, Near
 from failover.errors import FailoverError, ProgramError
+from failover.fencing.epoch import epoch
+from failover.kept_state.api import RESTARTED, SWITCHED, Resumed
+from failover.programs.carried import Carried
 from failover.programs.channel import Hello
 from failover.programs.running import Answered, Running, Source
 from failover.programs.sources import Place, before, source_of_directory, source_of_store, version_of
@@ -83,8 +88,20 @@ def declared(hello: Hello, beside: str) -> Described:
 class HostActor(Actor):
     """The mailbox of one program, and the versions that carry out its messages."""
 
-    def __init__(self, place: Place, first: Running, declaration: Declaration, who: str, kept: Kept | None) -> None:
-        super().__init__(object(), declaration, who)
+    def __init__(
+        self,
+        place: Place,
+        first: Running,
+        declaration: Declaration,
+        who: str,
+        kept: Kept | None,
+        keeping: Keeping | None = None,
+    ) -> None:
+        """
+        Args:
+            kept: what outlived the last host. keeping: of a host under an agent, its mailbox and `Carried`; else the store keeps.
+        """
+        super().__init__(object(), declaration, who, keeping)
         self._place = place
         self._running: Running | None = first
         self._old: Running | None = None
@@ -94,14 +111,30 @@ class HostActor(Actor):
         self._coming: Running | None = None
         self._is_coming = False
         self._said = ""
+        self._last = first.source
+        self._why_lost = ""
+        self._owed: tuple[Command, ...] = ()
+        """What the version that is started anew must carry out before anything else."""
+        self._is_starting_anew = False
+        """Until `_revived` has taken what came of it."""
+        self._started: tuple[Running | None] | None = None
+        """What came of it, from the thread."""
         self._restart_ns = 0
         self._gap_ms = 0.0
         self._state = first.state
         self._is_changed = True
         self._starter = ThreadPoolExecutor(1, "starts versions")
+        self._reviver = ThreadPoolExecutor(1, "starts versions anew")
+        self._loading: set[Running] = set()
+        self._is_closing = False
         self.wake: Callable[[], None] = lambda: None
         self.renew: Callable[[Declaration], None] = lambda _: None
-        if kept is not None:
+        self._switched: Kept | None = None
+        """State and version before the last switch."""
+        self._is_switch_unwritten = False
+        self._is_shelf_new = True
+        self._is_unsettled = False
+        if kept is not None and keeping is None:
             self._mailbox = Mailbox(kept.streams)
 
     # --- One message ------------------------------------------------------------------------------------------------------
@@ -112,19 +145,40 @@ class HostActor(Actor):
         answers = super().handle(clock)
         if self._is_changed:
             self._keep()
+        if self._is_unsettled:
+            self._settle()
         return answers
+
+    def _handle(self, now_ns: int, clock: Callable[[], int]) -> None:
+        """Under an agent, what a message did and that it was handled is one commit."""
+        super()._handle(now_ns, clock)
+        if self._keeping is not None and self._is_changed:
+            self._carry(self._keeping)
+
+    def following(self, now_ns: int) -> Envelope | None:
+        """While no version runs, only what is the host's own is carried out."""
+        if self._running is None:
+            self._mailbox.bring_forward(_is_hosts, now_ns)
+        first = super().following(now_ns)
+        return first if first is None or self._running is not None or _is_hosts(first) else None
+
+    def sample(self, publish: Publish, clock: Callable[[], int]) -> None:
+        """Streams pause while no version runs."""
+        if self._running is None:
+            self._samples_ns = dict.fromkeys(self._samples_ns, clock() + LOOK_NS)
+        super().sample(publish, clock)
 
     def wait_ns(self, now_ns: int) -> int | None:
         """Not longer than until something of the versions is due."""
         waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
-        if self._coming is not None:
+        if self._coming is not None or self._started is not None or self._is_changed:
             waits.append(0)
         if self._trial is not None:
             due = self._trial.wait_ns(now_ns)
             waits.append(LOOK_NS if due is None else due)
         if self._old is not None and self._trial is None:
             waits.append(max(self._old_until_ns - now_ns, 0))
-        if self._running is None:
+        if self._running is None and not self._is_starting_anew:
             waits.append(max(self._restart_ns - now_ns, 0))
         return min(waits, default=None)
 
@@ -136,19 +190,28 @@ class HostActor(Actor):
                 return answer(message, orders(message.body if isinstance(message.body, dict) else {}))
             except (FailoverError, ValueError) as error:  # ValueError: a name of a file with NUL
                 return refusal(message, "refused", str(error))
-        if message.verb.startswith("_"):
+        if _is_hosts(message):
             return super().carried_out(run)
         return self._forwarded(message)
 
-    def forbidden(self, envelope: Envelope, whose: Whose) -> str:
-        """Orders come from the host's own user or root on this robot, as the kernel says."""
+    def refused(self, envelope: Envelope, whose: Whose) -> Fault | None:
+        """Orders come from the host's own user or root on this robot, as the kernel says.
+
+        Messages for a version come while one runs: its sender's proxy sends what is refused as busy again. One past its deadline
+        is taken, and answered as such: its sender's next ones follow it.
+        """
+        is_late = envelope.deadline_ms is not None and envelope.deadline_ms <= 0
+        if self._running is None and not _is_hosts(envelope) and not is_late:
+            version = self._last.manifest.version
+            return Fault("busy", f"{self._place.name} {version} is being started anew: {self._why_lost}; send it again")
         if envelope.verb not in ("_switch", "_rollback"):
-            return ""
+            return None
         if not isinstance(whose, Near | Hand):
-            return f"give this order on the robot itself: {envelope.sender} is on another one"
+            return Fault("refused", f"give this order on the robot itself: {envelope.sender} is on another one")
         if whose.uid not in (0, os.geteuid()):
-            return f"this order is for uid {os.geteuid()}, whose host this is, and root: uid {whose.uid} is neither"
-        return ""
+            mine = os.geteuid()
+            return Fault("refused", f"this order is for uid {mine}, whose host this is, and root: uid {whose.uid} is neither")
+        return None
 
     def called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
         """A stream's value."""
@@ -157,7 +220,8 @@ class HostActor(Actor):
     def _forwarded(self, message: Envelope) -> Envelope:
         message = msgspec.structs.replace(message, hops=(), rest={})
         if self._running is None:
-            return refusal(message, "no_version", f"no version of {self._place.name} runs now: {self._said}")
+            text = f"no version of {self._place.name} runs now: {self._why_lost}; {message.verb} may have been carried out"
+            return refusal(message, "no_version", text)
         try:
             found = self._running.call(message)
             why = found.answer.error.sentence if found.answer.error is not UNSET and found.answer.error.kind == "failed" else ""
@@ -195,9 +259,30 @@ class HostActor(Actor):
                 self._said = str(error)
                 log.warning("%s", error)
 
+    def _carry(self, keeping: Keeping) -> None:
+        """State and versions into what the next commit takes to the standby."""
+        carried: Carried = keeping.instance
+        self._is_changed = False
+        self._number += 1
+        carried.newest = msgspec.msgpack.encode(Kept(self._number, self.version, self._state, {}, time.time()))
+        if self._is_shelf_new:
+            self._is_shelf_new = False
+            carried.switched = msgspec.msgpack.encode(self._switched) if self._switched is not None else b""
+            try:
+                carried.take_shelf(self._place.store.shelf(self._place.name), self._place)
+            except ProgramError as error:
+                self._say(f"a standby cannot take {self.version} over: {error}")
+
     def _write(self, *, is_lasting: bool = False) -> None:
+        if self._keeping is not None:
+            with self._keeping.message():
+                self._carry(self._keeping)
+            return
+        if self._switched is not None and self._is_switch_unwritten:
+            self._place.store.keep(before(self._declaration.path), self._switched)
+            self._is_switch_unwritten = False
         streams = {sender: _cut(one) for sender, one in self._mailbox.kept().items()}
-        kept = Kept(self._number + 1, self.version, self._state, streams)
+        kept = Kept(self._number + 1, self.version, self._state, streams, time.time())
         self._place.store.keep(self._declaration.path, kept, is_lasting=is_lasting)
         self._number += 1  # only now: while the disk is full, the newest whole one is never written over
 
@@ -212,7 +297,10 @@ class HostActor(Actor):
         now_ns = clock()
         if self._running is not None and not self._running.lives:
             self._ended()
-        if self._running is None and self._coming is None and now_ns >= self._restart_ns:
+        if self._started is not None:
+            (anew,), self._started = self._started, None
+            self._revived(anew)
+        if self._running is None and self._coming is None and not self._is_starting_anew and now_ns >= self._restart_ns:
             self._restart(now_ns)
         if self._coming is not None:
             coming, self._coming = self._coming, None
@@ -223,45 +311,54 @@ class HostActor(Actor):
             self._let_go()
 
     def _switch_to(self, new: Running, clock: Callable[[], int]) -> None:
-        """The new version takes over, or the old one goes on as if nothing had been."""
-        began_ns = clock()
+        """The new version takes over, or the old one goes on as if nothing had been.
+
+        No file is written between `pause` and the new version's `begin`, when no version can take a message. Before, the shelf
+        is: if the host ends from then on, the next one finds a trial, and goes back to the old version, whose state is the newest
+        kept. After, state, mailbox and the state at the switch are, before the first answer of the new version leaves.
+        """
         old, version = self._running, new.source.manifest.version
+        switched: Kept | None = None
+        try:
+            earlier = self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
+        except FailoverError as error:
+            new.end()
+            self._say(f"{version} could not take over: {error}")
+            return
+        began_ns = clock()
         try:
             if old is not None:
                 old.pause()
                 self._state = old.state
-            new.begin(self._state)
-            if old is not None:
-                switched = Kept(self._number, old.source.manifest.version, old.state, {})
-                self._place.store.keep(before(self._declaration.path), switched)
-            self._record(lambda shelf: states.succeed(shelf, states.warm(version_of(shelf, version)), "on trial"))
+                switched = Kept(self._number, old.source.manifest.version, old.state, {}, time.time())
+            new.begin(self._state, self._resumed(SWITCHED))
         except FailoverError as error:
+            if earlier is not None:
+                self._record_anyway(lambda shelf: states.undone(shelf, earlier))
             new.end()
             self._say(f"{version} could not take over: {error}")
             if old is not None:
                 self._resume(old, self._state)
             return
+        now_ns = clock()
         self._let_go()
         self._running, self._old, self._state = new, old, new.state
-        self._switched_with = old.state if old is not None else None
-        self._trial = Trial(new.source.manifest.health, clock())
-        self._gap_ms = (clock() - began_ns) / 1e6
+        self._switched, self._is_switch_unwritten = switched, switched is not None
+        self._trial = Trial(new.source.manifest.health, now_ns)
+        self._gap_ms = (now_ns - began_ns) / 1e6
         self._renew(new)
         notes = "".join(f"; {note}" for note in new.notes)
         self._say(f"{version} took over within {self._gap_ms:.1f} ms, on trial{notes}")
-        self._keep()
+        self._is_changed = True
 
-    def _resume(self, old: Running, state: Any) -> None:
-        """A version that was paused goes on with this state; started anew if its process does not."""
-        try:
-            old.begin(state)
-            self._running = old
-        except FailoverError as error:
-            self._say(f"{old.source.manifest.version} did not go on: {error}; it is started anew")
-            old.end()
-            self._state, self._running = state, None
-            self._last = old.source
-            self._restart(0)
+    def _resume(self, old: Running, state: Any) -> bool:
+        """A version that was paused goes on with this state; False: its process does not, and it is started anew."""
+        self._state = state
+        if self._began_with(old, state):
+            return True
+        old.end()
+        self._running, self._last, self._restart_ns = None, old.source, 0
+        return False
 
     def _judge(self, now_ns: int) -> None:
         assert self._trial is not None and self._running is not None
@@ -291,51 +388,49 @@ class HostActor(Actor):
         failed.end()
         version = failed.source.manifest.version
         if old is None:
-            self._running = None
+            self._running, self._last, self._why_lost = None, failed.source, why
             self._say(f"{version} failed, and no version was active before it: {why}")
-            self._last = failed.source
             return
         self._record_anyway(lambda shelf: states.fall_back(shelf, why))
         if failed.source.manifest.on_rollback == "newest" and self._began_with(old, newest):
-            told = f"with the state of {version}"
+            told = f"goes on with the state of {version}"
+        elif self._resume(old, (self._switched.state if self._switched is not None else None)):
+            told = f"goes on with its state at the switch, and {self._replayed(trial.replay)} commands since then once more"
         else:
-            self._resume(old, self._switched_with)
-            told = f"with its state at the switch, and {self._replayed(trial)} commands since then once more"
+            self._owed = trial.replay
+            told = f"is started anew with its state at the switch, and gets {len(self._owed)} commands since then once more"
         if self._running is not None:
             self._state = self._running.state
         self._renew(old)
-        self._say(f"{version} is rolled back: {why}; {old.source.manifest.version} goes on {told}")
-        self._keep()
+        self._say(f"{version} is rolled back: {why}; {old.source.manifest.version} {told}")
+        self._is_changed = True
 
     def _began_with(self, old: Running, state: Any) -> bool:
         try:
-            old.begin(state)
-        except FailoverError:
+            old.begin(state, self._resumed(SWITCHED))
+        except FailoverError as error:
+            self._why_lost = str(error)
             return False
         self._running = old
         return True
 
-    def _replayed(self, trial: Trial) -> int:
+    def _replayed(self, commands: Sequence[Command]) -> int:
         """How many commands were carried out again; their answers have left before."""
-        count = 0
-        self._state = self._switched_with
-        for command in trial.replay:
-            if self._running is None:
-                self._restart(0)
-            if self._running is None:
-                break
+        assert self._running is not None
+        self._state = self._switched.state if self._switched is not None else None
+        for count, command in enumerate(commands):
             try:
-                found = self._running.call(Envelope(verb=command.verb, body=command.body))
-                self._running.state = self._state = found.state
-                count += 1
+                self._running.state = self._state = _again(self._running, command)
             except FailoverError as error:
                 self._lost(f"at {command.verb}, which is left out: {error}")
-        return count
+                self._owed = tuple(commands[count + 1 :])
+                return count
+        return len(commands)
 
     def _let_go(self) -> None:
         old, self._old = self._old, None
         if old is not None:
-            old.end()
+            self._starter.submit(old.end)  # it may take its time, and no version waits for it
 
     # --- An end that no person ordered ------------------------------------------------------------------------------------
 
@@ -348,24 +443,81 @@ class HostActor(Actor):
     def _lost(self, why: str) -> None:
         """The active version is gone, not on trial: it is started anew with its last state."""
         lost, self._running = self._running, None
+        self._why_lost = why
         if lost is not None:
             lost.end()
             self._last = lost.source
             self._say(f"{lost.source.manifest.version}: {why}; it is started anew")
 
     def _restart(self, now_ns: int) -> None:
+        """Start the last version anew, in a thread: it may import for a minute, and the host answers meanwhile."""
         self._restart_ns = now_ns + RESTART_NS
+        self._is_starting_anew = True
+        self._reviver.submit(self._start_anew, self._last, self._state, self._owed)
+
+    def _start_anew(self, source: Source, state: Any, owed: Sequence[Command]) -> None:
+        """In the thread."""
+        running: Running | None = None
         try:
-            running = Running(self._last, lambda: self.wake())
-            try:
-                running.begin(self._state)
-            except FailoverError:
-                running.end()
-                raise
+            running = self._begun(source, state)
+            for command in owed:
+                try:
+                    running.state = _again(running, command)
+                except FailoverError as error:
+                    self._note(f"{command.verb} is left out: {error}")
+                    left, running = running, None
+                    left.end()
+                    running = self._begun(source, left.state)
         except FailoverError as error:
+            self._why_lost = str(error)
             self._say(f"it cannot be started anew: {error}")
+        except Exception as error:  # the sentence must not be lost in a thread
+            log.exception("a version could not be started anew")
+            self._say(f"it cannot be started anew: {type(error).__name__}: {error}")
+        finally:
+            self._started = (running,)
+            self.wake()
+
+    def _begun(self, source: Source, state: Any) -> Running:
+        """A new process of a version, with this state.
+
+        Raises:
+            ProgramError: it cannot be loaded, or cannot read the state.
+        """
+        running = self._loaded(source)
+        try:
+            running.begin(state, self._resumed(RESTARTED))
+        except FailoverError:
+            running.end()
+            raise
+        return running
+
+    def _loaded(self, source: Source) -> Running:
+        """A new process of a version, warm; `close` ends it before that."""
+        running = Running(source, lambda: self.wake())
+        self._loading.add(running)
+        try:
+            if self._is_closing:
+                running.end()
+            return running.load()
+        finally:
+            self._loading.discard(running)
+
+    def _revived(self, anew: Running | None) -> None:
+        """The version that was started anew takes messages, unless it could not, or another one does by now."""
+        self._is_starting_anew = False
+        if anew is None:
             return
-        self._running = running
+        if self._running is not None:
+            anew.end()
+            return
+        self._running, self._state, self._owed = anew, anew.state, ()
+        self._say(f"{anew.source.manifest.version} goes on: it was started anew as pid {anew.pid}")
+        self._is_changed = True
+
+    def _resumed(self, why: str) -> Resumed:
+        """Where a state comes from that a version gets from this host."""
+        return Resumed(self._who.partition("/")[0], epoch(), self._number, why, 0.0)
 
     # --- Orders -----------------------------------------------------------------------------------------------------------
 
@@ -373,26 +525,32 @@ class HostActor(Actor):
         """What there is, and what was said last."""
         shelf = self._place.store.find(self._place.name) if not self._place.directory else None
         running = self._running
-        said = {
-            "name": self._place.name,
-            "path": self._declaration.path,
-            "active": self.version,
-            "pid": running.pid if running is not None else 0,
-            "on_trial": self._trial is not None,
-            "is_coming": self._is_coming,
-            "said": self._said,
-            "gap_ms": round(self._gap_ms, 3),
-            "enforced": list(running.hello.enforced) if running is not None else [],
-            "not_enforced": list(running.hello.not_enforced) if running is not None else [],
-            "before": self._old.source.manifest.version if self._old is not None else "",
-        }
-        return said | {"versions": msgspec.to_builtins(shelf.versions) if shelf is not None else []}
+        standing = Standing(
+            name=self._place.name,
+            path=self._declaration.path,
+            active=self.version,
+            pid=running.pid if running is not None else 0,
+            on_trial=self._trial is not None,
+            is_coming=self._is_coming,
+            said=self._said,
+            gap_ms=round(self._gap_ms, 3),
+            enforced=running.hello.enforced if running is not None else (),
+            not_enforced=running.hello.not_enforced if running is not None else (),
+            before=self._old.source.manifest.version if self._old is not None else "",
+            versions=shelf.versions if shelf is not None else (),
+        )
+        return msgspec.to_builtins(standing)
 
     def _switch(self, body: Mapping[str, Any]) -> Any:
         """Begin to start a version; what comes of it, ``_versions`` tells."""
         version, directory = body.get("version"), body.get("directory")
         if self._is_coming or self._trial is not None:
             raise ProgramError(f"{self._place.name} is in the middle of a switch; wait until its trial is over, or roll it back")
+        if self._owed:
+            version, count = self._last.manifest.version, len(self._owed)
+            raise ProgramError(
+                f"{version} is being started anew, and gets {count} commands once more; order the switch after that"
+            )
         if isinstance(directory, str) and self._place.directory is not None:
             source = source_of_directory(Path(directory))
             if source.manifest.name != self._place.name or source.manifest.path != self._declaration.path:
@@ -420,7 +578,7 @@ class HostActor(Actor):
 
         def started() -> None:
             try:
-                self._coming = Running(source(), lambda: self.wake())
+                self._coming = self._loaded(source())
             except FailoverError as error:
                 self._say(f"it stays as it was: {error}")
             except Exception as error:  # the sentence must not be lost in a thread
@@ -435,7 +593,7 @@ class HostActor(Actor):
     def _rollback(self, body: Mapping[str, Any]) -> Any:
         """Back to the version before, whose process still waits."""
         old, new = self._old, self._running
-        if old is None or new is None:
+        if old is None:
             raise ProgramError(
                 f"{self._place.name} cannot be rolled back: the version before is kept for {ROLLBACK_S} s after a switch; "
                 "send the older program as a bundle with a higher version"
@@ -443,30 +601,33 @@ class HostActor(Actor):
         if self._trial is not None:
             self._fall_back("a person took it back")
             return {"active": self.version}
-        try:
-            new.pause()
-        except FailoverError as error:
-            self._note(f"{self.version} did not let its device go: {error}")
-        if not self._began_with(old, new.state):
+        source, newest = (new.source, new.state) if new is not None else (self._last, self._state)
+        version = source.manifest.version
+        if new is not None:
+            try:
+                new.pause()
+            except FailoverError as error:
+                self._note(f"{version} did not let its device go: {error}")
+            newest = new.state
+        if not self._began_with(old, newest):
             if not body.get("old_state"):
-                self._resume(new, new.state)
+                if new is not None:
+                    self._resume(new, newest)
                 raise ProgramError(
-                    f"{old.source.manifest.version} cannot read the state of {self.version}; with --old-state it goes "
+                    f"{old.source.manifest.version} cannot read the state of {version}; with --old-state it goes "
                     "on with its own state at the switch, and what came since then is lost"
                 )
-            self._resume(old, self._switched_with)
+            self._resume(old, (self._switched.state if self._switched is not None else None))
         self._record_anyway(lambda shelf: states.fall_back(shelf, "a person took it back"))
-        new.end()
+        if new is not None:
+            new.end()
         self._old, self._state = None, old.state
         self._renew(old)
-        self._say(f"{new.source.manifest.version} is rolled back by a person; {self.version} goes on")
-        self._keep()
+        self._say(f"{version} is rolled back by a person; {old.source.manifest.version} goes on")
+        self._is_changed = True
         return {"active": self.version}
 
     # --- What others see --------------------------------------------------------------------------------------------------
-
-    _last: Source
-    _switched_with: Any = None
 
     def _renew(self, running: Running) -> None:
         """Verbs, aliases and pace are those of this version."""
@@ -480,22 +641,28 @@ class HostActor(Actor):
         except FailoverError as error:
             self._note(f"its names were not told: {error}")
 
-    def _record(self, change: Callable[[Shelf], Shelf]) -> None:
-        """Change the shelf, for programs that have one.
+    def _record(self, change: Callable[[Shelf], Shelf]) -> Shelf | None:
+        """Change the shelf, for programs that have one; the shelf before that.
 
         Raises:
             ProgramError: it cannot be written.
         """
-        if self._place.directory is None and not self._place.beside:
-            store = self._place.store
-            try:
-                with store.locked():
-                    store.put(change(store.shelf(self._place.name)), is_lasting=False)
-            except OSError as error:
-                raise ProgramError(
-                    f"cannot write the versions of {self._place.name} in {store.place}: {error.strerror}"
-                ) from error
-            self._starter.submit(store.settle, self._place.name)  # the disk is not waited for between two messages
+        if self._place.directory is not None or self._place.beside:
+            return None
+        store = self._place.store
+        try:
+            with store.locked():
+                earlier = store.shelf(self._place.name)
+                store.put(change(earlier), is_lasting=False)
+        except OSError as error:
+            raise ProgramError(f"cannot write the versions of {self._place.name} in {store.place}: {error.strerror}") from error
+        self._is_shelf_new = self._is_changed = self._is_unsettled = True
+        return earlier
+
+    def _settle(self) -> None:
+        """Have the disk keep the shelf, without a wait: not between two messages, nor before an answer."""
+        self._is_unsettled = False
+        self._starter.submit(self._place.store.settle, self._place.name)
 
     def _record_anyway(self, change: Callable[[Shelf], Shelf]) -> None:
         """The same where what was done is done; a disk that is full is told."""
@@ -514,6 +681,9 @@ class HostActor(Actor):
 
     def close(self) -> None:
         """End all processes; the state stays."""
+        self._is_closing = True
+        for loading in tuple(self._loading):
+            loading.end()
         if self._running is not None and self._running.lives:
             try:
                 self._running.pause()
@@ -524,10 +694,26 @@ class HostActor(Actor):
             self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
-        self._starter.shutdown(wait=True)  # not before: a version dies with the thread that started it
-        for one in (self._running, self._old, self._coming):
+        for thread in (self._starter, self._reviver):
+            thread.shutdown(wait=True)  # not before: a version dies with the thread that started it
+        anew = self._started[0] if self._started is not None else None
+        for one in (self._running, self._old, self._coming, anew):
             if one is not None:
                 one.end()
+
+
+def _is_hosts(message: Envelope) -> bool:
+    """Whether the host itself answers it."""
+    return message.verb.startswith("_")
+
+
+def _again(running: Running, command: Command) -> Any:
+    """The state after a command that is carried out once more.
+
+    Raises:
+        ProgramError: its process ended, hangs, or said what is no answer.
+    """
+    return running.call(Envelope(verb=command.verb, body=command.body)).state
 
 
 def _cut(one: Stream) -> Stream:

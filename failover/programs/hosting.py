@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 from typing import Any
 
 import msgspec
@@ -13,11 +15,15 @@ from failover.drivers.actor import Actor
 from failover.drivers.declare import DRIVER, Declaration
 from failover.drivers.here import Here, refuse_second
 from failover.drivers.here import here as drivers_here
+from failover.drivers.keeping import Keeping
 from failover.drivers.server import Serving
 from failover.errors import FailoverError
+from failover.kept_state.api import RESTARTED, Resumed
+from failover.programs.carried import Carried, kept_in, open_carried, unpack
 from failover.programs.host import HostActor, declared
 from failover.programs.running import Running
 from failover.programs.sources import Place, before, end_trial, source_of_directory, source_of_store, version_of
+from failover.programs.store import Kept
 
 
 class Hosting(Serving):
@@ -33,39 +39,64 @@ class Hosting(Serving):
             DriverError: another process is the driver of its path.
         """
         place.store.open()
-        if place.directory is None and not place.beside:
-            shelf = place.store.shelf(place.name)
-            refuse_second(here or drivers_here(), shelf.path)  # before anything of a living host is changed
-            end_trial(place)
-        source = source_of_directory(place.directory) if place.directory is not None else source_of_store(place, version)
-        self._source = source
-        first = Running(source, lambda: self.wake())
-        try:
+        with contextlib.ExitStack() as stack:
+            self._carrying = open_carried(place)
+            if self._carrying is not None:
+                stack.callback(self._carrying.close)
+                if self._carrying.came_from is not None and self._carrying.instance.shelf:
+                    unpack(self._carrying.instance, place)
+                    version = ""  # the one that was active where it ran last
+            if place.directory is None and not place.beside:
+                shelf = place.store.shelf(place.name)
+                refuse_second(here or drivers_here(), shelf.path)  # before anything of a living host is changed
+                end_trial(place)
+            source = source_of_directory(place.directory) if place.directory is not None else source_of_store(place, version)
+            self._source = source
+            first = Running(source, lambda: self.wake())
+            stack.callback(first.end)
+            first.load()
             path = f"{first.hello.path}@{source.manifest.version}" if place.beside else ""
             declaration = declared(first.hello, path)
             self._host = place, first
             super().__init__(type(place.name, (), {DRIVER: declaration}), here)
-        except BaseException:
-            first.end()
-            raise
+            stack.pop_all()
+
+    def _begin(self, cls: type, declaration: Declaration, stack: contextlib.ExitStack) -> Keeping | None:
+        """What the agent keeps, if there is one."""
+        if self._carrying is not None:
+            stack.callback(self._carrying.close)
+        return self._carrying
 
     def _made(self, cls: type, declaration: Declaration, who: str) -> tuple[Any, Actor]:
         place, first = self._host
-        kept = place.store.kept(declaration.path)
+        kept, switched = self._kept(place, declaration.path)
         try:
-            first.begin(kept.state if kept is not None else None)
+            first.begin(kept.state if kept is not None else None, self._resumed(kept))
         except FailoverError:
-            switched = place.store.kept(before(declaration.path))
             if switched is None or switched.version != first.source.manifest.version:
                 raise
-            first.begin(switched.state)
+            first.begin(switched.state, self._resumed(switched))
             place.store.log(place.name, "it goes on with its state at the switch; what came after is lost")
-        actor = HostActor(place, first, declaration, who, kept)
+        actor = HostActor(place, first, declaration, who, kept, self._carrying)
         actor.wake, actor.renew = self.wake, self._renew
         self.actor = actor
-        actor._last = self._source
         self._began(place, first)
         return None, actor
+
+    def _kept(self, place: Place, path: str) -> tuple[Kept | None, Kept | None]:
+        """State and mailbox as they were last, and those at the last switch."""
+        if self._carrying is None:
+            return place.store.kept(path), place.store.kept(before(path))
+        carried: Carried = self._carrying.instance
+        return kept_in(carried.newest), kept_in(carried.switched)
+
+    def _resumed(self, kept: Kept | None) -> Resumed:
+        """Where the first version's state comes from."""
+        if self._carrying is not None and self._carrying.came_from is not None:
+            return self._carrying.came_from
+        if kept is None:
+            return Resumed(self.here.robot, 0, 0, RESTARTED, 0.0)
+        return Resumed(self.here.robot, 0, kept.number, RESTARTED, max(time.time() - kept.at_s, 0.0))
 
     def _began(self, place: Place, first: Running) -> None:
         version = first.source.manifest.version

@@ -10,15 +10,16 @@ import base64
 import binascii
 import time
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import msgspec
+from msgspec import Struct
 
 from failover.core.programs import bundle
 from failover.core.programs.archive import BUNDLE_SIZE_MAX
 from failover.drivers.declare import command, driver
 from failover.drivers.proxy import Proxy
-from failover.errors import ProgramError
+from failover.errors import DriverError, ProgramError
 from failover.programs.store import Store
 
 PART: Final = 512 << 10
@@ -35,6 +36,15 @@ Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 def path_of(robot: str) -> str:
     """Under which name a robot takes bundles."""
     return f"{robot}/programs"
+
+
+class Staged(Struct, frozen=True):
+    """What a robot tells of a bundle that it has taken."""
+
+    name: str
+    version: str
+    digest: str
+    owner: str
 
 
 def receiver(store: Store, team: Path, robot: str) -> type:
@@ -75,28 +85,37 @@ def receiver(store: Store, team: Path, robot: str) -> type:
             return len(self._content)
 
         @command
-        def finish(self, digest: Digest) -> dict[str, Any]:
+        def finish(self, digest: Digest) -> Staged:
             """Check it, and keep it."""
             content, self._digest, self._content = bytes(self._content), "", bytearray()
             if len(content) != self._size or bundle.digest_of(content) != digest:
                 raise ProgramError("the bundle has not come whole; send it again")
             found = store.take(content, team)
             said = found.program.manifest
-            return {"name": said.name, "version": said.version, "digest": found.program.digest, "owner": found.owner}
+            return Staged(said.name, said.version, found.program.digest, found.owner)
 
     return Receiver
 
 
-def send(proxy: Proxy, content: bytes) -> dict[str, Any]:
+def send(proxy: Proxy, content: bytes) -> Staged:
     """Bring a bundle to a robot.
 
     Raises:
         CallRefusedError: that robot does not take it; says why.
+        DriverError: what answers there takes no bundles.
         NoAnswerError: it does not answer.
     """
     digest = bundle.digest_of(content)
-    at = proxy.call("offer", digest=digest, size=len(content))
+    at = proxy.told("offer", int, {"digest": digest, "size": len(content)})
+    _check_at(proxy, at, max(0, min(at, len(content))))
     while at < len(content):
-        at = proxy.call("part", digest=digest, at=at, content=base64.b64encode(content[at : at + PART]).decode())
-    found: dict[str, Any] = proxy.call("finish", digest=digest, timeout=FINISH_S)
-    return found
+        part = content[at : at + PART]
+        expected = at + len(part)
+        at = proxy.told("part", int, {"digest": digest, "at": at, "content": base64.b64encode(part).decode()})
+        _check_at(proxy, at, expected)
+    return proxy.told("finish", Staged, {"digest": digest}, timeout=FINISH_S)
+
+
+def _check_at(proxy: Proxy, at: int, expected: int) -> None:
+    if at != expected:
+        raise DriverError(f"{proxy.path} has {at} bytes of the bundle, and {expected} were sent; send the bundle again")

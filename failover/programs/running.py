@@ -19,6 +19,7 @@ from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope
 from failover.core.programs.manifest import Manifest
 from failover.errors import ProgramError
+from failover.kept_state.api import Resumed
 from failover.programs.channel import (
     Begin,
     Call,
@@ -71,23 +72,32 @@ class Running:
     """A version's process, warm or with a driver. Used by one thread at a time, but for `end`."""
 
     def __init__(self, source: Source, ended: Callable[[], None] = lambda: None) -> None:
-        """Start it, and wait until its imports are done.
+        """Start its process; `load` comes next.
 
         Args:
             ended: called from another thread when the process has ended.
 
         Raises:
-            ProgramError: it cannot be loaded or confined; says why.
+            ProgramError: the system gives no process.
         """
         self.source = source
         self.state: State | None = None
         self.notes: tuple[str, ...] = ()
         self._is_ended = False
+        self._ended = ended
         try:
             self._start()
         except OSError as error:
             what = f"{source.manifest.name} {source.manifest.version}"
             raise ProgramError(f"{what} cannot be started: the system gives no process: {error.strerror}") from error
+
+    def load(self) -> Running:
+        """Wait until its imports are done.
+
+        Raises:
+            ProgramError: it cannot be loaded or confined, or `end` was called meanwhile; says why.
+        """
+        source = self.source
         try:
             file, name = source.manifest.entry_file, source.manifest.entry_class
             self._channel.send(Start(str(source.directory), file, name, source.confinement), LOAD_S)
@@ -100,7 +110,8 @@ class Running:
         except ProgramError as error:
             self.end()
             raise ProgramError(f"{source.manifest.name} {source.manifest.version} cannot be started: {error}") from error
-        threading.Thread(target=self._wait, args=(ended,), daemon=True, name=f"end of {self._process.pid}").start()
+        threading.Thread(target=self._wait, daemon=True, name=f"end of {self._process.pid}").start()
+        return self
 
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
@@ -131,9 +142,9 @@ class Running:
         """Whether its process has not ended."""
         return self._process.poll() is None
 
-    def _wait(self, ended: Callable[[], None]) -> None:
+    def _wait(self) -> None:
         self._process.wait()
-        ended()
+        self._ended()
 
     def _next(self, timeout_s: float) -> Message:
         found = self._channel.receive(timeout_s)
@@ -141,13 +152,16 @@ class Running:
             raise ProgramError(found.sentence)
         return found
 
-    def begin(self, state: State | None) -> None:
+    def begin(self, state: State | None, resumed: Resumed) -> None:
         """Make its driver with this state; None: with its first one.
+
+        Args:
+            resumed: where the state comes from, for the driver's ``on_resume``.
 
         Raises:
             ProgramError: it cannot; says why.
         """
-        self._channel.send(Begin(state), BEGIN_S)
+        self._channel.send(Begin(state, resumed), BEGIN_S)
         self._ready()
 
     def pause(self) -> None:

@@ -25,12 +25,13 @@ import msgspec
 from blake3 import blake3
 from msgspec import Struct
 
+from checkpoint.store.whole_file import write_whole
 from failover.core.messaging.mailbox import Stream
 from failover.core.programs import manifest, states, versions
 from failover.core.programs.archive import Member
 from failover.core.programs.bundle import Program
 from failover.core.programs.states import Shelf, State, Version
-from failover.errors import ProgramError
+from failover.errors import BundleRefusedError, ProgramError
 from failover.programs import packing
 from failover.programs.admission import Admitted, admit
 from failover.programs.channel import State as KeptState
@@ -47,12 +48,13 @@ _CHECK_SIZE: Final = 32
 
 
 class Kept(Struct, frozen=True):
-    """What outlives a host. ``number``: of this writing."""
+    """What outlives a host. ``number``: of this writing; ``at_s``: when, in seconds since 1970."""
 
     number: int
     version: str
     state: KeptState | None
     streams: dict[str, Stream]
+    at_s: float = 0.0
 
 
 def default_place() -> Path:
@@ -137,7 +139,7 @@ class Store:
             aside.mkdir(mode=0o755)
             for one in program.files:
                 _write_new(aside, one)
-            _replace(folder.with_suffix(".bundle"), content)
+            write_whole(self._bundle(program.digest), content)
             if not _is_whole(folder, program):
                 shutil.rmtree(folder, ignore_errors=True)
                 aside.rename(folder)
@@ -146,9 +148,38 @@ class Store:
         finally:
             shutil.rmtree(aside, ignore_errors=True)
 
+    def bring(self, digest: str, content: bytes, team: Path) -> None:
+        """Check a bundle that came with a program's state, and unpack it; the shelf is not changed.
+
+        Raises:
+            BundleRefusedError: it may not run here.
+            ProgramError: it cannot be unpacked.
+        """
+        found = admit(content, team)
+        if found.program.digest != digest:
+            other = found.program.digest
+            raise BundleRefusedError(f"the bundle {digest[:12]} that came with the state has the content of {other[:12]}")
+        with self.locked():
+            self._unpack(found.program, content)
+
     def tree(self, digest: str) -> Path:
         """Where a bundle's files are."""
         return self.place / "bundles" / digest
+
+    def has(self, digest: str) -> bool:
+        """Whether a bundle is here; `admitted` says whether it may run."""
+        return bool(digest) and self._bundle(digest).exists()
+
+    def bundle(self, digest: str) -> bytes:
+        """A bundle's bytes.
+
+        Raises:
+            ProgramError: it cannot be read.
+        """
+        return packing.read_file(self._bundle(digest))
+
+    def _bundle(self, digest: str) -> Path:
+        return self.tree(digest).with_suffix(".bundle")
 
     def admitted(self, digest: str, team: Path) -> Admitted:
         """A staged bundle, once everything about it was checked anew, and its files are those of the bundle.
@@ -157,7 +188,7 @@ class Store:
             BundleRefusedError: it may not run any more.
             ProgramError: its files were changed.
         """
-        content = packing.read_file(self.tree(digest).with_suffix(".bundle"))
+        content = self.bundle(digest)
         found = admit(content, team)
         if found.program.digest != digest:
             raise ProgramError(f"the bundle {digest[:12]} was replaced in {self.place}; send it again")
@@ -204,9 +235,8 @@ class Store:
         """Keep it; to be called in `locked`. ``is_lasting``: it outlives a power cut; else only after `settle`."""
         if not shelf.uid:
             shelf = msgspec.structs.replace(shelf, uid=self._free_uid(shelf.name))
-        _replace(
-            self.place / f"{shelf.name}.json", msgspec.json.format(msgspec.json.encode(shelf)) + b"\n", is_lasting=is_lasting
-        )
+        content = msgspec.json.format(msgspec.json.encode(shelf)) + b"\n"
+        write_whole(self.place / f"{shelf.name}.json", content, lasts="content" if is_lasting else "process")
 
     def settle(self, name: str) -> None:
         """Have the disk keep what was put."""
@@ -240,7 +270,7 @@ class Store:
             with path.open("a") as file:
                 file.write(line)
             if path.stat().st_size > LOG_SIZE_MAX:
-                _replace(path, path.read_bytes()[-LOG_SIZE_MAX // 2 :].partition(b"\n")[2])
+                write_whole(path, path.read_bytes()[-LOG_SIZE_MAX // 2 :].partition(b"\n")[2])
 
     def lines(self, name: str) -> list[dict[str, object]]:
         """The log, oldest first.
@@ -266,7 +296,7 @@ class Store:
         body = msgspec.msgpack.encode(kept)
         file = self._kept(path, kept.number % 2)
         try:
-            _replace(file, blake3(body).digest(_CHECK_SIZE) + body, is_lasting=is_lasting)
+            write_whole(file, blake3(body).digest(_CHECK_SIZE) + body, lasts="content" if is_lasting else "process")
         except OSError as error:
             raise ProgramError(f"cannot keep the state of {path} in {file}: {error.strerror}") from error
 
@@ -302,13 +332,3 @@ def _is_as_unpacked(folder: Path, one: Member) -> bool:
         return not path.is_symlink() and packing.read_file(path) == bytes(one.content)
     except ProgramError:
         return False
-
-
-def _replace(path: Path, content: bytes, *, is_lasting: bool = True) -> None:
-    aside = path.with_name(path.name + ".aside")
-    with open(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600), "wb") as file:
-        file.write(content)
-        file.flush()
-        if is_lasting:
-            os.fdatasync(file.fileno())
-    aside.replace(path)

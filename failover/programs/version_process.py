@@ -12,11 +12,13 @@ import socket
 import sys
 from typing import Any
 
+import msgspec
+
 from failover.core.messaging import envelope as envelopes
 from failover.drivers.actor import Actor
 from failover.drivers.declare import Declaration, declaration_of
 from failover.errors import FailoverError, ProgramError
-from failover.kept_state.component import kept_of, schema_of
+from failover.kept_state.component import kept_of, on_resume_of, schema_of
 from failover.programs import confine
 from failover.programs.channel import (
     Begin,
@@ -61,13 +63,18 @@ class Loaded:
         return Hello(said.path, said.aliases, said.rate_hz, verbs, said.schemas(), dict(said.labels), *words)
 
     def begin(self, order: Begin) -> Ready:
-        """Make the driver. Raises whatever the program raises, and FitError: it cannot read the state."""
+        """Make the driver; with a state that is kept, call its ``on_resume``.
+
+        Raises whatever the program raises, and FitError: it cannot read the state.
+        """
         values: dict[str, Any] = {}
+        resumed = order.resumed
         notes: tuple[str, ...] = ()
         if self._schema is not None and order.state is not None:
             regions = tuple(Region(name, memoryview(content)) for name, content in order.state.regions)
             decoded = self._schema.decode(Encoded(order.state.data, regions))
             values, notes = decoded.value, decoded.notes
+            resumed = msgspec.structs.replace(resumed, notes=(*resumed.notes, *notes)) if resumed is not None else None
         elif self._schema is not None:
             values = {name: one.first(None) for name, one in self._kept.items()}
         instance: Any = object.__new__(self._class)
@@ -77,6 +84,8 @@ class Loaded:
             vars(instance).update(values)
         self._instance, self._last = instance, None
         self._actor = Actor(instance, self.declaration, "program")
+        if order.state is not None and (called := on_resume_of(instance, resumed)) is not None:
+            called()
         return Ready(self._state(), notes)
 
     def call(self, order: Call) -> Done:

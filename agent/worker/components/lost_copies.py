@@ -6,8 +6,8 @@ import glob
 from pathlib import Path
 from typing import Final
 
-from agent.main_loop.vote_record import write_durably
 from checkpoint.store.index import folder_name
+from checkpoint.store.whole_file import write_whole
 
 KEPT: Final = 3
 """Of each component, the ones of the newest epochs: each is as large as the program's memory."""
@@ -22,7 +22,7 @@ def keep(directory: Path, component: str, epoch: int, content: bytes) -> Path:
     directory.mkdir(mode=0o700, exist_ok=True)
     stem = f"{folder_name(component)}-epoch"
     path = directory / f"{stem}{epoch}.snapshot"
-    write_durably(path, content)
+    write_whole(path, content)
     known = directory.glob(f"{glob.escape(stem)}*.snapshot")
     for older in sorted(known, key=lambda one: _epoch(one, stem))[:-KEPT]:
         older.unlink(missing_ok=True)

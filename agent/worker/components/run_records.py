@@ -13,6 +13,7 @@ import msgspec
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NO_TERMS, NOTHING_CARRIED, Carry, Terms
 from checkpoint.store.index import folder_name
+from checkpoint.store.whole_file import write_whole
 
 
 class Running(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -48,10 +49,7 @@ class Records:
         Raises:
             OSError: it cannot be written; the program must not run.
         """
-        path = self._path(component)
-        aside = path.with_suffix(".new")
-        aside.write_bytes(msgspec.json.encode(Running(component, epoch, terms)))
-        aside.replace(path)
+        write_whole(self._path(component), msgspec.json.encode(Running(component, epoch, terms)), lasts="process")
 
     def epoch(self, component: str) -> int:
         """The epoch under which it runs; 0 if no note of it exists."""

@@ -7,7 +7,6 @@ changed. One with a mistake gives no right to any user but root and the agent's 
 from __future__ import annotations
 
 import asyncio
-import os
 import time
 from datetime import datetime
 from pathlib import Path
@@ -19,11 +18,11 @@ from agent.directory.client import DirectoryProcess
 from agent.directory.messages import Question, spelled_age
 from agent.errors import RefusedError
 from agent.system.permissions import may
-from failover.config import accounts, rights
-from failover.config.rights import Rights
+from failover.config import accounts
+from failover.config.rights import Rights, RightsFile
 from failover.core.rights import hours
 from failover.core.rights.rules import NEVER_BY_DEFAULT, Decision, Subject, decide
-from failover.errors import FailoverError, RightsError
+from failover.errors import RightsError
 
 RIGHT_OF: Final = {
     "ping": "see",
@@ -52,11 +51,8 @@ class RightsGate:
         Args:
             starter: of services of their own, for the process that asks the directory.
         """
-        self._path = team_directory / rights.RIGHTS_FILE
+        self._file = RightsFile(team_directory)
         self._places = team_directory, state_directory, starter
-        self._read_at: tuple[int, int, int] | None = None
-        self._rights: Rights | None = None
-        self._mistake = ""
         self._directory: DirectoryProcess | None = None
         self._answered_at: float | None = None
         self._away = ""
@@ -64,8 +60,8 @@ class RightsGate:
     @property
     def has_rules(self) -> bool:
         """Whether there is a file of rules, mistaken or not."""
-        self._refresh()
-        return self._read_at is not None
+        self._look()
+        return self._file.exists
 
     async def subject(self, uid: int, verb: str) -> Subject:
         """Who a user of this robot, or one that another robot vouches for, is.
@@ -73,17 +69,17 @@ class RightsGate:
         Raises:
             RefusedError: who it is cannot be known now; so no right is given, for a rule that denies may be about it.
         """
-        self._refresh()
+        found = self._look()
         if may(uid, None) and verb not in NEVER_BY_DEFAULT:
             return Subject(
                 f"uid:{uid}", uid=uid, stands_above=True
             )  # asks no directory: the robot's own console works without a network
-        if self._mistake or self._rights is None:
-            raise RefusedError(f"no right can be given: {self._mistake or 'there are no rules'}", "PermissionError")
-        config = self._rights.config
+        if found is None:
+            raise RefusedError(f"no right can be given: {self._file.mistake or 'there are no rules'}", "PermissionError")
+        config = found.config
         if config.source == "file":
-            found = await asyncio.to_thread(accounts.subject_of, uid, config.groups)
-            return replace(found, stands_above=may(uid, None))
+            subject = await asyncio.to_thread(accounts.subject_of, uid, config.groups)
+            return replace(subject, stands_above=may(uid, None))
         return await self._by_directory(await asyncio.to_thread(accounts.name_of, uid), uid, verb)
 
     async def explained(self, user: str, verb: str, path: str, owner: int | None) -> tuple[Decision, Subject]:
@@ -95,7 +91,7 @@ class RightsGate:
         uid = await asyncio.to_thread(accounts.uid_of, user)
         if uid is not None:
             subject = await self.subject(uid, verb)
-        elif self._rights is None or self._rights.config.source == "file":
+        elif (found := self._file.rights) is None or found.config.source == "file":
             raise RefusedError(f"this robot has no user {user!r}; see getent passwd", "RightsError")
         else:
             subject = await self._by_directory(user, None, verb)
@@ -105,10 +101,11 @@ class RightsGate:
         """One sentence for the status: by which rules and whose groups rights are decided, what is wrong; "" without a file."""
         if not self.has_rules:
             return ""
-        if self._mistake or self._rights is None:
-            return f"no user but root has any: {self._mistake}; mend the file, failover-agent check names the next mistake"
-        config, many = self._rights.config, len(self._rights.rules)
-        told = f"{many} rule{'s' * (many != 1)} of {self._path}; groups"
+        found = self._file.rights
+        if found is None:
+            return f"no user but root has any: {self._file.mistake}; mend the file, failover-agent check names the next mistake"
+        config, many = found.config, len(found.rules)
+        told = f"{many} rule{'s' * (many != 1)} of {self._file.path}; groups"
         if config.source == "file":
             return f"{told} of this machine"
         told = f"{told} by {config.ldap.server}"
@@ -126,7 +123,7 @@ class RightsGate:
         Args:
             owner: uid of whose the component is; None: it is not known.
         """
-        rules = self._rights.rules if self._rights is not None else ()
+        rules = self._file.rights.rules if self._file.rights is not None else ()
         now = datetime.now()
         minute = hours.minute_of(now.weekday(), now.hour, now.minute)
         try:
@@ -166,22 +163,9 @@ class RightsGate:
         named = f"uid:{uid}" if answer.is_stranger else f"ldap:{name}"
         return Subject(named, frozenset(answer.groups), uid=uid, stands_above=is_above, copy=answer.copy)
 
-    def _refresh(self) -> None:
-        """Read the file if it is another one than the last that was read."""
-        try:
-            found = os.stat(self._path)
-            at = (found.st_mtime_ns, found.st_ino, found.st_size)
-        except FileNotFoundError:
-            at = None
-        except OSError as error:
-            self._read_at, self._mistake = (0, 0, 0), f"{self._path}: cannot be read: {error.strerror}"
-            return
-        if at == self._read_at:
-            return
-        self.close()  # it has read the older one
-        self._read_at, self._rights, self._mistake = at, None, ""
-        self._answered_at, self._away = None, ""
-        try:
-            self._rights = rights.read(self._path.parent)
-        except FailoverError as error:
-            self._mistake = str(error)
+    def _look(self) -> Rights | None:
+        """The rules as they are now; None: there are none, or they are mistaken."""
+        if self._file.look():
+            self.close()  # it has read the older one
+            self._answered_at, self._away = None, ""
+        return self._file.rights

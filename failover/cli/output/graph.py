@@ -27,7 +27,7 @@ def rows(edges: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 def dot(edges: Sequence[Mapping[str, Any]]) -> str:
     """A directed graph; an edge is as thick as its share of the messages."""
-    most = max((one["count"] for one in edges), default=1)
+    most = max((one["count"] for one in edges), default=1) or 1  # of one that came over an hour ago only its end may count
     lines = ["digraph team {", "  rankdir=LR;"]
     for one in edges:
         label = f"{one['verb']}: {one['count']}" + (f", {one['errors']} errors" if one["errors"] else "")

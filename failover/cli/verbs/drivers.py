@@ -8,7 +8,7 @@ import json
 import sys
 import time
 from collections import defaultdict
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import msgspec
 
@@ -17,12 +17,13 @@ from failover.cli.output import names_tree, render
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.clocks import Bounds, ClockPair, Part, parts
 from failover.core.messaging.envelope import MESSAGE_SIZE_MAX, Envelope, Hop
+from failover.core.messaging.traffic import Edge
 from failover.core.naming.tree import Place, Reach, Tree, robot_of
 from failover.drivers.here import Here, here
 from failover.drivers.lookup import lookup, whole_tree
 from failover.drivers.proxy import Proxy
 from failover.drivers.sending import address_of, way_to
-from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError, RequestError
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError, RequestError
 
 EXCHANGES: Final = 8
 """Messages to and fro from which the offset of a robot's clock is found: the fastest of each direction count."""
@@ -104,7 +105,7 @@ def _json(text: str, what: str) -> Any:
         raise RequestError(f"the {what} is not JSON: {error}; text stands in double quotes, as in '\"blue\"'") from error
 
 
-# --- The way of a message --------------------------------------------------------------------------------------------
+# --- What drivers tell of messages --------------------------------------------------------------------------------------------
 
 
 def graph(arguments: argparse.Namespace) -> int:
@@ -112,33 +113,58 @@ def graph(arguments: argparse.Namespace) -> int:
     place = here()
     with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
         while True:
-            edges, silent = _edges(place, whole_tree(place))
+            found = _edges(place, whole_tree(place))
+            edges = found.edges
             if arguments.json:
-                render.as_json({"edges": edges, "silent": silent})
+                render.as_json(msgspec.to_builtins(found))
             elif arguments.dot:
                 print(render.spoken(graph_output.dot(edges)), flush=True)
             else:
-                told = f"; no answer from {', '.join(silent)}" if silent else ""
+                told = f"; no answer from {', '.join(found.silent)}" if found.silent else ""
                 draw(graph_output.COLUMNS, graph_output.rows(edges), f"{len(edges)} edges in the last hour{told}")
+            for sentence in found.mistaken:
+                print(f"failover: {render.spoken(sentence)}", file=sys.stderr, flush=True)
             if not arguments.watch:
-                return 1 if silent else 0
+                return 1 if found.silent or found.mistaken else 0
             time.sleep(arguments.every_ms / 1_000)
     return 0  # Ctrl-C ended the watch
 
 
-def _edges(here: Here, tree: Tree) -> tuple[list[dict[str, Any]], list[str]]:
-    """All edges, the busiest first; and the drivers that did not tell theirs."""
-    found: list[dict[str, Any]] = []
-    silent: list[str] = []
+Hops = tuple[Hop, ...] | None
+
+
+class _Graph(msgspec.Struct):
+    """What all drivers told.
+
+    Attributes:
+        edges: the busiest first.
+        silent: drivers that did not tell theirs. mistaken: a sentence for each whose answer cannot be read.
+    """
+
+    edges: list[dict[str, Any]]
+    silent: list[str]
+    mistaken: list[str]
+
+
+def _edges(here: Here, tree: Tree) -> _Graph:
+    found = _Graph([], [], [])
     for place in _live(tree):
         try:
-            with Proxy(here, place) as driver:
-                rows = driver.call("_graph", timeout=ASK_S)
-        except (NoAnswerError, CallRefusedError, DriverError):
-            silent.append(place.record.path)
+            driver = Proxy(here, place)
+        except DriverError:
+            found.silent.append(place.record.path)
             continue
-        found += [{"from": row["from"], "to": place.record.path} | row for row in rows]
-    return sorted(found, key=lambda row: (-row["count"], row["from"], row["to"], row["verb"])), silent
+        with driver:
+            try:
+                edges = driver.told("_graph", list[Edge], timeout=ASK_S)
+            except (NoAnswerError, CallRefusedError):
+                found.silent.append(driver.path)
+            except DriverError as error:
+                found.mistaken.append(str(error))
+            else:
+                found.edges += [{"from": one.sender, "to": driver.path} | msgspec.to_builtins(one) for one in edges]
+    found.edges.sort(key=lambda row: (-row["count"], row["from"], row["to"], row["verb"]))
+    return found
 
 
 def path(arguments: argparse.Namespace) -> int:
@@ -165,12 +191,13 @@ def _remembered(here: Here, tree: Tree, wanted: str) -> tuple[Hop, ...]:
     for place in _live(tree):
         try:
             with Proxy(here, place) as driver:
-                hops = driver.call("_path", {"id": wanted}, timeout=ASK_S)
-        except (NoAnswerError, CallRefusedError, DriverError):
+                hops = driver.told("_path", cast("type[tuple[Hop, ...] | None]", Hops), {"id": wanted}, timeout=ASK_S)
+            envelopes.check_hops(hops or ())
+        except (NoAnswerError, CallRefusedError, DriverError, EnvelopeError):
             continue
         asked += 1
         if hops:
-            return tuple(msgspec.convert(hops, tuple[Hop, ...]))
+            return hops
     raise NameUnknownError(
         f"none of the {asked} drivers that answered remembers a message {wanted!r}: each keeps its last 4096; "
         "failover call --json prints the id of a message"

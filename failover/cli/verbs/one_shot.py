@@ -54,6 +54,7 @@ from checkpoint.linux.spawn.vessel import Birth, Born
 from checkpoint.snapshot import credentials, format
 from checkpoint.snapshot.canonical_state import State
 from checkpoint.snapshot.credentials import Owner
+from checkpoint.store.whole_file import written_aside
 from failover.cli.keeper_client import Keeper
 from failover.cli.output import render, team_tree
 from failover.cli.verbs.components import exit_like
@@ -253,22 +254,10 @@ def _written_whole(target: Path) -> Iterator[int]:
     """
     aside = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        try:
+        with written_aside(target, aside, lasts="name", is_exclusive=True) as descriptor:
             yield descriptor
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        aside.replace(target)
-        directory = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
     except OSError as error:
         raise FailoverError(f"cannot write {target}: {error.strerror}; the program was not ended") from error
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def terms_of(arguments: argparse.Namespace) -> Terms:

@@ -10,14 +10,18 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
+from msgspec import Struct
+
+from checkpoint.store.whole_file import write_whole
 from failover.cli.output import render
 from failover.core.naming.tree import Place as NamedPlace
 from failover.core.programs import bundle, states
-from failover.core.programs.states import Shelf
+from failover.core.programs.states import Shelf, Standing
 from failover.drivers.here import here
 from failover.drivers.lookup import lookup
 from failover.drivers.proxy import Proxy
-from failover.errors import NameUnknownError, NoAnswerError, ProgramError
+from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError, ProgramError
 from failover.programs import keys, packing
 from failover.programs.admission import admit
 from failover.programs.store import Store, default_place
@@ -70,10 +74,8 @@ def _until(day: str | None) -> int:
 
 def _written(arguments: argparse.Namespace, path: Path, content: bytes) -> int:
     program = bundle.read(bundle.split(content)[1])
-    aside = path.with_name(path.name + ".new")
     try:
-        aside.write_bytes(content)
-        aside.replace(path)
+        write_whole(path, content, mode=0o666, lasts="process")
     except OSError as error:
         raise ProgramError(f"cannot write {path}: {error.strerror}") from error
     said = program.manifest
@@ -118,7 +120,8 @@ def _sent_to(arguments: argparse.Namespace) -> int:
         raise NameUnknownError(f"{arguments.to} takes no bundles: {error}; run there: failover program receive") from error
     with proxy:
         told = receiver.send(proxy, content)
-    return _told(arguments, told, f"{told['name']} {told['version']} is staged on {arguments.to}, signed by {told['owner']}")
+    sentence = f"{told.name} {told.version} is staged on {arguments.to}, signed by {told.owner}"
+    return _told(arguments, msgspec.to_builtins(told), sentence)
 
 
 def receive(arguments: argparse.Namespace) -> int:
@@ -162,7 +165,11 @@ def show(arguments: argparse.Namespace) -> int:
             trial = ", on trial" if version["state"] == states.State.ACTIVE and not version["is_committed"] else ""
             print(f"  {version['version']:10} {version['state']}{trial}  {version['digest'][:12]}  {version['why']}")
         host = one["host"]
-        print("  no host runs it" if host is None else f"  pid {host['pid']}; {_enforcement(host)}")
+        print(
+            f"  {render.spoken(one['trouble'] or 'no host runs it')}"
+            if host is None
+            else f"  pid {host['pid']}; {_enforcement(host)}"
+        )
     if not found:
         print(f"no program is in {store.place}; failover program send brings one")
     return 0
@@ -173,14 +180,15 @@ def _enforcement(host: dict[str, Any]) -> str:
 
 
 def _with_host(shelf: Shelf) -> dict[str, Any]:
-    import msgspec
-
+    """A shelf with what its host tells. ``trouble``: why nothing is known of a host that may be there."""
     told: dict[str, Any] = msgspec.to_builtins(shelf)
     try:
         with _host(shelf.path) as proxy:
-            return told | {"host": proxy.call("_versions", timeout=1.0)}
+            return told | {"host": msgspec.to_builtins(proxy.told("_versions", Standing, timeout=1.0)), "trouble": ""}
     except (NameUnknownError, NoAnswerError):
-        return told | {"host": None}
+        return told | {"host": None, "trouble": ""}
+    except (CallRefusedError, DriverError) as error:
+        return told | {"host": None, "trouble": f"{shelf.path} is no host of failover's: {error}"}
 
 
 def switch(arguments: argparse.Namespace) -> int:
@@ -189,20 +197,25 @@ def switch(arguments: argparse.Namespace) -> int:
     is_directory = "/" in arguments.version or (given / packing.PROGRAM_FILE).exists()
     order = {"directory": str(given.resolve())} if is_directory else {"version": arguments.version}
     with _host(_path(arguments)) as proxy:
-        version = proxy.call("_switch", order)["version"]
+        version = proxy.told("_switch", _Ordered, order).version
         end = time.monotonic() + SWITCH_MAX_S
-        while (found := _asked(proxy))["is_coming"] or found["active"] != version or (arguments.wait and found["on_trial"]):
-            if not found["is_coming"] and found["active"] != version and found["said"]:
-                raise ProgramError(str(found["said"]))
-            if time.monotonic() > end and not found["on_trial"]:
+        while (found := _asked(proxy)).is_coming or found.active != version or (arguments.wait and found.on_trial):
+            if not found.is_coming and found.active != version and found.said:
+                raise ProgramError(found.said)
+            if time.monotonic() > end and not found.on_trial:
                 raise NoAnswerError(f"{version} has not become active within {SWITCH_MAX_S:g} s; failover program log tells why")
             time.sleep(POLL_S)
-    return _told(arguments, found, str(found["said"]))
+    return _told(arguments, msgspec.to_builtins(found), found.said)
 
 
-def _asked(proxy: Proxy) -> dict[str, Any]:
-    found: dict[str, Any] = proxy.call("_versions", timeout=SWITCH_MAX_S)
-    return found
+class _Ordered(Struct, frozen=True):
+    """The answer to ``_switch``: the version that is being started."""
+
+    version: str
+
+
+def _asked(proxy: Proxy) -> Standing:
+    return proxy.told("_versions", Standing, timeout=SWITCH_MAX_S)
 
 
 def rollback(arguments: argparse.Namespace) -> int:
@@ -210,7 +223,7 @@ def rollback(arguments: argparse.Namespace) -> int:
     with _host(_path(arguments)) as proxy:
         proxy.call("_rollback", {"old_state": arguments.old_state})
         found = _asked(proxy)
-    return _told(arguments, found, str(found["said"]))
+    return _told(arguments, msgspec.to_builtins(found), found.said)
 
 
 def lines(arguments: argparse.Namespace) -> int:

@@ -334,11 +334,14 @@ def _check_head(envelope: Envelope) -> None:
             raise EnvelopeError(f"the message holds the integer {number}: above 2^53 it must be written as text")
     if envelope.deadline_ms is not None and not -INTEGER_MAX <= envelope.deadline_ms <= INTEGER_MAX:
         raise EnvelopeError(f"the message has the deadline_ms {envelope.deadline_ms}: 2^53 ms are the most; none: leave it out")
-    if len(envelope.hops) > HOPS_MAX:
-        raise EnvelopeError(
-            f"the message was passed on {len(envelope.hops)} times, {HOPS_MAX} are the most: names lead in a circle"
-        )
-    for hop in envelope.hops:
+    check_hops(envelope.hops)
+
+
+def check_hops(hops: tuple[Hop, ...]) -> None:
+    """Raises EnvelopeError: no message was passed on like this."""
+    if len(hops) > HOPS_MAX:
+        raise EnvelopeError(f"the message was passed on {len(hops)} times, {HOPS_MAX} are the most: names lead in a circle")
+    for hop in hops:
         if len(hop.who) > TEXT_MAX:
             raise EnvelopeError(f"the message has a hop whose name has {len(hop.who)} characters; {TEXT_MAX} are the most")
         for stamp in (hop.came, hop.left):

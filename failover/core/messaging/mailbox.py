@@ -25,7 +25,7 @@ a program that goes back to its last commit takes back nothing that others have 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import msgspec
@@ -436,6 +436,28 @@ class Mailbox:
     def first(self) -> Envelope | None:
         """What `take` would look at next; it stays."""
         return self._queue[0].envelope if self._queue else None
+
+    def bring_forward(self, is_chosen: Callable[[Envelope], bool], now_ns: int) -> None:
+        """Have the first message that is chosen be the next one, unless one of the same sender waits before it.
+
+        Those before it that are past their deadline are answered, in the order of their sender.
+        """
+        waiting: set[str] = set()
+        passed: deque[Arrived] = deque()
+        chosen: Arrived | None = None
+        while chosen is None and self._queue:
+            one = self._queue.popleft()
+            sender = one.envelope.sender
+            if sender not in waiting and one.until_ns is not None and now_ns >= one.until_ns:
+                self._expire(one.envelope)
+            elif sender not in waiting and is_chosen(one.envelope):
+                chosen = one
+            else:
+                waiting.add(sender)
+                passed.append(one)
+        self._queue.extendleft(reversed(passed))
+        if chosen is not None:
+            self._queue.appendleft(chosen)
 
     def take_same(self, verb: str, now_ns: int) -> Envelope | None:
         """The next message to handle, if it has this verb; None: it has another one, or there is none."""

@@ -5,9 +5,10 @@ Each edge (sender, verb) has a row for each of the last 60 minutes; the oldest l
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from msgspec import Struct
+import msgspec
+from msgspec import Meta, Struct
 
 MINUTES: Final = 60
 MINUTE_NS: Final = 60_000_000_000
@@ -34,6 +35,24 @@ def who(sender: str) -> str:
         if not (dash and number.isdecimal()):
             return left or sender
     return sender
+
+
+Count = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+
+
+class Edge(Struct, frozen=True, rename={"sender": "from"}):
+    """One row of a driver's answer to ``_graph``: what one sender has sent to one verb in the last hour.
+
+    Attributes:
+        p99_us: in which time 99 of 100 were answered; None: none was.
+    """
+
+    sender: str
+    verb: str
+    count: Count
+    bytes: Count
+    errors: Count
+    p99_us: Annotated[float, Meta(ge=0)] | None = None
 
 
 class Minute(Struct):
@@ -67,7 +86,7 @@ class Traffic:
         minute.durations[step] = minute.durations.get(step, 0) + 1
 
     def rows(self, now_ns: int) -> list[dict[str, Any]]:
-        """The edges of the last hour: ``from``, ``verb``, ``count``, ``bytes``, ``errors``, ``p99_us`` (or None)."""
+        """The edges of the last hour, each an `Edge` as plain data."""
         oldest = now_ns // MINUTE_NS - MINUTES
         found = []
         for (sender, verb), minutes in list(self._edges.items()):
@@ -75,9 +94,9 @@ class Traffic:
             if not minutes:
                 del self._edges[sender, verb]
                 continue
-            sums = {name: sum(getattr(one, name) for one in minutes) for name in ("count", "bytes", "errors")}
-            found.append({"from": sender, "verb": verb, **sums, "p99_us": _p99_us(minutes)})
-        return found
+            count, size, errors = (sum(getattr(one, name) for one in minutes) for name in ("count", "bytes", "errors"))
+            found.append(Edge(sender, verb, count, size, errors, _p99_us(minutes)))
+        return [msgspec.to_builtins(edge) for edge in found]
 
     def _minute(self, sender: str, verb: str, now_ns: int) -> Minute:
         name = self._names.get(sender)

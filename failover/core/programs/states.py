@@ -19,6 +19,7 @@ Always true: at most one version is active. The floor against downgrades is the 
 from __future__ import annotations
 
 import enum
+from collections.abc import Collection
 from typing import Final
 
 import msgspec
@@ -70,6 +71,33 @@ class Version(Struct, frozen=True):
     state: State = State.RECEIVED
     is_committed: bool = False
     why: str = ""
+
+
+class Standing(Struct, frozen=True):
+    """What a host tells of its program: the answer to ``_versions``.
+
+    Attributes:
+        active: the version that carries out messages; "" while none does.
+        pid: of its process; 0: none.
+        is_coming: another version is being started. said: what happened last, for people.
+        gap_ms: how long no version could take a message at the last switch.
+        enforced, not_enforced: one sentence each.
+        before: the version whose process waits for a rollback; "": none does.
+        versions: all of the shelf; none for a program that runs from a directory.
+    """
+
+    name: str
+    path: str
+    active: str
+    pid: int
+    on_trial: bool
+    is_coming: bool
+    said: str
+    gap_ms: float
+    enforced: tuple[str, ...]
+    not_enforced: tuple[str, ...]
+    before: str
+    versions: tuple[Version, ...] = ()
 
 
 def _moved(one: Version, state: State, why: str, *, is_committed: bool = False) -> Version:
@@ -189,3 +217,38 @@ def fall_back(shelf: Shelf, why: str) -> Shelf:
     shelf = put(shelf, roll_back(new, why))
     back = commit(activate(warm(old), f"{new.version} was rolled back"), f"{new.version} was rolled back: {why}")
     return msgspec.structs.replace(put(shelf, back), before="")
+
+
+def undone(shelf: Shelf, earlier: Shelf) -> Shelf:
+    """The shelf as it was at a moment before, with what has come since: a version that was to become active could not begin."""
+    known = {versions.order(one.version) for one in earlier.versions}
+    came = [one for one in shelf.versions if versions.order(one.version) not in known]
+    both = sorted((*earlier.versions, *came), key=lambda one: versions.order(one.version))
+    return msgspec.structs.replace(shelf, versions=tuple(both), floor=earlier.floor, before=earlier.before)
+
+
+def carried_over(shelf: Shelf, here: Shelf | None, present: Collection[str]) -> Shelf:
+    """The shelf of a program that goes on here: as it was where it ran, with the versions that are on this robot besides.
+
+    Args:
+        shelf: of the robot where it ran last; its floor counts, also where a person went back there.
+        here: of this robot; None: the program was never here.
+        present: digests of those bundles of ``shelf`` that are here and may run.
+
+    Raises:
+        ProgramError: this robot's program of that name has another path.
+    """
+    if here is not None and here.path != shelf.path:
+        raise ProgramError(f"{shelf.name} speaks for {here.path} here, and for {shelf.path} where it ran; give one another name")
+    found = {versions.order(one.version): one for one in shelf.versions if one.digest in present}
+    for one in here.versions if here is not None else ():
+        if versions.order(one.version) not in found:
+            is_active = one.state is State.ACTIVE
+            kept = retire(one, f"{shelf.name} went on at another robot") if is_active else one
+            found[versions.order(one.version)] = kept
+    before = shelf.before if shelf.before and versions.order(shelf.before) in found else ""
+    newest = tuple(found[order] for order in sorted(found))
+    needed = [one for one in newest if one.state is State.ACTIVE or one.version == before]
+    others = [one for one in newest if one not in needed][-(VERSIONS_MAX - len(needed)) :]
+    both = tuple(one for one in newest if one in needed or one in others)
+    return Shelf(shelf.name, shelf.path, both, shelf.floor, before, here.uid if here is not None else 0)

@@ -14,7 +14,7 @@ from failover.cli import main
 from failover.core.messaging.envelope import Envelope, encode
 from failover.drivers.here import Here
 from failover.drivers.local import LocalWay
-from failover.errors import CallRefusedError
+from failover.errors import CallRefusedError, DriverError
 from tests.failover.drivers.devices import ENGINE, Arm, Engine
 from tests.failover.drivers.serving import LIMIT_S, called, serving, until
 
@@ -63,3 +63,50 @@ def test_the_graph_is_the_matrix_of_what_was_sent(here: Here, capsys: pytest.Cap
     assert all(one["p99_us"] for one in edges.values()) and told["silent"] == []
     assert dot.count(" -> ") == len(edges) and dot.startswith("digraph")
     assert table.count("robot1/") == len(edges)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        None,
+        7,
+        "rows",
+        {"from": "x"},
+        [1],
+        [{}],
+        [{"from": "x", "verb": "set", "count": "many", "bytes": 1, "errors": 0, "p99_us": None}],
+        [{"from": "x", "verb": "set", "count": -1, "bytes": 1, "errors": 0, "p99_us": None}],
+        [{"from": "x", "verb": "set", "count": 1, "bytes": 1, "errors": 0, "p99_us": []}],
+    ],
+)
+def test_a_driver_whose_answer_is_no_graph_gets_one_sentence_and_the_others_are_shown(
+    here: Here, capsys: pytest.CaptureFixture[str], answer: object
+) -> None:
+    with serving(Engine, here) as engine, serving(Arm, here):
+        with called(here, "arm") as proxy:
+            proxy.call("read")
+        engine._actor._own = {**engine._actor._own, "_graph": lambda *_: answer}
+        until(lambda: len(engine.service.tree()) == 2)
+        for words in (["graph"], ["graph", "--dot"], ["graph", "--json"]):
+            assert main.main(words) == 1
+            out, err = capsys.readouterr()
+            assert err.startswith(f"failover: {ENGINE} answered _graph in a form that failover does not know: ")
+            assert err.count("\n") == 1 and "read" in out
+
+
+@pytest.mark.parametrize("answer", [7, [["x", "abc", None]], [["x", 1, 1 << 60]], [[1]], {"x": 1}])
+def test_a_driver_whose_answer_is_no_way_of_a_message_is_passed_over(
+    here: Here, capsys: pytest.CaptureFixture[str], answer: object
+) -> None:
+    with serving(Engine, here) as engine:
+        engine._actor._own = {**engine._actor._own, "_path": lambda *_: answer}
+        assert main.main(["path", "unheard"]) == 1
+        assert "drivers that answered remembers a message 'unheard'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("answer", [None, 7, {"verbs": 7}, {"verbs": {"current": "stream"}}])
+def test_a_stream_of_a_driver_that_does_not_say_what_it_has_is_refused(here: Here, answer: object) -> None:
+    with serving(Engine, here) as engine, called(here, "engine") as proxy:
+        engine._actor._own = {**engine._actor._own, "_describe": lambda *_: answer}
+        with pytest.raises(DriverError, match="answered _describe in a form"):
+            next(iter(proxy.stream("current")))

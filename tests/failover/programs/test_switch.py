@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import resource
@@ -13,20 +14,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec import UNSET
 
 from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.mailbox import SENDERS_MAX
+from failover.core.programs import states
 from failover.core.programs.states import State
 from failover.drivers.server import Near, Peer
-from failover.errors import BundleRefusedError, CallRefusedError, DriverError, ProgramError
+from failover.errors import BundleRefusedError, CallRefusedError, DriverError, NoAnswerError, ProgramError
 from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.running import Running
 from failover.programs.sources import Place
-from failover.programs.store import Kept
+from failover.programs.store import Kept, Store
+from tests.failover.drivers.serving import taking_messages
 from tests.failover.programs.senders import Lab, engine, switched, until
 
 LEAST = 100
@@ -174,6 +178,67 @@ def test_mailbox_and_state_outlive_the_host_and_its_version(lab: Lab) -> None:
         assert proxy.call("read") == [0, 1, 2, 3]
 
 
+SLOW = """
+import os, pathlib, time
+place = pathlib.Path({place!r})
+if (place / "slow").exists():
+    (place / "loading").touch()
+    while (place / "slow").exists():
+        time.sleep(0.01)
+"""
+
+
+def test_while_a_lost_version_is_started_anew_the_host_answers_and_refuses_with_a_sentence(lab: Lab) -> None:
+    first = lab.source("1", engine(before=SLOW.format(place=str(lab.folder))))
+    second = lab.source("2", seconds=0)
+    hosting = taking_messages(Hosting(Place(lab.store, lab.team, "engine", first), "", lab.here))
+    with hosting as host, lab.proxy() as proxy:
+        assert proxy.call("step", number=0) == 0
+        (lab.folder / "slow").touch()
+        process = host.actor._running._process  # type: ignore[union-attr]
+        process.kill()
+        until(proxy, lambda found: not found["active"] and (lab.folder / "loading").exists())
+        assert [proxy.call("_describe")["path"], proxy.call("_graph")[0]["verb"]] == ["Lab/robot1/Engine", "step"]
+        with pytest.raises(NoAnswerError, match="busy: engine 1 is being started anew: its process ended; send it again"):
+            proxy.call("step", number=1, timeout=0.2)
+        assert proxy.call("_versions")["active"] == "", "its import still goes on"
+        (lab.folder / "slow").unlink()
+        assert proxy.call("step", number=2, timeout=60) == 2 and proxy.call("read") == [0, 2]
+        (lab.folder / "slow").touch()
+        (lab.folder / "loading").unlink()
+        host.actor._running._process.kill()  # type: ignore[union-attr]
+        until(proxy, lambda found: not found["active"] and (lab.folder / "loading").exists())
+        proxy.call("_switch", {"directory": str(second)})
+        until(proxy, lambda found: found["active"] == "2")  # it need not wait for the lost one
+        assert proxy.call("step", number=3, timeout=60) == 3 and proxy.call("read") == [0, 2, 3]
+        (lab.folder / "slow").touch()  # and the host's end does not wait either
+
+
+RESUMES = """numbers: list[int] = failover.kept(default=[])
+    told = "nothing"
+    def on_resume(self, resumed):
+        self.told = [resumed.why, resumed.robot, resumed.age_s >= 0, list(self.numbers), list(resumed.notes)]"""
+
+
+def test_a_version_that_begins_with_a_kept_state_is_told_where_it_comes_from(lab: Lab) -> None:
+    text = engine(kept=RESUMES, extra="return self.told")
+    lab.send("1", text)
+    lab.send(
+        "2", text.replace("failover.kept(default=[])", "failover.kept(default=[])\n    more: int = failover.kept(default=7)")
+    )
+    with lab.hosting("1") as host, lab.proxy() as proxy:
+        assert proxy.call("fly") == "nothing", "its state begins here"
+        proxy.call("step", number=1)
+        host.actor._running._process.kill()  # type: ignore[union-attr]
+        host.actor._running._process.wait()  # type: ignore[union-attr]
+        assert proxy.call("fly", timeout=60) == ["restarted", "robot1", True, [1], []]
+        switched(proxy, "2")
+        why, _, _, numbers, notes = proxy.call("fly")
+        assert (why, numbers) == ("switched", [1]) and "more" in notes[0]
+    with lab.hosting(), lab.proxy() as proxy:
+        assert proxy.call("fly")[0] == "restarted"
+
+
 def test_a_host_that_ends_during_a_trial_goes_back(lab: Lab) -> None:
     lab.send("1")
     lab.send("2", seconds=600)
@@ -185,6 +250,59 @@ def test_a_host_that_ends_during_a_trial_goes_back(lab: Lab) -> None:
     with lab.hosting(), lab.proxy() as proxy:
         assert proxy.call("_versions")["active"] == "1" and proxy.call("read") == [1, 2]
     assert states_of(lab) == {"1": "active", "2": "rolled back"}
+
+
+def test_a_host_that_ends_between_the_shelf_and_the_switch_goes_on_with_the_old_version_and_its_newest_state(lab: Lab) -> None:
+    lab.send("1")
+    with lab.hosting("1"), lab.proxy() as proxy:
+        proxy.call("step", number=1)
+    lab.send("2", engine(kept="numbers: list[str] = failover.kept(default=[])"))
+    shelf = lab.store.shelf("engine")
+    lab.store.put(states.succeed(shelf, states.warm(shelf.find("2")), "on trial"))  # type: ignore[arg-type]
+    with lab.hosting(), lab.proxy() as proxy:
+        assert proxy.call("_versions")["active"] == "1" and proxy.call("read") == [1]
+    assert states_of(lab) == {"1": "active", "2": "rolled back"}
+
+
+def test_no_file_is_written_while_no_version_can_take_a_message(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send("1")
+    lab.send("2", seconds=0)
+    said: list[str] = []
+
+    def noted(owner: object, name: str) -> None:
+        real = getattr(owner, name)
+
+        def called(*arguments: Any, **named: Any) -> Any:
+            said.append(name)
+            return real(*arguments, **named)
+
+        monkeypatch.setattr(owner, name, called)
+
+    with lab.hosting("1"), lab.proxy() as proxy:
+        for owner, names in ((Running, ("pause", "begin", "end")), (Store, ("put", "keep", "settle", "log"))):
+            for name in names:
+                noted(owner, name)
+        assert switched(proxy, "2")["active"] == "2"
+        until(proxy, lambda _: said.count("put") > 1)
+        first = said.index("pause")
+        assert "put" in said[:first] and said[first : first + 2] == ["pause", "begin"], said
+        assert {"keep", "log"} <= set(said[first + 2 :]) and not {"settle", "end"} & set(said[: first + 2]), said
+
+
+def test_a_switch_that_cannot_be_recorded_leaves_the_old_version_untouched(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send("1", engine(kept=RESUMES, extra="return self.told"))
+    lab.send("2")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with lab.hosting("1"), lab.proxy() as proxy:
+        with monkeypatch.context() as patch:
+            patch.setattr(Store, "put", full)
+            found = switched(proxy, "2")
+        assert found["active"] == "1" and "No space left on device" in str(found["said"]), found
+        assert proxy.call("fly") == "nothing", "it was neither paused nor begun again"
+    assert states_of(lab) == {"1": "active", "2": "staged"}
 
 
 def test_two_versions_run_side_by_side_under_two_names(lab: Lab) -> None:

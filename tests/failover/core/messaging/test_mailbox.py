@@ -388,6 +388,31 @@ MUTANTS = {
 }
 
 
+def test_a_message_brought_forward_overtakes_other_senders_and_never_its_own() -> None:
+    box = Mailbox()
+
+    def came(sender: str, seq: int, verb: str, deadline_ms: float | None = None) -> None:
+        after = max(seq - 1, 0)
+        message = Envelope("a", verb, sender=sender, boot=1, seq=seq, after=after, reliable=True, deadline_ms=deadline_ms)
+        assert not box.arrived(message, 0)
+
+    came("one", 1, "set", 5.0)
+    came("one", 2, "_look")
+    came("two", 1, "set")
+    came("two", 2, "_look")
+    came("three", 1, "_look")
+    box.bring_forward(lambda message: message.verb == "_look", 0)
+    assert [box.take(0).sender, box.take(0).verb] == ["three", "set"]  # type: ignore[union-attr]
+    box = Mailbox()
+    came("one", 1, "set", 5.0)
+    came("two", 1, "set")
+    came("one", 2, "_look")
+    box.bring_forward(lambda message: message.verb == "_look", 10 * MS)
+    assert [one.error.kind for one in box.committed()] == ["expired"]  # type: ignore[union-attr]
+    found = [box.take(10 * MS), box.take(10 * MS)]
+    assert [(one.sender, one.verb) for one in found] == [("one", "_look"), ("two", "set")]  # type: ignore[union-attr]
+
+
 @pytest.mark.parametrize("name", MUTANTS)
 def test_a_mistake_in_the_mailbox_is_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     attribute, wrong = MUTANTS[name]
