@@ -308,7 +308,8 @@ class Worker(Switchboard):
         self._bringing.lost(peer)
 
     def link_is_new(self, peer: str) -> None:
-        """A peer greets on a new replication link: what was half here stays half."""
+        """A peer greets on a new replication link: what was half here stays half, and it may have answered on the link before."""
+        self._shipper.answers_may_be_lost(peer)
         self._receiver.lost(peer)
         self._contents.lost(peer)
         self._stock.lost(peer)

@@ -74,13 +74,14 @@ Offered = Offer | Content
 
 
 class _Outgoing(Struct):
-    """One transfer that leaves, as far as it has been taken."""
+    """One transfer that leaves, as far as it has been taken. ``doubted``: what its receiver said last may be lost."""
 
     peer: str
     what: str
     until: int = 0
     sent: bool = False
     taken: bool = False
+    doubted: bool = False
     refused: str = ""
     moved: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -140,7 +141,15 @@ class Shipper:
                 transfer.taken = True
             case Refuse():
                 transfer.refused = message.reason or "no reason given"
+        transfer.doubted = False
         transfer.moved.set()
+
+    def answers_may_be_lost(self, peer: str) -> None:
+        """The peer has connected anew: its last words may be lost. While it is at a transfer, it says so each second."""
+        for transfer in self._outgoing.values():
+            if transfer.peer == peer:
+                transfer.doubted = True
+                transfer.moved.set()
 
     async def _give_way(self) -> None:
         """Let the bytes of snapshots go first, as long as a file may wait."""
@@ -156,9 +165,10 @@ class Shipper:
                 transfer.moved.set()
 
     async def _until(self, transfer: _Outgoing, reached: Callable[[], bool], patience_s: float | None = None) -> None:
-        patience_s = PATIENCE_S if patience_s is None else patience_s
+        longest_s = PATIENCE_S if patience_s is None else patience_s
         while not transfer.refused and not reached():
             transfer.moved.clear()
+            patience_s = min(PATIENCE_S, longest_s) if transfer.doubted else longest_s
             try:
                 async with asyncio.timeout(patience_s):  # wait_for loses a cancellation that comes with the event
                     await transfer.moved.wait()

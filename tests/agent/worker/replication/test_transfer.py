@@ -173,6 +173,47 @@ def test_a_receiver_that_shows_nothing_is_not_waited_for(tmp_path: Path, content
 
 
 @pytest.mark.usefixtures("little_patience")
+def test_an_answer_that_went_with_its_connection_is_not_waited_for_as_for_a_slow_disk(tmp_path: Path, content: Path) -> None:
+    async def body() -> None:
+        free = asyncio.Event()
+        two = Two(tmp_path, Slow(free))
+        shipping = asyncio.create_task(ship(two, content))
+        while sum(isinstance(message, Chunk) for message in two.out.said) < 6:
+            await asyncio.sleep(0)
+        two.back.connected = False
+        free.set()
+        while not two.desk.taken:
+            await asyncio.sleep(0.01)
+        two.back.connected = True
+        two.shipper.answers_may_be_lost("robot2")
+        with pytest.raises(LaneError, match="robot2 took nothing for 0 s"):
+            await shipping
+
+    run(body())
+
+
+@pytest.mark.usefixtures("little_patience")
+def test_a_receiver_that_connects_anew_and_is_still_at_it_is_waited_for(
+    tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transfer, "SIGN_S", 0.02)
+
+    async def body() -> None:
+        free = asyncio.Event()
+        two = Two(tmp_path, Slow(free))
+        shipping = asyncio.create_task(ship(two, content))
+        while sum(isinstance(message, Chunk) for message in two.out.said) < 6:
+            await asyncio.sleep(0)
+        two.shipper.answers_may_be_lost("robot2")
+        await asyncio.sleep(3 * transfer.PATIENCE_S)
+        assert not shipping.done()
+        free.set()
+        await shipping
+
+    run(body())
+
+
+@pytest.mark.usefixtures("little_patience")
 def test_never_more_chunks_are_under_way_than_there_is_credit_for(tmp_path: Path, content: Path) -> None:
     async def body() -> None:
         two = Two(tmp_path, Desk())
