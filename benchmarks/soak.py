@@ -285,8 +285,15 @@ def _looked_at(robot: RobotMachine) -> dict[str, tuple[float, float]]:
 
 
 def _opened(pid: int) -> list[str]:
-    """The targets of its descriptors."""
-    return [os.readlink(f"/proc/{pid}/fd/{name}") for name in os.listdir(f"/proc/{pid}/fd")]
+    """The targets of its descriptors; of one that is closed meanwhile: an empty text."""
+    return [_target(f"/proc/{pid}/fd/{name}") for name in os.listdir(f"/proc/{pid}/fd")]
+
+
+def _target(path: str) -> str:
+    try:
+        return os.readlink(path)
+    except FileNotFoundError:
+        return ""
 
 
 def _kept_by(opened: list[str], followed: dict[int, str]) -> str:
