@@ -121,6 +121,7 @@ class NewFile:
         self._writer = Writer(cast("IO[Any]", self._stream), chunk_size=CHUNK_SIZE)
         self._schemas: dict[SchemaText, int] = {}
         self._count = 0
+        self._is_failed = False
         self._writer.start(library=library)
 
     @property
@@ -156,21 +157,24 @@ class NewFile:
         """Bring all messages so far into the file, as whole chunks.
 
         Raises:
-            RecordingError: they cannot be written; what was there is kept. Only `abandon` may follow.
+            RecordingError: they cannot be written; what was there is kept. Only `close` or `abandon` may follow.
         """
         self._written(self._writer.flush)
 
     def close(self) -> None:
-        """Write the index, and close the file.
+        """Write the index, and close the file; one that could not be written is only closed, and so is one that is closed.
 
         Raises:
             RecordingError: as for `flush`.
         """
-        self.flush()
-        self._written(self._writer.finish)
-        self._written(self._stream.flush)
-        self._written(lambda: os.fsync(self._descriptor))
-        self.abandon()
+        try:
+            if self._descriptor >= 0 and not self._is_failed:
+                self.flush()
+                self._written(self._writer.finish)
+                self._written(self._stream.flush)
+                self._written(lambda: os.fsync(self._descriptor))
+        finally:
+            self.abandon()
 
     def abandon(self) -> None:
         """Close the file as it is."""
@@ -182,6 +186,7 @@ class NewFile:
         try:
             act()
         except OSError as error:
+            self._is_failed = True
             raise RecordingError(
                 f"cannot write {self.path} any more: {error.strerror}; it keeps its first {self._stream.written} bytes, what was "
                 f"recorded until a second before; make room, then failover board record --recover {self.path} gives it its index"

@@ -59,9 +59,8 @@ class Recorder:
         begin_s = time.monotonic()
         try:
             self.stream.run(self._plan.rate, self._plan.span_s, self._each_second)
-            self._file.close()
         finally:
-            self._file.abandon()
+            self._file.close()
             self.took_s = time.monotonic() - begin_s
 
     def _each_second(self) -> None:

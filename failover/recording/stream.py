@@ -111,11 +111,13 @@ class Counts(Struct):
     Attributes:
         missed: puts that were replaced between two looks.
         pauses: sentences on spans in which there was no board.
+        misfits: sentences on items that are declared as a type which their values do not have.
     """
 
     robots: set[str]
     items: set[str]
     pauses: list[str]
+    misfits: set[str]
     puts: int = 0
     missed: int = 0
     decisions: int = 0
@@ -133,7 +135,7 @@ class Stream:
         self._coders: dict[int, tuple[object, Coder, int]] = {}
         self._channels: dict[object, int] = {}
         self._pause = ""
-        self.counts = Counts(set(), set(), [])
+        self.counts = Counts(set(), set(), [], set())
         self.is_ended = False
 
     def begin_anew(self, sink: Sink) -> None:
@@ -201,6 +203,10 @@ class Stream:
     def _line(self, fresh: Fresh) -> tuple[Coder, int]:
         """How values of an item are said, and the number of its channel."""
         channel = recording.channel_of(fresh.robot, fresh.record, fresh.private)
+        if why := recording.misfit_of(fresh.record):
+            self.counts.misfits.add(
+                f"item {fresh.record.name!r} of {fresh.robot} is told as bytes: {why}; its declaration is wrong"
+            )
         if channel not in self._channels:
             metadata = recording.metadata_of(channel)
             self._channels[channel] = self._sink.channel(channel.topic, recording.item_schema(channel), metadata)

@@ -79,6 +79,8 @@ def record(arguments: argparse.Namespace) -> int:
     told, files = recorder.stream.counts, recorder.files
     if decisions is not None and decisions.complaint and (is_agents or told.decisions):
         note(f"decisions of the agents are not recorded to the end: {decisions.complaint}")
+    for misfit in sorted(told.misfits):
+        note(misfit)
     for pause in told.pauses:
         note(f"nothing was recorded for a while: {pause}")
     written = sum(path.stat().st_size for path in files)
@@ -192,4 +194,6 @@ def serve(arguments: argparse.Namespace) -> int:
             stream = Stream(board, follower, server, _decisions(arguments))
             with ended_by_signals(stream):
                 stream.run(arguments.rate, None, each_look=server.fulfil)
+            for misfit in sorted(stream.counts.misfits):
+                note(misfit)
     return 0

@@ -11,6 +11,7 @@ minus the age that the board told then, so the latest instant at which the value
 from __future__ import annotations
 
 import binascii
+import struct
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -116,9 +117,28 @@ def topic_of(robot: str, item: str) -> str:
 
 
 def channel_of(robot: str, record: Record, private: bool) -> Channel:
-    """The channel of an item."""
+    """The channel of an item; one of bytes where the declaration says no type, or one that does not fit (`misfit_of`)."""
     fields = {name: getattr(record, name) for name in Wanted.__struct_fields__}
-    return Channel(robot, Wanted(**fields | {"text": record.text or f"bytes[{record.size}]"}), private)
+    if not record.text or misfit_of(record):
+        octets = Opaque("bytes", record.size)
+        fields |= {"text": canonical(octets), "kind": layout.BYTES, "digest": type_digest(octets)}
+    return Channel(robot, Wanted(**fields), private)
+
+
+def misfit_of(record: Record) -> str:
+    """Why the text of a declaration cannot be the type of the item's values; "": it can, or there is none."""
+    if not record.text:
+        return ""
+    try:
+        kind = parse(record.text)
+    except ItemError as error:
+        return str(error)
+    code = layout.KINDS.index(kind.kind) if isinstance(kind, Opaque) else layout.STRUCT
+    if code != record.kind:
+        return f"{record.text[:80]} is a type of kind {layout.KINDS[code]}, and the table says {layout.KINDS[record.kind]}"
+    if size_of(kind) != record.size:
+        return f"{record.text[:80]} has {size_of(kind)} bytes, and the table says {record.size}"
+    return ""
 
 
 _NUMBERS: Final = ("id", "banks", "period", "phase", "bound_ns", "flags")
@@ -299,7 +319,7 @@ class Coder:
                 is_all = told == there and self._values.pack(there) == octets
             else:
                 is_all = self._values.pack(of_json(self._kind, _decode(value), self._place)) == octets
-        except (ValueMisfitError, TypeError, UnicodeError, RecursionError):  # what msgpack can say and JSON cannot
+        except (ValueMisfitError, TypeError, UnicodeError, RecursionError, struct.error):  # what msgpack can say and JSON cannot
             is_all = False
         return Put(
             value,

@@ -32,7 +32,9 @@ from failover.cli import main
 from failover.core.board import layout, recording
 from failover.core.board.ages import NO_ERROR_BOUND
 from failover.core.frames.frame import Portion
+from failover.recording.follower import Choice, Follower
 from failover.recording.mcap_file import NewFile, Recorded
+from failover.recording.record import Plan, Recorder
 from tests.failover.boards.conftest import place as place
 from tests.failover.boards.programs import ROOT, program
 
@@ -147,6 +149,45 @@ def test_each_put_is_recorded_once_with_the_instant_at_which_it_was_produced(
     assert found[f"/{robot}/secret"][0][1]["value"] == {"a": "ff"}
     states = found[recording.ROBOTS_TOPIC][0][1]
     assert states["here"] == robot and [one["state"] for one in states["robots"]] == ["run", "run"]
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "size", "why"),
+    [
+        ("{x:f5}", layout.STRUCT, 4, "f5"),
+        ("{x:f8}", layout.STRUCT, 4, "has 8 bytes, and the table says 4"),
+        ("{x:f4}", layout.BYTES, 4, "is a type of kind struct, and the table says bytes"),
+    ],
+)
+def test_an_item_that_is_declared_wrongly_is_recorded_and_replayed_as_bytes(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, kind: int, size: int, why: str
+) -> None:
+    path = tmp_path / "team.mcap"
+    with failover.board() as board, from_robot2(board) as received:
+        received.change((), (layout.Wanted(9, "odd", size, kind=kind, digest=7, text=text),))
+        take(received, 3, 0, 0)
+        assert received.take([Portion(9, 0, 1, b"odd!")], now(), 0, 2) == 1
+        _, err = said(capsys, "record", str(path), "--for", "1ms", "--no-decisions")
+        assert "item 'odd' of robot2 is told as bytes" in err and why in err and len(err.splitlines()) == 1
+    found = messages(path)
+    assert found["/robot2/odd"][0][1]["value"] == b"odd!".hex() and found["/robot2/ball"][0][1]["value"]["n"] == 3
+    with failover.board() as board:
+        replayed = answered(capsys, "replay", str(path), "--pace", "1000")
+        assert replayed["puts"] == 2
+
+
+def test_an_error_that_is_not_the_files_leaves_a_whole_file(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "team.mcap"
+    with failover.board() as board:
+        ball = board.add(BALL)
+        ball.put({"x": 1.0, "n": 1})
+        recorder = Recorder(board, Follower(board, Choice()), Plan(path, 100.0, 60.0))
+        looks = iter([recorder.stream._follower.look])
+        monkeypatch.setattr(recorder.stream._follower, "look", lambda: next(looks)())
+        with pytest.raises(StopIteration):
+            recorder.run()
+        robot = board.robot
+    assert len(messages(path)[f"/{robot}/ball"]) == 1
 
 
 def test_only_what_is_chosen_is_recorded(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
