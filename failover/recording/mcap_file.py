@@ -120,7 +120,7 @@ class NewFile:
         self._stream = _Stream(self._descriptor)
         self._writer = Writer(cast("IO[Any]", self._stream), chunk_size=CHUNK_SIZE)
         self._schemas: dict[SchemaText, int] = {}
-        self._count = 0
+        self._channels: dict[tuple[object, ...], int] = {}
         self._is_failed = False
         self._writer.start(library=library)
 
@@ -130,15 +130,17 @@ class NewFile:
         return self._stream.tell()
 
     def channel(self, topic: str, schema: SchemaText | None, metadata: Mapping[str, str], encoding: str = "json") -> int:
-        """The number of a new channel; None: its messages have no schema.
+        """The number of a channel, the same for the same one; ``schema`` None: its messages have none.
 
         Raises:
             RecordingError: there are too many.
         """
-        if self._count == CHANNELS_MAX:
-            raise RecordingError(f"{self.path}: an MCAP file has room for {CHANNELS_MAX} channels; choose items with --items")
-        self._count += 1
-        return int(self._writer.register_channel(topic, encoding, self._schema(schema), dict(metadata)))
+        key = (topic, schema, tuple(sorted(metadata.items())), encoding)
+        if key not in self._channels:
+            if len(self._channels) == CHANNELS_MAX:
+                raise RecordingError(f"{self.path}: an MCAP file has room for {CHANNELS_MAX} channels; choose items with --items")
+            self._channels[key] = int(self._writer.register_channel(topic, encoding, self._schema(schema), dict(metadata)))
+        return self._channels[key]
 
     def _schema(self, schema: SchemaText | None) -> int:
         """The number of a schema, the same for the same one; 0: none."""

@@ -84,7 +84,7 @@ class Source:
                 found.here = found.here or recording.read_robots(message.content).here
                 continue
             before = found.channels.setdefault(message.topic, message.channel)
-            if before != message.channel:
+            if before is not message.channel and before.declared != message.channel.declared:
                 raise RecordingError(f"{message.topic} is declared in two ways in these files; replay them one after the other")
             found.puts += 1
             found.first_ns = min(found.first_ns, message.log_ns) if found.puts > 1 else message.log_ns

@@ -15,7 +15,7 @@ from msgspec import Struct
 from failover.boards import boottime
 from failover.boards.board import Board
 from failover.core.board import recording
-from failover.core.board.recording import Coder, Schema
+from failover.core.board.recording import Channel, Coder, Schema
 from failover.errors import BoardError, FailoverError
 from failover.recording.follower import Follower, Fresh
 
@@ -47,7 +47,9 @@ def nothing() -> None:
 class Sink(Protocol):
     """Where messages go."""
 
-    def channel(self, topic: str, schema: Schema | None, metadata: Mapping[str, str]) -> int: ...
+    def channel(self, topic: str, schema: Schema | None, metadata: Mapping[str, str]) -> int:
+        """The number of a channel, which replaces an earlier one of its topic."""
+        ...
 
     def add(self, channel: int, log_ns: int, publish_ns: int, sequence: int, content: bytes) -> None: ...
 
@@ -133,7 +135,7 @@ class Stream:
         self._decisions = decisions
         self._origin_ns = time.time_ns() - boottime.now_ns(board.skew_ns)
         self._coders: dict[int, tuple[object, Coder, int]] = {}
-        self._channels: dict[object, int] = {}
+        self._channels: dict[str, tuple[Channel | None, int]] = {}
         self._pause = ""
         self.counts = Counts(set(), set(), [], set())
         self.is_ended = False
@@ -207,10 +209,11 @@ class Stream:
             self.counts.misfits.add(
                 f"item {fresh.record.name!r} of {fresh.robot} is told as bytes: {why}; its declaration is wrong"
             )
-        if channel not in self._channels:
-            metadata = recording.metadata_of(channel)
-            self._channels[channel] = self._sink.channel(channel.topic, recording.item_schema(channel), metadata)
-        return Coder(channel), self._channels[channel]
+        declared, number = self._channels.get(channel.topic, (None, 0))
+        if declared != channel.declared:
+            number = self._sink.channel(channel.topic, recording.item_schema(channel), recording.metadata_of(channel))
+            self._channels[channel.topic] = (channel.declared, number)
+        return Coder(channel), number
 
     def _say_robots(self) -> None:
         if self._pause:
@@ -233,6 +236,6 @@ class Stream:
     def _say(self, topic: str, schema: Schema, message: bytes, age_ns: int) -> None:
         """A message of a channel that is no item's."""
         if topic not in self._channels:
-            self._channels[topic] = self._sink.channel(topic, schema, {})
+            self._channels[topic] = (None, self._sink.channel(topic, schema, {}))
         log_ns = self._origin_ns + boottime.now_ns(self._board.skew_ns)
-        self._sink.add(self._channels[topic], log_ns, log_ns - age_ns, 0, message)
+        self._sink.add(self._channels[topic][1], log_ns, log_ns - age_ns, 0, message)

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, UNBOUNDED_NS
@@ -109,6 +110,11 @@ class Channel(Struct, frozen=True):
     @property
     def topic(self) -> str:
         return topic_of(self.robot, self.wanted.name)
+
+    @property
+    def declared(self) -> Channel:
+        """The same without what an item gets when it is added: equal for an item that is removed and added alike."""
+        return replace(self, wanted=replace(self.wanted, id=0, flags=self.wanted.flags & ~layout.ADDED))
 
 
 def topic_of(robot: str, item: str) -> str:

@@ -8,6 +8,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,9 +22,12 @@ pytest.importorskip("websockets")
 from websockets.sync.client import ClientConnection, connect
 
 import failover
+from failover.boards import directory
 from failover.boards.board import Board
+from failover.boards.received import ReceivedItems
 from failover.cli import main
-from failover.core.board import recording
+from failover.core.board import layout, recording
+from failover.core.frames.frame import Portion
 from tests.failover.boards.conftest import place as place
 from tests.failover.boards.programs import ROOT
 
@@ -133,6 +137,34 @@ def test_an_item_that_is_declared_anew_has_another_channel(board: Board) -> None
             looker.hear()
         looker.subscribe(topic)
         assert looker.until(topic)[1]["value"] == {"y": 2.0}
+
+
+def test_an_item_that_is_declared_again_as_at_first_is_not_silent(board: Board) -> None:
+    received = ReceivedItems(directory.make_peer(board.directory, "robot2", rank=1, state=layout.RUN))
+    puts = 0
+
+    def take() -> None:
+        nonlocal puts
+        puts += 1
+        now = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        assert received.take([Portion(7, 0, puts, puts.to_bytes(4, "little"))], now, 0, puts) == 1
+
+    wanted = [
+        layout.Wanted(7, "goal", 4, kind=layout.STRUCT, flags=layout.ADDED, text=text) for text in ("{x:u4}", "{y:u4}", "{x:u4}")
+    ]
+    received.change((), wanted[:1])
+    take()
+    with served() as address, looking(address) as looker:
+        before = -1
+        for number, one in enumerate(wanted, 1):
+            if number > 1:
+                received.change((7,), (one,))
+                take()
+            while looker.channels.get("/robot2/goal", {"id": before})["id"] == before:
+                looker.hear()
+            before = looker.channels["/robot2/goal"]["id"]
+            looker.subscribe("/robot2/goal")
+            assert looker.until("/robot2/goal")[1]["value"] == {one.text[1]: number}
 
 
 def refused(capsys: pytest.CaptureFixture[str], *options: str) -> str:

@@ -176,6 +176,28 @@ def test_an_item_that_is_declared_wrongly_is_recorded_and_replayed_as_bytes(
         assert replayed["puts"] == 2
 
 
+def test_an_item_that_was_removed_and_added_alike_is_one_channel_and_is_replayed(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    with failover.board() as board:
+        recorders = []
+        for number, path in enumerate(files):
+            ball = board.add(BALL)
+            ball.put({"x": 1.0, "n": number})
+            recorders.append(Recorder(board, Follower(board, Choice()), Plan(path, 100.0, 0.0)))
+            recorders[-1].stream._look()
+            board.remove("ball")
+            board.add(BALL).put({"x": 1.0, "n": 10 + number})
+            recorders[-1].run()
+        robot = board.robot
+    with files[0].open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and [one.topic for one in summary.channels.values()] == [f"/{robot}/ball"]
+    assert [one["value"]["n"] for _, one in messages(files[0])[f"/{robot}/ball"]] == [0, 10]
+    assert answered(capsys, "replay", *map(str, files), "--pace", "1000")["puts"] == 4
+
+
 def test_an_error_that_is_not_the_files_leaves_a_whole_file(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "team.mcap"
     with failover.board() as board:
