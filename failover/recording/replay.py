@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -42,7 +42,7 @@ class Contents(Struct):
     Attributes:
         here: the robot that recorded; "": the files do not say.
         first_ns, last_ns: log times of the first and the last message.
-        lost: sentences on what the files have not.
+        lost: sentences on what the files have not, and on channels that are left out.
     """
 
     channels: dict[str, Channel] = {}
@@ -79,7 +79,8 @@ class Source:
         """
         found = Contents({}, lost=[])
         known: set[tuple[str, str]] = set()
-        for message in self.messages(known):
+        refused: dict[str, str] = {}
+        for message in self.messages(known, refused):
             if message.channel is None:
                 found.here = found.here or recording.read_robots(message.content).here
                 continue
@@ -90,42 +91,52 @@ class Source:
             found.first_ns = min(found.first_ns, message.log_ns) if found.puts > 1 else message.log_ns
             found.last_ns = max(found.last_ns, message.log_ns)
         names = ", ".join(str(file.path) for file in self._files)
-        if not known:
+        if not known and not refused:
             raise RecordingError(f"{names}: no item of a board is recorded there; failover board record makes such files")
+        if refused and not found.channels:
+            raise RecordingError(next(iter(refused.values())))
         self._choice.check(known)
         if not found.channels:
             raise BoardError(f"{names}: no item is chosen: none of the robots in --robots has one of --items")
         found.lost = [said for file in self._files if (said := file.loss.sentence(file.path))]
+        found.lost += [f"{said}; {topic} is left out" for topic, said in refused.items()]
         found.here = found.here or next(iter(found.channels.values())).robot
         return found
 
-    def messages(self, known: set[tuple[str, str]] | None = None) -> Iterator[_Message]:
+    def messages(self, known: set[tuple[str, str]] | None = None, refused: dict[str, str] | None = None) -> Iterator[_Message]:
         """The chosen messages of items, and those of the robots' states.
 
         Args:
-            known: is filled with all robots and items.
+            known: is filled with all robots and items. refused: with the topics of chosen channels that cannot be read, and why.
         """
+        known = set() if known is None else known
+        refused = {} if refused is None else refused
         for file in self._files:
             channels: dict[int, Channel | None] = {}
             for _, channel, message in file.messages():
                 if channel.id not in channels:
-                    channels[channel.id] = self._channel(file.path, channel.metadata, known)
+                    channels[channel.id] = self._channel(file.path, channel, known, refused)
                 one = channels[channel.id]
                 if one is None and channel.topic != recording.ROBOTS_TOPIC:
                     continue
                 age_ns = max(message.log_time - message.publish_time, 0)
-                if one is None or self._choice.has(one.robot, one.wanted.name):
-                    yield _Message(one, channel.topic, message.log_time, age_ns, message.data)
+                yield _Message(one, channel.topic, message.log_time, age_ns, message.data)
 
-    @staticmethod
-    def _channel(path: Path, metadata: dict[str, str], known: set[tuple[str, str]] | None) -> Channel | None:
+    def _channel(self, path: Path, said: Any, known: set[tuple[str, str]], refused: dict[str, str]) -> Channel | None:
+        """A channel of a chosen item; None: it is another one."""
+        metadata = said.metadata
+        if recording.FORMAT_KEY not in metadata:
+            return None
+        robot, item = metadata.get("robot", ""), metadata.get("item", "")
+        if robot.isprintable() and item.isprintable():  # others are in no sentence
+            known.add((robot, item))
+        if not self._choice.has(robot, item):
+            return None
         try:
-            channel = recording.read_channel(metadata)
+            return recording.read_channel(metadata)
         except RecordingError as error:
-            raise RecordingError(f"{path}: {error}") from None
-        if channel is not None and known is not None:
-            known.add((channel.robot, channel.wanted.name))
-        return channel
+            refused.setdefault(said.topic[:80], f"{path}: {error}")
+            return None
 
 
 # --- Where values go -------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 pytest.importorskip("mcap")
@@ -453,6 +454,27 @@ def test_an_agents_board_is_left_alone_unless_names_have_a_prefix(
         for one in place.iterdir():
             one.unlink()
         place.rmdir()
+
+
+def test_a_channel_that_cannot_be_read_is_left_out_and_told(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "team.mcap"
+    file = NewFile(path, "test")
+    wanted = layout.wanted_of(BALL, 0)
+    for name in ("ball", "goal", "odd"):
+        channel = recording.Channel("robot2", msgspec.structs.replace(wanted, name=name))
+        metadata = recording.metadata_of(channel) | ({"type": "{x:f5}"} if name == "odd" else {})
+        put = recording.Coder(channel).put_of(bytes(16), 1, 0, 0, False)
+        file.add(file.channel(channel.topic, None, metadata), 1, 1, 1, recording.encode(put))
+    file.close()
+    answer = answered(capsys, "replay", str(path))
+    assert answer["puts"] == 2 and len(answer["lost"]) == 1
+    assert "the declaration of 'odd'" in answer["lost"][0] and "/robot2/odd is left out" in answer["lost"][0]
+    answer = answered(capsys, "replay", str(path), "--items", "ball")
+    assert answer["puts"] == 1 and answer["lost"] == []
+    _, err = said(capsys, "replay", str(path), "--items", "odd", status=1)
+    assert "damaged: the declaration of 'odd'" in err and len(err.splitlines()) == 1
 
 
 def test_a_recording_of_something_else_is_refused(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
