@@ -32,6 +32,9 @@ RAW_SIZE_MAX: Final = 256 << 20
 MAGIC_SIZE: Final = 8
 """Bytes with which a file begins and ends."""
 
+INDEX_MAX: Final = 250_000
+"""Entries of a file's index from which it `is_full`: the library keeps them in memory until the file is closed."""
+
 CHANNELS_MAX: Final = 65_535
 """Channels and schemas of a file have numbers of two bytes, from 1."""
 
@@ -92,6 +95,7 @@ class NewFile:
     Attributes:
         path: where it is.
         messages: so far.
+        index_entries: so far: one for each chunk, and one for each channel that has messages in it.
     """
 
     def __init__(self, path: Path, library: str) -> None:
@@ -122,7 +126,14 @@ class NewFile:
         self._schemas: dict[SchemaText, int] = {}
         self._channels: dict[tuple[object, ...], int] = {}
         self._is_failed = False
+        self.index_entries = 0
+        self._active: set[int] = set()
         self._writer.start(library=library)
+
+    @property
+    def is_full(self) -> bool:
+        """Its index takes as much memory as it may."""
+        return self.index_entries >= INDEX_MAX
 
     @property
     def size(self) -> int:
@@ -152,8 +163,16 @@ class NewFile:
 
     def add(self, channel: int, log_ns: int, publish_ns: int, sequence: int, content: bytes) -> None:
         """Append a message; it is in the file after the next `flush`."""
+        self._active.add(channel)
+        before = self._stream.tell()
         self._writer.add_message(channel, max(log_ns, 0), content, max(publish_ns, 0), sequence & 0xFFFF_FFFF)
         self.messages += 1
+        if self._stream.tell() != before:
+            self._count_chunk()
+
+    def _count_chunk(self) -> None:
+        self.index_entries += 1 + len(self._active)
+        self._active.clear()
 
     def flush(self) -> None:
         """Bring all messages so far into the file, as whole chunks.
@@ -162,6 +181,8 @@ class NewFile:
             RecordingError: they cannot be written; what was there is kept. Only `close` or `abandon` may follow.
         """
         self._written(self._writer.flush)
+        if self._active:
+            self._count_chunk()
 
     def close(self) -> None:
         """Write the index, and close the file; one that could not be written is only closed, and so is one that is closed.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Final
 
 from msgspec import Struct
 
@@ -12,6 +13,9 @@ from failover.recording.follower import Follower
 from failover.recording.mcap_file import NewFile
 from failover.recording.stream import Decisions, Stream
 
+SIZE_MAX: Final = 256_000_000
+"""Bytes of a file if nothing else is wanted."""
+
 
 class Plan(Struct, frozen=True):
     """How to record.
@@ -19,7 +23,7 @@ class Plan(Struct, frozen=True):
     Attributes:
         rate: looks a second.
         span_s: for how long; None: until it is ended.
-        size_max: bytes from which a file is closed and another one begun; 0: never.
+        size_max: bytes from which a file is closed and another one begun, as it is when its index is full.
         keep: files that are kept, the newest; 0: all.
         library: who writes, for people.
     """
@@ -27,7 +31,7 @@ class Plan(Struct, frozen=True):
     path: Path
     rate: float
     span_s: float | None = None
-    size_max: int = 0
+    size_max: int = SIZE_MAX
     keep: int = 0
     library: str = "failover"
 
@@ -66,7 +70,7 @@ class Recorder:
     def _each_second(self) -> None:
         """Bring all into the file; begin another one if it is full."""
         self._file.flush()
-        if self._plan.size_max and self._file.size >= self._plan.size_max:
+        if self._file.size >= self._plan.size_max or self._file.is_full:
             self._rotate()
 
     def _rotate(self) -> None:

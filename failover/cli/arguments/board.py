@@ -73,7 +73,11 @@ def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
     record.add_argument("--for", dest="span", metavar="SPAN", type=_span_ms, help="end after 10s, 5min, 2h (default: at Ctrl-C)")
     _add_looks(record)
     record.add_argument(
-        "--max-size", metavar="SIZE", type=_size, default=0, help="begin another file, team-2.mcap, from 500MB or 2GB on"
+        "--max-size",
+        metavar="SIZE",
+        type=_size,
+        default=0,
+        help="begin another file, team-2.mcap, from 500MB or 2GB on (default: 256MB)",
     )
     record.add_argument("--keep", metavar="COUNT", type=whole, default=0, help="of these files, keep so many, the newest")
     record.add_argument(
@@ -193,7 +197,8 @@ RECORD_DESCRIPTION: Final = """
 
     The file grows each second. A recorder that is killed loses the last second at most: replay reads such a file as it is,
     other programs after --recover, which keeps the old file as FILE.before. The library comes with the extra "record":
-    pip install 'failover[record]'.
+    pip install 'failover[record]'. From --max-size on, or when the index of a file takes much memory, team-2.mcap is begun;
+    each file can be read alone, and replay takes them all.
 
       failover board record team.mcap
       failover board record team.mcap --items 'ball*' --robots robot2 --for 10min

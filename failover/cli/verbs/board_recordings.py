@@ -19,7 +19,6 @@ from failover.cli.output import render
 from failover.cli.output.team_tree import size
 from failover.cli.verbs.board import board_there
 from failover.core.board import layout
-from failover.errors import RequestError
 from failover.recording.follower import Choice, Follower
 from failover.recording.stream import Decisions, Stream
 
@@ -62,12 +61,10 @@ def record(arguments: argparse.Namespace) -> int:
     """Record until the span is over, Ctrl-C or SIGTERM."""
     if arguments.recover:
         return _recover(arguments)
-    from failover.recording.record import Plan, Recorder
+    from failover.recording.record import SIZE_MAX, Plan, Recorder
 
-    if arguments.keep and not arguments.max_size:
-        raise RequestError("--keep says how many files stay of those that --max-size closes: give --max-size too")
     span_s = None if arguments.span is None else arguments.span / 1000
-    plan = Plan(Path(arguments.file), arguments.rate, span_s, arguments.max_size, arguments.keep, LIBRARY)
+    plan = Plan(Path(arguments.file), arguments.rate, span_s, arguments.max_size or SIZE_MAX, arguments.keep, LIBRARY)
     with board_there(arguments) as board:
         is_agents = not board.ensured().own.header.flags & layout.ALONE
         decisions = _decisions(arguments)

@@ -33,6 +33,7 @@ from failover.cli import main
 from failover.core.board import layout, recording
 from failover.core.board.ages import NO_ERROR_BOUND
 from failover.core.frames.frame import Portion
+from failover.recording import mcap_file
 from failover.recording.follower import Choice, Follower
 from failover.recording.mcap_file import NewFile, Recorded
 from failover.recording.record import Plan, Recorder
@@ -247,6 +248,25 @@ def test_a_file_that_is_full_is_followed_by_one_that_stands_alone(
     assert tmp_path / "team.mcap" not in files and (tmp_path / "team-3.mcap").read_text() == "another one's"
     for path in files:
         assert messages(path)[f"/{robot}/goal"][0][1]["value"] == b"goal".hex()
+
+
+def test_a_file_whose_index_is_full_is_followed_by_another_one(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_file, "INDEX_MAX", 6)
+    with failover.board() as board:
+        items = [board.add(failover.Item(f"item{number}", size=4)) for number in range(4)]
+        for item in items:
+            item.put(b"x")
+        recorder = Recorder(board, Follower(board, Choice()), Plan(tmp_path / "team.mcap", 100.0, 1.5))
+        recorder.run()
+    assert [one.name for one in recorder.files] == ["team.mcap", "team-2.mcap", "team-3.mcap"][: len(recorder.files)]
+    assert len(recorder.files) > 1
+    for path in recorder.files[:-1]:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert sum(1 + len(one.message_index_offsets) for one in summary.chunk_indexes) == 6
 
 
 def test_a_killed_recorder_loses_its_last_second_at_most(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
