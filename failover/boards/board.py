@@ -221,7 +221,7 @@ class Board:
                 there = self._where(opened, declaration.name)
                 if there is None:
                     file.add(wanted)
-                elif there[0] is not file or not _is_alike(there[1], wanted):
+                elif there[0] is not file or not is_alike(there[1], wanted):
                     raise BoardError(
                         f"cannot add item {declaration.name!r}: it is declared already as {there[1].text} in {there[0].path}, "
                         f"period {there[1].period}, banks {there[1].banks}; remove it first, or take it as it is"
@@ -457,7 +457,7 @@ class Board:
         raise BoardError(f"the board {opened.directory} has no file for private items")
 
 
-def _is_alike(record: Record, wanted: layout.Wanted) -> bool:
+def is_alike(record: Record, wanted: layout.Wanted) -> bool:
     """Whether a table has an item as it is wanted: all but its number and how it came."""
     names = ("kind", "size", "banks", "period", "phase", "digest", "bound_ns")
     return all(getattr(record, name) == getattr(wanted, name) for name in names)

@@ -18,11 +18,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from failover.boards import boottime, directory
-from failover.boards.board import Board, board
+from failover.boards.board import Board, board, is_alike
 from failover.boards.received import ReceivedItems
 from failover.core.board import ages, layout, recording
 from failover.core.board.item_types import parse
-from failover.core.board.items import Item
+from failover.core.board.items import BLOCK_SIZE_MAX, Item
 from failover.core.board.layout import Wanted
 from failover.core.board.recording import Channel, Coder, Put
 from failover.core.frames.frame import Portion
@@ -32,6 +32,8 @@ from failover.recording.mcap_file import Recorded
 
 NAME: Final = "failover board replay"
 """Of this program among the board's users."""
+ROOM_LEFT: Final = 4
+"""One of so many parts of an agent's table stays free for programs."""
 SLEEP_S: Final = 0.1
 """The longest sleep without a look at the signal that ends the replay."""
 
@@ -266,13 +268,46 @@ class Stage:
                 f"give --board {directory.SHARED_MEMORY}/NAME for a board of its own, or --as PREFIX for items with other names"
             )
 
+    def _make_room(self, contents: Contents, prefix: str) -> None:
+        """Remove what a replay that was killed has left under this prefix, and is not wanted again.
+
+        Raises:
+            BoardError: too little room would be left for programs: the row of an item that was removed is not used again.
+        """
+        wanted = {_prefixed(prefix, channel): channel.wanted for channel in contents.channels.values()}
+        file = next(file for file in self.board.ensured().files if file.header.flags & layout.PRIVATE)
+        for record in file.records():
+            is_ours = record.flags & layout.ADDED and record.name.startswith(f"{prefix}.")
+            if not is_ours or record.name.count(".") < prefix.count(".") + 2:
+                continue
+            if record.name in wanted and is_alike(record, wanted[record.name]):
+                self._added.append(record.name)
+                del wanted[record.name]
+                continue
+            with contextlib.suppress(BoardError):  # a program writes it: it is that program's
+                self.board.writer(record.name).ready()
+                self.board.remove(record.name)
+        header = file.read_header()
+        rows = header.capacity - header.count - len(wanted)
+        octets = sum(one.banks * layout.aligned(layout.BANK_HEAD + one.size) for one in wanted.values())
+        left = BLOCK_SIZE_MAX - header.file_size - octets
+        if wanted and (rows < header.capacity // ROOM_LEFT or left < BLOCK_SIZE_MAX // ROOM_LEFT):
+            raise BoardError(
+                f"the board {self.board.directory} has room for {header.capacity - header.count} private items and "
+                f"{BLOCK_SIZE_MAX - header.file_size} bytes; {len(wanted)} of {octets} bytes would leave less than a quarter of "
+                "the table, and what a replay has used is free only when the agent begins anew: start the agent anew, choose "
+                f"fewer with --items, or give --board {directory.SHARED_MEMORY}/NAME for a board of its own"
+            )
+
     def _fill(self, contents: Contents, prefix: str) -> None:
         """Make every item; those of this robot first, because another process may write one of them."""
+        if prefix:
+            self._make_room(contents, prefix)
         here = self.board.robot
         own = [one for one in contents.channels.values() if prefix or one.robot == here]
         others = [one for one in contents.channels.values() if not prefix and one.robot != here]
         for channel in own:
-            name = f"{prefix}.{channel.robot}.{channel.wanted.name}" if prefix else channel.wanted.name
+            name = _prefixed(prefix, channel) if prefix else channel.wanted.name
             item = _OwnItem(self.board, replace(channel.wanted, name=name), not (prefix or channel.private))
             self.targets[channel.topic] = item
             if prefix and not item.was_there:
@@ -303,6 +338,10 @@ class Stage:
             with contextlib.suppress(BoardError):
                 self.board.remove(name)
         self.board.close()
+
+
+def _prefixed(prefix: str, channel: Channel) -> str:
+    return f"{prefix}.{channel.robot}.{channel.wanted.name}"
 
 
 class Player:

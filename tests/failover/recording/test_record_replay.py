@@ -470,6 +470,39 @@ def test_an_agents_board_is_left_alone_unless_names_have_a_prefix(
                 replay.terminate()
                 replay.communicate()
             assert replay.returncode == 0 and board.names() == ["ball"]
+            with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as replay:
+                assert replay.stdout is not None
+                replay.stdout.readline()
+                replay.kill()
+            board.add(failover.Item("old.robot9.goal", size=4, shared=False))
+            board.add(failover.Item("old.mine.goal", size=4, shared=False)).put(b"mine")
+            board.add(failover.Item("old.mine", size=4, shared=False))
+            assert len(board.names()) == 6
+            rows = board.ensured().files[1].read_header().count
+            answered(capsys, "replay", str(path), "--as", "old", "--pace", "1000")
+            assert board.names() == ["ball", "old.mine.goal", "old.mine"], "one that a program writes stays"
+            assert board.ensured().files[1].read_header().count == rows, "items that were left are used again"
+    finally:
+        for one in place.iterdir():
+            one.unlink()
+        place.rmdir()
+
+
+def test_a_replay_leaves_room_for_the_programs_of_an_agents_board(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "team.mcap"
+    recorded_team(path)
+    place.mkdir()
+    for name, flags in ((directory.PRIVATE_NAME, layout.PRIVATE), (directory.OWN_NAME, layout.OWN)):
+        directory.make_file(place / name, flags, "robot1", capacity=8)
+    try:
+        for _ in range(3):
+            answered(capsys, "replay", str(path), "--as", "old", "--pace", "1000")
+        _, err = said(capsys, "replay", str(path), "--as", "old", status=1)
+        assert "has room for 2 private items" in err and "start the agent anew" in err and len(err.splitlines()) == 1
+        with failover.board() as board:
+            board.add(failover.Item("mine", size=4, shared=False))
     finally:
         for one in place.iterdir():
             one.unlink()
