@@ -6,10 +6,10 @@ numbers of the puts tell how many there were.
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Final
 
 from msgspec import Struct
@@ -114,17 +114,27 @@ class _File(Struct):
     generation: int = -1
 
 
-class Follower:
-    """Looks at a board again and again."""
+def silent(_sentence: str) -> None:
+    """Tells nothing."""
 
-    def __init__(self, board: Board, choice: Choice) -> None:
+
+class Follower:
+    """Looks at a board again and again.
+
+    Attributes:
+        tell: is given a sentence on each file that is damaged, once; the others are looked at nevertheless.
+    """
+
+    def __init__(self, board: Board, choice: Choice, tell: Callable[[str], None] = silent) -> None:
         """Raises: BoardError: nothing there is chosen."""
+        self.tell = tell
+        self._damaged: dict[str, str] = {}
         self._board = board
         self._choice = choice
         self._files: dict[str, _File] = {}
         self._listed_s = -LIST_S
         self._place = board.directory
-        known = {(robot, record.name) for robot, file in self._there() for record in file.records()}
+        known = {(robot, record.name) for robot, file in self._there() for record in self._records(file)}
         choice.check(known)
 
     def look(self) -> list[Fresh]:
@@ -157,8 +167,30 @@ class Follower:
         opened = self._board.ensured()
         yield from ((opened.robot, file) for file in opened.files)
         for robot in opened.peer_names():
-            with contextlib.suppress(BoardError):  # it went in this moment
+            try:
                 yield robot, opened.peer(robot)
+            except BoardError as error:
+                path = opened.directory / f"{directory.PEER_PREFIX}{robot}"
+                if path.exists():  # else it went in this moment
+                    self._complain(path, error)
+
+    def _records(self, file: MappedFile) -> list[Record]:
+        """Of one file; none where its table is damaged, which is told."""
+        try:
+            records = file.records()
+        except BoardGoneError:
+            return []
+        except BoardError as error:
+            self._complain(file.path, error)
+            return []
+        self._damaged.pop(str(file.path), None)
+        return records
+
+    def _complain(self, path: Path, error: BoardError) -> None:
+        said = str(error)
+        if self._damaged.get(str(path)) != said:
+            self._damaged[str(path)] = said
+            self.tell(f"the items of {path.name} are left out: {said}; its agent or writer must make it anew")
 
     def _list(self) -> None:
         """Find files that came, and leave out those that went."""
@@ -180,6 +212,10 @@ class Follower:
                 self._examine(file)
             except BoardGoneError:
                 return
+            except BoardError as error:
+                self._complain(file.file.path, error)
+                return
+            self._damaged.pop(str(file.file.path), None)
         private = bool(file.file.header.flags & layout.PRIVATE)
         for row in file.rows:
             place = row.place
@@ -202,6 +238,7 @@ class Follower:
 
         Raises:
             BoardGoneError: the file is another one by now.
+            BoardError: it is damaged.
         """
         generation = file.file.generation
         known = {row.record: row for row in file.rows}

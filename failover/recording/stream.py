@@ -206,9 +206,10 @@ class Stream:
         """How values of an item are said, and the number of its channel."""
         channel = recording.channel_of(fresh.robot, fresh.record, fresh.private)
         if why := recording.misfit_of(fresh.record):
-            self.counts.misfits.add(
-                f"item {fresh.record.name!r} of {fresh.robot} is told as bytes: {why}; its declaration is wrong"
-            )
+            said = f"item {fresh.record.name!r} of {fresh.robot} is told as bytes: {why}; its declaration is wrong"
+            if said not in self.counts.misfits:
+                self.counts.misfits.add(said)
+                self._follower.tell(said)
         declared, number = self._channels.get(channel.topic, (None, 0))
         if declared != channel.declared:
             number = self._sink.channel(channel.topic, recording.item_schema(channel), recording.metadata_of(channel))

@@ -68,7 +68,7 @@ def record(arguments: argparse.Namespace) -> int:
     with board_there(arguments) as board:
         is_agents = not board.ensured().own.header.flags & layout.ALONE
         decisions = _decisions(arguments)
-        recorder = Recorder(board, Follower(board, chosen(arguments)), plan, decisions)
+        recorder = Recorder(board, Follower(board, chosen(arguments), note), plan, decisions)
         if not arguments.json:
             print(f"recording the board of {board.robot} to {plan.path}; Ctrl-C ends it", flush=True)
         with ended_by_signals(recorder.stream):
@@ -76,8 +76,6 @@ def record(arguments: argparse.Namespace) -> int:
     told, files = recorder.stream.counts, recorder.files
     if decisions is not None and decisions.complaint and (is_agents or told.decisions):
         note(f"decisions of the agents are not recorded to the end: {decisions.complaint}")
-    for misfit in sorted(told.misfits):
-        note(misfit)
     for pause in told.pauses:
         note(f"nothing was recorded for a while: {pause}")
     written = sum(path.stat().st_size for path in files)
@@ -180,7 +178,7 @@ def serve(arguments: argparse.Namespace) -> int:
 
     check_address(arguments.listen, arguments.unsafe_listen)
     with board_there(arguments) as board:
-        follower = Follower(board, chosen(arguments))
+        follower = Follower(board, chosen(arguments), note)
         with LiveServer(f"failover {board.robot}", arguments.listen, arguments.foxglove, follower) as server:
             told = {"address": arguments.listen, "port": server.port, "robot": board.robot}
             if arguments.json:
@@ -191,6 +189,4 @@ def serve(arguments: argparse.Namespace) -> int:
             stream = Stream(board, follower, server, _decisions(arguments))
             with ended_by_signals(stream):
                 stream.run(arguments.rate, None, each_look=server.fulfil)
-            for misfit in sorted(stream.counts.misfits):
-                note(misfit)
     return 0

@@ -10,6 +10,7 @@ import pytest
 import failover
 from failover.boards import directory
 from failover.boards.board import Board
+from failover.boards.received import ReceivedItems
 from failover.core.board import layout
 from failover.errors import BoardError
 from failover.recording import follower
@@ -89,3 +90,19 @@ def test_a_board_that_an_agent_makes_anew_is_followed_and_never_made(place: Path
         for one in place.iterdir():
             one.unlink()
         place.rmdir()
+
+
+def test_a_file_whose_table_is_damaged_is_told_once_and_the_others_go_on(board: Board) -> None:
+    ball = board.add(BALL)
+    received = ReceivedItems(directory.make_peer(board.directory, "robot2", items={0: BALL}))
+    told: list[str] = []
+    follower_ = Follower(board, Choice(), told.append)
+    good = received.file.halves[(layout.RECORDS_AT + layout.BANKS_FIELD) // 2]
+    for number, banks in enumerate((99, good, 99)):
+        with received.file.changing():
+            received.file.set_word16(layout.RECORDS_AT + layout.BANKS_FIELD, banks)
+        for value in (b"1", b"2"):
+            ball.put(value)
+            assert seen(follower_)[0][:3] == (board.robot, "ball", value)
+        assert len(told) == (number + 2) // 2 and "peer-robot2" in told[0] and "has 99 banks" in told[0]
+    assert [one.robot for one in Follower(board, Choice(), told.append).look()] == [board.robot] and len(told) == 3
