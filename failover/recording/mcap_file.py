@@ -226,16 +226,20 @@ class Loss(Struct):
         is_finished: it has its last record and its index.
         tail: bytes at its end that are no whole record.
         chunks: of messages that were damaged, and left out.
+        is_written: a process is recording it, and what it has written since the first look is not read.
     """
 
     is_finished: bool = False
     tail: int = 0
     chunks: int = 0
+    is_written: bool = False
 
     def sentence(self, path: Path) -> str:
         """What is lost; "" if nothing is."""
         told = []
-        if not self.is_finished:
+        if self.is_written:
+            told.append("it is being recorded: what comes from now on is left out")
+        elif not self.is_finished:
             rest = (
                 f"its last {self.tail} bytes are no whole record and are left out" if self.tail else "all its records are whole"
             )
@@ -246,7 +250,7 @@ class Loss(Struct):
 
 
 class Recorded:
-    """An MCAP file to be read, any number of times."""
+    """An MCAP file to be read, any number of times: each time what it had when it was opened first."""
 
     def __init__(self, path: Path) -> None:
         """Look at its beginning.
@@ -260,14 +264,16 @@ class Recorded:
         from mcap.stream_reader import read_magic
 
         self.path = path
-        self.loss = Loss()
         with self._opened() as file:
+            self._size = os.fstat(file.fileno()).st_size
+            self._is_written = _is_written(file)
             try:
                 read_magic(ReadDataStream(file))
             except (McapError, struct.error):
                 raise RecordingError(f"{path} is no MCAP file: its first bytes are not those of one") from None
             except OSError as error:
                 raise RecordingError(f"cannot read {path}: {error.strerror}") from error
+        self.loss = Loss(is_written=self._is_written)
 
     def _opened(self) -> IO[bytes]:
         try:
@@ -287,7 +293,7 @@ class Recorded:
 
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        loss = Loss()
+        loss = Loss(is_written=self._is_written)
         for record in self._records(loss):
             if isinstance(record, Schema):
                 schemas[record.id] = record
@@ -304,10 +310,12 @@ class Recorded:
         from mcap.stream_reader import StreamReader, breakup_chunk
 
         with self._opened() as file:
-            size = os.fstat(file.fileno()).st_size
+            size = min(self._size, os.fstat(file.fileno()).st_size)
             whole, has_footer = MAGIC_SIZE, False
             for record in _whole(StreamReader(file, emit_chunks=True, record_size_limit=size).records):
                 end = file.tell()
+                if end > size:
+                    break
                 if isinstance(record, Chunk):
                     inner = _broken_up(record, breakup_chunk)
                     if inner is None and end == size:
@@ -370,7 +378,7 @@ def recover(path: Path, library: str) -> Recovered:
         RecordingError: it is none, or there is no room; nothing was changed.
     """
     recorded = Recorded(path)
-    if _is_written(path):
+    if recorded.loss.is_written:
         raise RecordingError(f"{path} is being recorded now: end its recorder first, which gives it its index")
     messages = sum(1 for _ in recorded.messages())
     if not recorded.loss.sentence(path):
@@ -396,13 +404,14 @@ def recover(path: Path, library: str) -> Recovered:
     return Recovered(file.messages, recorded.loss, kept)
 
 
-def _is_written(path: Path) -> bool:
-    """Whether a process writes a file."""
-    with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
+def _is_written(file: IO[bytes]) -> bool:
+    """Whether a process writes a file; the lock that finds it goes when ``file`` is closed."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
     return False
 
 

@@ -32,6 +32,8 @@ from failover.recording.mcap_file import Recorded
 
 NAME: Final = "failover board replay"
 """Of this program among the board's users."""
+TURN_S: Final = 0.1
+"""What a turn of a replay takes at least that begins again and again, also where all was recorded in one instant."""
 ROOM_LEFT: Final = 4
 """One of so many parts of an agent's table stays free for programs."""
 SLEEP_S: Final = 0.1
@@ -356,8 +358,8 @@ class Player:
         self.is_ended = False
         self.puts = 0
 
-    def run(self) -> None:
-        """Play it once.
+    def run(self, least_s: float = 0.0) -> None:
+        """Play it once, which takes ``least_s`` at least.
 
         Raises:
             RecordingError: a message is damaged; what came before it is played.
@@ -372,10 +374,14 @@ class Player:
             if message.channel is None:
                 self._stage.tell_robots(message.content)
                 continue
+            target = self._stage.targets.get(message.topic)
+            if target is None:
+                continue  # the file is another one than it was when it was examined
             put: Put = recording.read_put(message.content, message.topic)
             octets = self._coders[message.topic].octets_of(put)
-            self._stage.targets[message.topic].put(octets, message.age_ns, put.error_us)
+            target.put(octets, message.age_ns, put.error_us)
             self.puts += 1
+        self._sleep_until(begin_s + least_s)
 
     def _sleep_until(self, instant_s: float) -> None:
         while not self.is_ended and (left_s := instant_s - time.monotonic()) > 0:

@@ -136,7 +136,7 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 def replay(arguments: argparse.Namespace) -> int:
     """Play the files once, or again and again."""
-    from failover.recording.replay import Player, Source, Stage
+    from failover.recording.replay import TURN_S, Player, Source, Stage
 
     source = Source([Path(file) for file in arguments.files], chosen(arguments))
     contents = source.examined()
@@ -156,11 +156,12 @@ def replay(arguments: argparse.Namespace) -> int:
             )
         for said in stage.notes:
             note(said)
+        least_s = TURN_S if arguments.loop else 0.0
         player = Player(source, contents, stage, arguments.pace)
         with ended_by_signals(player):
-            player.run()
+            player.run(least_s)
             while arguments.loop and not player.is_ended:
-                player.run()
+                player.run(least_s)
     answer = {"puts": player.puts, "items": len(contents.channels), "robots": robots, "span_s": round(span_s, 3)}
     if arguments.json:
         render.as_json(answer | {"lost": contents.lost})

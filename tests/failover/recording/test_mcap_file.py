@@ -96,8 +96,13 @@ def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="is being recorded now"):
         recover(path, "test")
     assert numbers(Recorded(path)) == [1] and len(list(tmp_path.iterdir())) == 1
+    recorded = Recorded(path)
+    file.add(file.channel("/r/new", None, {}), 2, 2, 2, b"{}")
+    file.flush()
+    assert numbers(recorded) == [1], "what it had when it was opened"
+    assert recorded.loss.is_written and recorded.loss.tail == 0 and "it is being recorded" in recorded.loss.sentence(path)
     file.close()
-    assert by_mcap(path) == [1]
+    assert numbers(recorded) == [1] and by_mcap(path) == [1, 2]
 
 
 def test_a_damaged_chunk_is_left_out_and_told(tmp_path: Path) -> None:

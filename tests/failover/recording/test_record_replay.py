@@ -37,6 +37,7 @@ from failover.recording import mcap_file
 from failover.recording.follower import Choice, Follower
 from failover.recording.mcap_file import NewFile, Recorded
 from failover.recording.record import Plan, Recorder
+from failover.recording.replay import TURN_S, Player, Source, Stage
 from tests.failover.boards.conftest import place as place
 from tests.failover.boards.programs import ROOT, program
 
@@ -507,6 +508,26 @@ def test_a_replay_leaves_room_for_the_programs_of_an_agents_board(
         for one in place.iterdir():
             one.unlink()
         place.rmdir()
+
+
+def test_a_file_that_is_being_recorded_is_replayed_as_it_was_when_it_was_examined(place: Path, tmp_path: Path) -> None:
+    path = tmp_path / "team.mcap"
+    file = NewFile(path, "test")
+    for name in ("ball", "goal"):
+        channel = recording.Channel("robot2", msgspec.structs.replace(layout.wanted_of(BALL, 0), name=name))
+        put = recording.Coder(channel).put_of(bytes(16), 1, 0, 0, False)
+        file.add(file.channel(channel.topic, None, recording.metadata_of(channel)), 1, 1, 1, recording.encode(put))
+        file.flush()
+        if name == "ball":
+            source = Source([path], Choice())
+            contents = source.examined()
+    assert contents.lost == [f"{path}: it is being recorded: what comes from now on is left out"]
+    with Stage(place, contents, "") as stage:
+        player = Player(source, contents, stage, 1.0)
+        begin_s = time.monotonic()
+        player.run(TURN_S)
+        assert player.puts == 1 and time.monotonic() >= begin_s + TURN_S, "a turn without a span takes a while"
+    file.close()
 
 
 def test_a_channel_that_cannot_be_read_is_left_out_and_told(
