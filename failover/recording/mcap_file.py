@@ -12,6 +12,7 @@ import os
 import stat
 import struct
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final, cast
 
@@ -350,9 +351,33 @@ def _broken_up(chunk: Any, break_up: Any) -> list[Any] | None:
     if chunk.uncompressed_size > RAW_SIZE_MAX:
         return None
     try:
-        return list(break_up(chunk, validate_crc=True))
+        raw = _unpacked(chunk)
+        if len(raw) != chunk.uncompressed_size:
+            return None
+        return list(break_up(replace(chunk, compression="", data=raw), validate_crc=True))
     except Exception:  # noqa: BLE001  # its bytes are anything, and each codec has errors of its own
         return None
+
+
+def _unpacked(chunk: Any) -> bytes:
+    """The records of a chunk, and at most a byte more than it says that they have: the codecs' own sizes may be made to do harm.
+
+    Raises:
+        Exception: its codec is not known, not installed, or refuses the bytes.
+    """
+    most = chunk.uncompressed_size + 1
+    if chunk.compression == "zstd":
+        import zstandard
+
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            return bytes(reader.read(most))
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
+    if chunk.compression:
+        raise ValueError(f"no codec {chunk.compression!r} is known")
+    return bytes(chunk.data)
 
 
 # --- Recovery --------------------------------------------------------------------------------------------------------

@@ -347,7 +347,7 @@ class Coder:
                 octets = self._values.pack(of_json(self._kind, put.value, self._place))
             else:
                 octets = binascii.a2b_base64(put.raw, strict_mode=True)
-        except (ValueMisfitError, binascii.Error, RecursionError) as error:
+        except (ValueMisfitError, ValueError, RecursionError) as error:  # `raw` that is no base64, or no ASCII
             raise RecordingError(f"damaged: put {put.number} of {self._place}: {error}") from None
         most = size_of(self._kind)
         least = 0 if isinstance(self._kind, Opaque) else most
@@ -364,7 +364,7 @@ def read_put(content: bytes, topic: str) -> Put:
     """
     try:
         return _decode_put(content)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(f"damaged: a message of {topic[:80]}: {error}") from None
 
 
@@ -376,5 +376,5 @@ def read_robots(content: bytes) -> Robots:
     """
     try:
         return _decode_robots(content)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(f"damaged: a message of {ROBOTS_TOPIC}: {error}") from None

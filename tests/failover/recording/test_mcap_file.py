@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip("mcap")
 
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 from failover.core.board.recording import Schema
 from failover.errors import RecordingError
@@ -115,6 +117,24 @@ def test_a_damaged_chunk_is_left_out_and_told(tmp_path: Path) -> None:
     recorded = Recorded(path)
     assert numbers(recorded) == []  # the channel was told in the first chunk alone
     assert recorded.loss.chunks == 1 and "1 damaged chunks are left out" in recorded.loss.sentence(path)
+
+
+@pytest.mark.parametrize("codec", ["zstd", "lz4"])
+@pytest.mark.parametrize("change", [0, 1, -1])
+def test_a_chunk_that_unpacks_to_another_size_than_it_says_is_left_out(tmp_path: Path, codec: str, change: int) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType[codec.upper()])
+        writer.start()
+        writer.add_message(writer.register_channel("/r/i", "json", 0), 1, b"{}" * 500, 1)
+        writer.finish()
+    octets = bytearray(path.read_bytes())
+    at = octets.index(codec.encode()) - 16
+    (size,) = struct.unpack_from("<Q", octets, at)
+    struct.pack_into("<Q", octets, at, size + change)
+    path.write_bytes(octets)
+    recorded = Recorded(path)
+    assert len(numbers(recorded)) == (change == 0) and recorded.loss.chunks == (change != 0)
 
 
 def test_any_damage_is_read_around_or_told(tmp_path: Path) -> None:

@@ -101,7 +101,16 @@ def test_a_missing_word_of_a_declaration_is_named() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"[]", b'{"value":1}', b'{"value":1,"number":"x","age_us":1,"stale":false}', b"[" * 100_000, b"\xff\xfe"],
+    [
+        b"",
+        b"{",
+        b"[]",
+        b'{"value":1}',
+        b'{"value":1,"number":"x","age_us":1,"stale":false}',
+        b"[" * 100_000,
+        b"\xff\xfe",
+        b'{"value":"\xff","number":1,"age_us":1,"stale":false,"raw":"\xff"}',
+    ],
 )
 def test_a_message_that_is_none_is_refused(content: bytes) -> None:
     with pytest.raises(RecordingError, match="damaged: a message of /r/i"):
@@ -109,7 +118,15 @@ def test_a_message_that_is_none_is_refused(content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "said", [{"value": "x"}, {"value": 1e999}, {"value": None}, {"value": 1.0, "raw": "??"}, {"value": 1.0, "raw": "AAAA"}]
+    "said",
+    [
+        {"value": "x"},
+        {"value": 1e999},
+        {"value": None},
+        {"value": 1.0, "raw": "??"},
+        {"value": 1.0, "raw": "AAAA"},
+        {"value": 1.0, "raw": "é"},
+    ],
 )
 def test_a_value_of_another_type_is_refused(said: dict[str, object]) -> None:
     put = msgspec.convert({"number": 3, "age_us": 1, "stale": False} | said, recording.Put)
