@@ -60,7 +60,8 @@ class Decisions:
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
         self._since_s = time.time()
-        self._asked_s = time.monotonic()
+        self._begin_s = self._asked_s = time.monotonic()
+        self._heard_s: dict[str, float] = {}
         self._known: set[tuple[object, ...]] = set()
         self._waiting: list[Mapping[str, Any]] = []
         self._lock = threading.Lock()
@@ -90,13 +91,18 @@ class Decisions:
         self._look()
 
     def _look(self) -> None:
-        asked_s = time.monotonic()
+        asked_s, since_s = time.monotonic(), self._asked_s
         try:
-            answer = self._ask(round((asked_s - self._asked_s) * 1000) + MARGIN_MS)
+            answer = self._ask(round((asked_s - since_s) * 1000) + MARGIN_MS)
+            behind_s = min(map(self._heard_until, _answered(answer)), default=since_s)
+            if behind_s < since_s:  # a robot that was cut off is back: what it decided meanwhile
+                since_s = behind_s
+                answer = self._ask(round((asked_s - since_s) * 1000) + MARGIN_MS)
         except (FailoverError, OSError) as error:
             self.complaint = str(error)
             return
         self.complaint, self._asked_s = "", asked_s
+        self._heard_s |= {robot: asked_s for robot in _answered(answer) if self._heard_until(robot) >= since_s}
         fresh = []
         for line in answer.get("story") or ():
             key = (line.get("robot"), line.get("life"), line.get("number"))
@@ -105,6 +111,15 @@ class Decisions:
                 fresh.append(line)
         with self._lock:
             self._waiting += fresh
+
+    def _heard_until(self, robot: str) -> float:
+        """By the monotonic clock: a robot's decisions before it are known."""
+        return self._heard_s.get(robot, self._begin_s)
+
+
+def _answered(answer: Mapping[str, Any]) -> list[str]:
+    """The robots of an answer to ``why`` that have answered."""
+    return [str(one.get("robot")) for one in answer.get("robots") or () if one.get("answered")]
 
 
 class Counts(Struct):

@@ -38,6 +38,7 @@ from failover.recording.follower import Choice, Follower
 from failover.recording.mcap_file import NewFile, Recorded
 from failover.recording.record import Plan, Recorder
 from failover.recording.replay import TURN_S, Player, Source, Stage
+from failover.recording.stream import Decisions
 from tests.failover.boards.conftest import place as place
 from tests.failover.boards.programs import ROOT, program
 
@@ -355,6 +356,34 @@ def test_a_signal_ends_a_recording_in_order(place: Path, tmp_path: Path) -> None
             out, _ = recorder.communicate()
     assert recorder.returncode == 0 and "1 puts of 1 items of 1 robots" in out
     assert len(messages(path)) == 2
+
+
+def test_decisions_of_a_robot_that_was_cut_off_are_asked_for_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = time.time()
+    clock_s = 1000.0
+    monkeypatch.setattr("failover.recording.stream.time.monotonic", lambda: clock_s)
+    team = ("robot1", "robot2")
+    lines = [{"robot": robot, "life": 1, "number": n, "at": now_s + 10 * n} for robot in team for n in range(1, 7)]
+    turn = 0
+    cut = {2, 3, 4, 5}
+
+    def ask(age_ms: int) -> dict[str, Any]:
+        """As an agent answers after 10 s times ``turn``; robot2 is cut off in some turns."""
+        there = [robot for robot in team if robot == "robot1" or turn not in cut]
+        known_s = now_s + 10 * turn
+        story = [one for one in lines if one["robot"] in there and known_s - age_ms / 1000 <= one["at"] <= known_s]
+        asked.append(age_ms)
+        return {"robots": [{"robot": robot, "answered": robot in there} for robot in team], "story": story}
+
+    decisions = Decisions(ask)
+    got: list[tuple[object, object]] = []
+    asked: list[int] = []
+    for turn in range(1, 8):  # noqa: B007  # `ask` reads it
+        clock_s += 10
+        decisions._look()
+        got += [(one["robot"], one["number"]) for one in decisions.taken()]
+    assert sorted(got) == [(one["robot"], one["number"]) for one in lines]
+    assert asked == [15_000] * 6 + [55_000] + [15_000], "the long question is asked once"
 
 
 # --- Replay ----------------------------------------------------------------------------------------------------------
