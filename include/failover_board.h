@@ -288,7 +288,7 @@ struct fb_component {
     uint64_t seen, epoch, since;
     uint64_t last;                   /* number of the last reading */
     char primary[65], robot[65];     /* now; of the last reading */
-    unsigned char *table;            /* FB_SIZE_MAX_ bytes */
+    unsigned char *table;            /* FB_SIZE_MAX_ bytes; behind them as many as the item has, for a value that may not be given */
     char path[256];
 };
 
@@ -1255,6 +1255,7 @@ static inline int fb_remove(fb_board *board, const char *name)
         if (index >= 0)
             __atomic_store_n((uint16_t *)(void *)(found->map + FB_RECORDS_AT_ + (uint64_t)index * FB_RECORD_SIZE_ + FB_BANKS_), 0, __ATOMIC_RELEASE);
         fb_end_change_(found);
+        outcome = index < 0 && index != -ENOENT ? index : 0;
     }
     for (fb_added_ **link = &board->added; outcome == 0 && *link != NULL;) {
         fb_added_ *added = *link;
@@ -1736,31 +1737,42 @@ static inline int fb_see_primary_(fb_component *component)
     return outcome;
 }
 
-/* What a robot has: 0; -ENODATA where it has not the item, or has never put it. */
-static inline int fb_of_robot_(fb_component *component, const char *robot, void *value, fb_reading *reading)
+/* What a robot has, behind the component's table: 0; -ENODATA where it has not the item, or has never put it. */
+static inline int fb_of_robot_(fb_component *component, const char *robot, fb_reading *found)
 {
-    const int outcome = fb_get_reading(component->item, robot, value, reading);
+    const int outcome = fb_get_reading(component->item, robot, component->table + FB_SIZE_MAX_, found);
     return outcome == -ENOENT ? -ENODATA : outcome;
+}
+
+static inline void fb_give_value_(const fb_component *component, const fb_reading *found, void *value, fb_reading *reading)
+{
+    memcpy(value, component->table + FB_SIZE_MAX_, found->size);
+    *reading = *found;
 }
 
 static inline int fb_component_get(fb_component *component, void *value, fb_reading *reading)
 {
+    fb_reading found;
     int outcome = fb_see_primary_(component);
+    memset(&found, 0, sizeof found);
     if (outcome != 0)
         return outcome;
-    outcome = fb_of_robot_(component, component->primary, value, reading);
+    outcome = fb_of_robot_(component, component->primary, &found);
     if (outcome != 0 && outcome != -ENODATA)
         return outcome;
     /* Put by the copy that runs now: under its epoch, or since it runs there; its epoch may grow while it runs. */
-    const int64_t put_ns = outcome != 0 ? 0 : fb_clock_(CLOCK_BOOTTIME) - component->item->board->skew - reading->age_ns;
-    if (outcome == 0 && (reading->number >> FB_EPOCH_BITS_ >= component->epoch || put_ns >= (int64_t)component->since)) {
-        component->last = reading->number;
+    const int64_t put_ns = outcome != 0 ? 0 : fb_clock_(CLOCK_BOOTTIME) - component->item->board->skew - found.age_ns;
+    if (outcome == 0 && (found.number >> FB_EPOCH_BITS_ >= component->epoch || put_ns >= (int64_t)component->since)) {
+        fb_give_value_(component, &found, value, reading);
+        component->last = found.number;
         memcpy(component->robot, component->primary, sizeof component->robot);
         return 0;
     }
     if (component->last != 0) {
-        outcome = fb_of_robot_(component, component->robot, value, reading);
-        if (outcome == 0 ? reading->number >= component->last : outcome != -ENODATA)
+        outcome = fb_of_robot_(component, component->robot, &found);
+        if (outcome == 0 && found.number >= component->last)
+            fb_give_value_(component, &found, value, reading);
+        if (outcome == 0 ? found.number >= component->last : outcome != -ENODATA)
             return outcome;
     }
     return fb_fail_(ENODATA, "item %s of %s: it runs on %s under epoch %llu, and has not put it there yet", component->item->name,
@@ -1816,7 +1828,7 @@ static inline fb_component *fb_of(fb_item *item, const char *component)
     if (made != NULL) {
         made->item = item;
         made->primaries = fb_new_item_(board, "primaries", FB_SIZE_MAX_, 0);
-        made->table = (unsigned char *)malloc(FB_SIZE_MAX_);
+        made->table = (unsigned char *)malloc(FB_SIZE_MAX_ + (size_t)item->size);
     }
     if (made == NULL || made->primaries == NULL || made->table == NULL) {
         if (made != NULL) {

@@ -73,11 +73,13 @@ static void of_component(const char *name, const char *after, const char *ms)
 {
     long long milliseconds = atoll(ms);
     struct timespec limit = {(time_t)(milliseconds / 1000), (long)(milliseconds % 1000) * 1000000};
-    uint64_t value = 0;
+    uint64_t value = 77;
     fb_reading reading;
     int outcome = *ms == '\0' ? fb_component_get(component_of(name), &value, &reading)
                               : fb_component_wait(component_of(name), &value, &reading, strtoull(after, NULL, 10), &limit);
-    if (outcome != 0)
+    if (outcome != 0 && value != 77)
+        printf("failed, and wrote the value %" PRIu64 "\n", value);
+    else if (outcome != 0)
         answer(outcome);
     else
         printf("%" PRIu64 " %s number %" PRIu64 " age %" PRId64 " max %" PRId64 "\n", value, fb_component_robot(component_of(name)),

@@ -11,6 +11,7 @@ import pytest
 
 from failover.boards.board import Board, board
 from failover.boards.received import ReceivedItems
+from failover.core.board import layout
 from failover.core.board.items import Item
 from failover.core.frames.frame import Portion
 from failover.errors import BoardError
@@ -61,6 +62,28 @@ def test_an_item_that_is_not_there_is_not_removed(place: Path) -> None:
     with board(place), tool(place) as c:
         assert "cannot remove item goal: this robot has none" in c.say("remove", "goal")
         assert "a name has 1 to 63 bytes" in c.say("remove", "g" * 64)
+
+
+SLEEPS = {"230", "35", "115", "101"}
+"""Numbers of clock_nanosleep and nanosleep on x86-64, and on aarch64."""
+
+
+def test_a_table_that_is_damaged_before_the_item_is_removed_is_told(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        python.add(Item("goal", size=8))
+        file = python.ensured().own
+        at = layout.RECORDS_AT + layout.BANKS_FIELD
+        answers: list[str] = []
+        asks = threading.Thread(target=lambda: answers.append(c.say("remove", "goal")))
+        with file.changing():
+            asks.start()
+            while Path(f"/proc/{c.pid}/syscall").read_text().split()[0] not in SLEEPS:
+                assert not answers, "it waits for the table, in which it has found the item"
+            file.set_word16(at, 99)
+        asks.join()
+        file.set_word16(at, 2)
+        assert len(answers) == 1 and "is damaged: record 0" in answers[0]
+        assert python.names() == ["goal"]
 
 
 # --- The item of a component -----------------------------------------------------------------------------------------

@@ -363,7 +363,9 @@ def test_decisions_of_a_robot_that_was_cut_off_are_asked_for_when_it_is_back(mon
     clock_s = 1000.0
     monkeypatch.setattr("failover.recording.stream.time.monotonic", lambda: clock_s)
     team = ("robot1", "robot2")
-    lines = [{"robot": robot, "life": 1, "number": n, "at": now_s + 10 * n} for robot in team for n in range(1, 7)]
+    lines: list[dict[str, Any]] = [
+        {"robot": robot, "life": 1, "number": n, "at": now_s + 10 * n} for robot in team for n in range(1, 7)
+    ]
     turn = 0
     cut = {2, 3, 4, 5}
 
