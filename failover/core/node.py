@@ -49,7 +49,7 @@ from failover.core.peer_claims import Testimony
 from failover.core.replication import servers, standby, warm_standby
 from failover.core.status import guarantee, view
 from failover.core.status.observations import Watch
-from failover.core.transitions import exits, failback, handover, promotion
+from failover.core.transitions import exits, failback, handover, promotion, restarts
 from failover.core.types import (
     COMPONENTS_MAX,
     ENDED,
@@ -424,6 +424,9 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
 def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     expected = component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING)
     if not expected or event.epoch != component.epoch:
+        return
+    if restarts.waits(component):  # a start that took too long: the next one begins with nothing left of it
+        turn.order(acts.Stop(component.name, component.epoch))
         return
     lost = ""
     how = "it runs" if isinstance(event, Started) else f"it resumes from checkpoint {event.position.sequence}"

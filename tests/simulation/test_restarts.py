@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from failover.core import acts
-from failover.core.events import Exited, Run
+from failover.core.events import Exited, Run, Started
 from failover.core.types import MS, ComponentSpec, Launch, Restart, Rule, Rules, State
 from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.teams import elective, pair
@@ -77,6 +77,17 @@ def test_while_it_waits_the_status_says_so() -> None:
     assert (
         "it ended with exit status 3 and is started anew in 0.1 s, start 1 of 5 in 60 s; failover stop ends that" in one.notes()
     )
+
+
+def test_a_start_that_is_done_too_late_counts_for_nothing() -> None:
+    one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE))
+    one.world.program_ends("robot1", PART, FAILS)
+    one.world.run(one.world.now_ns + 20 * MS)
+    one.world.feed(one.world.robots["robot1"], Started(PART, seen_at(one.world, "robot1", PART).epoch))
+    one.world.run(one.world.now_ns + 20 * MS)
+    assert state_at(one.world, "robot1", PART) is State.RECOVERING
+    one.world.run(one.world.now_ns + 1_000 * MS)
+    assert one.world.acting(PART) == ["robot1"]
 
 
 def test_starts_before_the_window_count_no_more() -> None:
