@@ -280,6 +280,11 @@ class Component(Struct):
         return self.state in HOLDING
 
     @property
+    def is_settled(self) -> bool:
+        """Whether its copy is here, running or frozen, or waits to be started anew: it goes on above an epoch that came to nothing."""
+        return self.state in (State.PRIMARY, State.FROZEN) or self.restart_ns > 0
+
+    @property
     def has_begun(self) -> bool:
         """Whether a checkpoint of it is here, or was ever given away, as far as is known."""
         return self.begun or bool(self.entrusted or self.trusted or self.held)

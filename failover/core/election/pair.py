@@ -517,7 +517,7 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
         open_line(component, turn)
     elif component.holding and elsewhere:
         lose(component, turn, entry.primary, entry)
-    elif component.state in (State.PRIMARY, State.FROZEN):
+    elif component.is_settled:
         renew(component, turn, entry.epoch)
     elif not component.holding:
         component.epoch, component.trusted = entry.epoch, False

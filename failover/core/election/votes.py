@@ -33,8 +33,6 @@ from failover.core.wire.names import weight
 WITHDRAWN_BEATS = 2
 """Beats for each place in the order of names that a robot waits after a claim in vain: the next one finds no rival."""
 
-_SETTLED = frozenset({State.PRIMARY, State.FROZEN})
-
 
 def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant, a majority would agree, and this robot is the one to run it."""
@@ -160,11 +158,11 @@ def _heard_rival(component: Component, turn: Turn, sender: str, entry: Entry, th
             withdraw(component, turn, f"{sender} holds or claims epoch {entry.epoch}")
             _heard_holder(component, turn, sender, entry)
     elif majority.leased(component, turn):
-        if later and component.state in _SETTLED:
+        if later and component.is_settled:
             renew(component, turn, entry.epoch)
     elif _prevails(component, turn, sender, entry):
         lose(component, turn, sender, entry)
-    elif theirs is not State.CLAIMING and component.state in _SETTLED:
+    elif theirs is not State.CLAIMING and component.is_settled:
         _contend(component, turn, sender, entry, theirs)
 
 
@@ -196,7 +194,7 @@ def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, thei
     if not component.holding or component.state is State.CLAIMING:
         heard_end(component, turn, sender, entry, theirs)
     elif entry.epoch > component.epoch and majority.leased(component, turn):
-        if component.state in _SETTLED and turn.config.runs(sender):
+        if component.is_settled and turn.config.runs(sender):
             renew(component, turn, entry.epoch)
     elif _is_decided(component, turn, entry) or (sender == entry.primary and _prevails(component, turn, sender, entry)):
         lose(component, turn, entry.primary, entry)
@@ -213,7 +211,7 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
     if component.state is State.CLAIMING:
         if turn.config.runs(sender):
             withdraw(component, turn, f"epoch {entry.epoch} is known already")
-    elif component.state in _SETTLED and (majority.leased(component, turn) or not decided):
+    elif component.is_settled and (majority.leased(component, turn) or not decided):
         if turn.config.runs(sender) or _needs_the_vote(component, turn):
             renew(component, turn, entry.epoch)
     elif component.holding and decided and not majority.leased(component, turn):

@@ -14,6 +14,7 @@ from failover.core.election import majority
 from failover.core.election.pair import claim, exhaustion, living_entries, renew, vacant
 from failover.core.events import Promote
 from failover.core.replication.servers import offer
+from failover.core.transitions import restarts
 from failover.core.types import MS, State
 
 SKIPPED_EPOCHS = 1
@@ -32,7 +33,7 @@ def obey(component: Component, turn: Turn, command: Promote) -> None:
         turn.order(acts.Answer(command.request, True, _loss(component, turn), risks(component, turn)))
     elif component.state is State.CLAIMING:
         _go_on_with_the_claim(component, turn, command.request)
-    elif component.state is State.FROZEN:
+    elif _stands_here(component):
         _let_it_go_on(component, turn, command.request)
     elif component.newest is None:
         _want(component, turn, command.request)
@@ -71,10 +72,11 @@ def _refusal(component: Component, turn: Turn) -> str:
         return spent
     if component.state in _ENDED_WELL:
         return f"it is {component.state}; failover run starts it anew"
-    waits = not turn.config.by_majority and component.state in (State.CLAIMING, State.FROZEN)
+    is_here = component.state is State.CLAIMING or _stands_here(component)
+    waits = is_here and not turn.config.by_majority
     if (component.holding and not waits) or component.state is State.STOPPING:
         return f"here it is {component.state}"
-    if component.state not in (State.CLAIMING, State.FROZEN) and _best(component, turn) is None:
+    if not is_here and _best(component, turn) is None:
         return f"neither {me} nor a robot that it hears holds a checkpoint of it" + (
             f": {component.unable}" if component.unable else ""
         )
@@ -90,6 +92,11 @@ def _refusal(component: Component, turn: Turn) -> str:
     if component.flight is not None and component.flight.position is None:
         return f"the agent is taking a snapshot of {name}; try again"
     return ""
+
+
+def _stands_here(component: Component) -> bool:
+    """Whether its copy here, frozen or ended, waits for the word of another robot."""
+    return component.state is State.FROZEN or restarts.waits(component)
 
 
 def _no_majority(component: Component, turn: Turn) -> str:
@@ -193,6 +200,8 @@ def _loss(component: Component, turn: Turn) -> str:
     where = f"{component.name} would resume at {turn.me}"
     if component.state is State.FROZEN:
         return f"{where}, where it is frozen"
+    if restarts.waits(component):
+        return f"{where}, where it waits to be started anew"
     best = _best(component, turn)
     if component.state is State.CLAIMING:
         best = (turn.me, component.plan) if component.plan else None
