@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import pytest
+from msgspec.structs import replace
 
 from failover.core import acts
 from failover.core.events import Exited, Run, Started
@@ -65,6 +66,35 @@ def test_each_pause_is_twice_as_long_and_after_the_limit_it_has_failed(rule: Rul
     assert [state_at(one.world, name, PART) for name in ("robot1", "robot2")] == [State.FAILED, State.FAILED]
     assert "it ended with exit status 1; it was started anew 4 times in 60 s, as often as restart_limit allows" in one.notes()
     assert f"failover start {PART} starts it" in one.notes()
+
+
+def test_after_the_limit_a_good_end_of_a_program_that_is_always_to_run_is_a_failure() -> None:
+    one = service(Rule.PAIR, Rules(restart=Restart.ALWAYS, restart_limit=1))
+    one.fail(0)
+    one.world.program_ends("robot1", PART, 0)
+    one.world.run(one.world.now_ns + 2_000 * MS)
+    assert [state_at(one.world, name, PART) for name in ("robot1", "robot2")] == [State.FAILED, State.FAILED]
+    assert "it ended with exit status 0; it was started anew 1 times in 60 s, as often as restart_limit allows" in one.notes()
+    assert f"failover start {PART} starts it" in one.notes()
+
+
+def test_a_program_that_was_protected_has_no_command_to_start_anew() -> None:
+    one = service(Rule.PAIR, Rules(restart=Restart.ALWAYS))
+    robot = one.world.robots["robot1"]
+    component = robot.node._components[PART]
+    component.spec = replace(component.spec, launch=Launch(pid=7))
+    one.world.program_ends("robot1", PART, 0)
+    one.world.run(one.world.now_ns + 500 * MS)
+    assert state_at(one.world, "robot1", PART) is State.FINISHED
+
+
+def test_a_fresh_start_lost_nothing() -> None:
+    one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE))
+    component = one.world.robots["robot1"].node._components[PART]
+    component.resumed_ns, component.lost_ns = 1, 9_000 * MS
+    one.fail()
+    assert (component.resumed_ns, component.lost_ns) == (-1, -1)
+    assert "lost" not in one.notes()
 
 
 def test_while_it_waits_the_status_says_so() -> None:

@@ -174,6 +174,13 @@ def _end(component: Component, turn: Turn, cause: Cause, status: int, reason: st
     _end_handover(component, turn, f"{component.name} ended meanwhile")
     if restarts.begin(component, turn, cause, status, reason):
         return
+    if cause is Cause.FINISH and restarts.is_wanted(component, cause):
+        cause, reason = Cause.FAIL, f"it ended with {restarts.how(status)}"
+    _record(component, turn, cause, status, reason)
+
+
+def _record(component: Component, turn: Turn, cause: Cause, status: int, reason: str) -> None:
+    """This end is one."""
     if cause is Cause.FAIL:
         reason = "; ".join((reason, *restarts.remarks(component)))
         reason += component.said if restarts.is_declared(component) else ""

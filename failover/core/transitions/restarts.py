@@ -44,6 +44,12 @@ def resumes_first(component: Component) -> bool:
     return rules.restart in (Restart.ALWAYS, Restart.ON_FAILURE) and rules.on_crash is OnCrash.RESUME and bool(component.held)
 
 
+def is_wanted(component: Component, cause: Cause) -> bool:
+    """Whether its rules want another start after such an end, if the limit allows it. A program that was protected has no command."""
+    spec, ends = component.spec, CAUSES.get(component.rules.restart, ())
+    return cause in ends and not component.ending and spec is not None and not spec.launch.pid
+
+
 def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str) -> bool:
     """Wait to start it anew, where its rules want that; False: this end is one.
 
@@ -51,7 +57,7 @@ def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str)
         cause: FINISH or FAIL: of the record that is made otherwise.
         why: "" where the status says all.
     """
-    if cause not in CAUSES.get(component.rules.restart, ()) or component.ending or component.spec is None:
+    if not is_wanted(component, cause):
         return False
     _forget_old(component, turn)
     if not _may_once_more(component):
@@ -65,6 +71,7 @@ def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str)
     component.crashes.clear()
     component.held = []  # of the program that has ended: a crash of the next one resumes from none of them. The store keeps them.
     component.acked, component.acked_ns, component.crashed = None, -1, 0
+    component.resumed_ns = component.lost_ns = -1
     component.degraded = component.awaited = component.undelivered = ""
     component.unprotected = False
     restart_line(component, turn)
