@@ -118,6 +118,11 @@ def _stop(component: Component, turn: Turn, command: Stop) -> None:
         exits.end_waiting(component, turn)
         turn.order(acts.Answer(command.request, True, f"{component.name} is not started anew"))
         return
+    if component.state is State.STARTING:
+        component.ending, component.end_signal = True, command.signal
+        sentence = f"signal {command.signal} is sent to {component.name} once it has started"
+        turn.order(acts.Answer(command.request, True, sentence))
+        return
     if component.state not in _RUNNING:
         _elsewhere(component, turn, command.request, "stop")
         return

@@ -155,6 +155,7 @@ class Component(Struct):
             program did not run is left out. lost_ns: how much of its work was lost then, at most.
         awaited: why there is nothing to capture, where that is as it should be.
         stored_ns: on a standby, when its newest checkpoint was stored, -1 if it was before this life of the agent.
+        ending: an operator stops it; end_signal: with this signal, once it has started; 0: it was sent.
         elects: primaries are elected. free, open: then, what this robot would vote for (``majority.py``).
         ordered: the claim was, by an operator.
         former: the facts known of its namesake before an operator had it started.
@@ -238,6 +239,7 @@ class Component(Struct):
     said: str = ""
     handing: Handing | None = None
     ending: bool = False
+    end_signal: int = 0
     needs_base: bool = False
     admitted: tuple[str, int] = ("", 0)
     unable: str = ""

@@ -442,6 +442,9 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
     if component.request:
         turn.order(acts.Answer(component.request, True, f"{component.name} runs at {turn.me}"))
         component.request = 0
+    if component.end_signal:
+        turn.order(acts.End(component.name, component.epoch, component.end_signal))
+        component.end_signal = 0
 
 
 def _review(component: Component, turn: Turn) -> None:

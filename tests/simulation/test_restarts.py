@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from failover.core import acts
-from failover.core.events import Exited, Run, Started
+from failover.core.events import ActFailed, Exited, Run, Started, Stop, Tick
 from failover.core.types import MS, ComponentSpec, Launch, Restart, Rule, Rules, State
 from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.teams import elective, pair
@@ -86,6 +86,40 @@ def test_a_program_that_was_protected_has_no_command_to_start_anew() -> None:
     one.world.program_ends("robot1", PART, 0)
     one.world.run(one.world.now_ns + 500 * MS)
     assert state_at(one.world, "robot1", PART) is State.FINISHED
+
+
+def test_a_stop_while_it_is_started_anew_ends_it_for_good() -> None:
+    one = service(Rule.PAIR, Rules(restart=Restart.ALWAYS))
+    one.world.program_ends("robot1", PART, FAILS)
+    while state_at(one.world, "robot1", PART) is not State.STARTING:
+        one.world.run(one.world.now_ns + 1 * MS)
+    one.world.command("robot1", Stop(one.world.request(), PART, 9))
+    one.world.run(one.world.now_ns + 2_000 * MS)
+    assert state_at(one.world, "robot1", PART) is State.FINISHED
+    assert len(one.begun) == 2
+
+
+@pytest.mark.parametrize("restart", [Restart.NEVER, Restart.ON_FAILURE], ids=str)
+def test_an_operators_start_that_fails_is_a_failure_and_forgets_nothing(restart: Restart) -> None:
+    rules = Rules(restart=restart)
+    one = service(Rule.PAIR, rules)
+    one.world.command("robot1", Stop(one.world.request(), PART))
+    one.world.run(one.world.now_ns + 1_000 * MS)
+    robot = one.world.robots["robot1"]
+    node = robot.node
+    assert node is not None
+    now_ns = one.world.local(robot)
+    spec = ComponentSpec(PART, launch=Launch(("part",)), rules=rules)
+    robot.life += 1  # its agent carries out nothing more
+    node.step(Run(99, spec), now_ns)
+    epoch = node.status(now_ns).components[0].epoch
+    for step in range(40):
+        node.step(Tick(), now_ns + step * 25 * MS)
+    ready = node.step(ActFailed(PART, epoch, "no such file: part"), now_ns + 1_000 * MS)
+    assert [act.sentence for act in ready.act if isinstance(act, acts.Answer) and not act.ok] == ["no such file: part"]
+    view = node.status(now_ns + 1_001 * MS).components[0]
+    assert view.state is State.FAILED
+    assert f"failover start {PART} starts it" in "; ".join(view.notes)
 
 
 def test_a_fresh_start_lost_nothing() -> None:

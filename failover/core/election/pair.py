@@ -160,7 +160,8 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.undelivered = component.unstored = ""
     component.resumed_ns = component.lost_ns = -1
     component.safe = component.vouched = component.shown = None
-    component.handing, component.ending, component.reported = None, False, False
+    component.handing, component.reported = None, False
+    component.ending, component.end_signal = False, 0
     component.ordered = False
     component.crashed, component.reason = 0, ""
     component.lease_ns = component.told_ns = component.took_ns = component.freeze_us = component.still_us = 0

@@ -77,10 +77,15 @@ def failed(component: Component, turn: Turn, event: ActFailed) -> None:
     if event.epoch != component.epoch or restarts.waits(component):
         return
     if component.state is State.STARTING:
-        told = bool(component.request)  # the operator is told; then nothing of it is remembered: its name is whose it was before
-        component.spec = component.former if told else component.spec
+        told = bool(component.request)
         refuse_request(component, turn, event.message)
-        _end(component, turn, Cause.RELEASE if told else Cause.FAIL, 0, event.message)
+        if not told:
+            _end(component, turn, Cause.FAIL, 0, event.message)
+        elif restarts.is_declared(component):  # the operator who was told decides what is next
+            _record(component, turn, Cause.FAIL, 0, event.message)
+        else:  # nothing of it is remembered: its name is whose it was before
+            component.spec = component.former
+            _record(component, turn, Cause.RELEASE, 0, event.message)
     elif component.state is State.RECOVERING:
         turn.say(component, f"{turn.me} could not resume it: {event.message}")
         _recover(component, turn, component.status)
