@@ -50,10 +50,11 @@ def robots(here: str, seen: Sequence[Seen], status: Mapping[str, Any] | None, ow
         status: see `failover.client.control.STATUS`; None: no agent answers.
         owners: task → component.
     """
-    others = Component(OTHERS, {}, tuple(one for one in seen if one.task not in owners))
     if status is None:
-        return (Robot(here, "", (others,)),)
+        return (Robot(here, "", (Component(OTHERS, {}, tuple(seen)),)),)
     views = sorted((one for one in map(sight, status["components"]) if one.get("state") != "released"), key=_name)
+    placed = {_name(view) for view in views if view.get("primary") == status["robot"]}
+    others = Component(OTHERS, {}, tuple(one for one in seen if owners.get(one.task) not in placed))
     found = []
     for name, state in [(str(status["robot"]), "live"), *((str(peer["name"]), str(peer["state"])) for peer in status["peers"])]:
         own = [

@@ -102,6 +102,14 @@ def test_json_has_the_tree_by_names_and_each_task_with_its_component() -> None:
     assert found["/lab/robot1/navigation"][3] == ["odometry", "mapper"]
 
 
+@pytest.mark.parametrize(("state", "primary"), [("released", "robot1"), ("running", "robot2")])
+def test_a_task_of_a_component_that_is_not_shown_here_is_one_of_the_other_programs(state: str, primary: str) -> None:
+    status = {**STATUS, "components": [component("/lab/robot1/navigation", primary, state)]}
+    here, *_ = found = task_tree.robots("robot1", TASKS, status, OWNERS)
+    assert [one.task for one in here.components[-1].tasks] == [one.task for one in TASKS]
+    assert {one["component"] for one in task_tree.told("robot1", TASKS, found)["tasks"]} == {""}
+
+
 def test_it_is_well_while_no_task_is_idle_or_late_and_no_component_has_failed() -> None:
     well = {**STATUS, "components": STATUS["components"][:2]}
     assert task_tree.is_well(task_tree.robots("robot1", TASKS[:3], well, OWNERS))
