@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 RESTART_LIMIT_MAX: Final = 100
 RESTART_WINDOW_S_MAX: Final = 3_600
 """As `failover.core.types.Rules` has them."""
+UNTAKEN: Final = ("KILL", "STOP")
+"""No program can have a handler for them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,10 @@ class TaskConfig:
             raise ValueError(f"restart_limit is {self.restart_limit}; at most {RESTART_LIMIT_MAX}, and 0 sets no limit")
         if not 1 <= self.restart_window_s <= RESTART_WINDOW_S_MAX:
             raise ValueError(f"restart_window_s is {self.restart_window_s:g}; at least 1 and at most {RESTART_WINDOW_S_MAX}")
-        if not hasattr(signal, f"SIG{self.wake_signal}"):
-            raise ValueError(f"wake_signal is {self.wake_signal!r}; give the name of a signal, such as CONT or USR1")
+        if f"SIG{self.wake_signal}" not in signal.Signals.__members__ or self.wake_signal in UNTAKEN:
+            raise ValueError(
+                f"wake_signal is {self.wake_signal!r}; give the name of a signal, other than KILL and STOP, such as CONT"
+            )
         if self.wake == "signal" and not self.period_ms:
             raise ValueError('wake = "signal" without period_ms: a program is sent a signal at each activation of its task')
         for name in self.environment:
@@ -76,10 +80,10 @@ class TaskConfig:
                 raise ValueError(f"environment has a variable {name!r}; a name is not empty and has no '=' in it")
 
     def argv(self, name: str) -> tuple[str, ...]:
-        """The command that is started: its own, or one that wakes it."""
+        """The command that is started: its own, or one that wakes it. ``-P``: no module comes from the program's directory."""
         if self.wake == "self":
             return self.command
-        return (sys.executable, "-m", "failover", "task", "run", "--signal", self.wake_signal, name, "--", *self.command)
+        return (sys.executable, "-P", "-m", "failover", "task", "run", "--signal", self.wake_signal, name, "--", *self.command)
 
 
 def declaration(name: str, task: TaskConfig) -> Declaration | None:

@@ -86,7 +86,7 @@ def _spawned(theirs: socket.socket, complaints: IO[bytes]) -> Child:
     import subprocess
 
     return subprocess.Popen(
-        [sys.executable, "-m", "checkpoint", "keeper", str(theirs.fileno())],
+        [sys.executable, "-P", "-m", "checkpoint", "keeper", str(theirs.fileno())],
         pass_fds=(theirs.fileno(),),
         stdin=subprocess.DEVNULL,
         stderr=complaints,

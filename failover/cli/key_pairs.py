@@ -15,7 +15,7 @@ def new_pair() -> tuple[str, str]:
     Raises:
         TeamFileError: the agent's program is not installed, or made no keys.
     """
-    ran = subprocess.run([sys.executable, "-m", "agent.main", "keypair"], capture_output=True, text=True, check=False)
+    ran = subprocess.run([sys.executable, "-P", "-m", "agent.main", "keypair"], capture_output=True, text=True, check=False)
     try:
         pair = json.loads(ran.stdout)
         return str(pair["public"]), str(pair["secret"])

@@ -283,7 +283,7 @@ class Component(Struct):
 
     @property
     def is_settled(self) -> bool:
-        """Whether its copy is here, running or frozen, or waits to be started anew: it goes on above an epoch that came to nothing."""
+        """Whether its copy is here, or is to be started anew after an end: it goes on above an epoch that came to nothing."""
         return self.state in (State.PRIMARY, State.FROZEN) or self.restart_ns > 0
 
     @property

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import pwd
 import re
+import subprocess
 import sys
 import tomllib
 from dataclasses import replace
@@ -91,8 +92,17 @@ def test_a_declared_task_is_a_component_that_the_core_starts_by_itself(directory
 
 def test_a_task_that_is_woken_by_a_signal_is_started_by_the_command_that_sends_it(directory: Path) -> None:
     (spec,) = node_config(configuration.load(written(directory, *TASK, "period_ms = 10", 'wake = "signal"'))).components
-    sends = ("-m", "failover", "task", "run", "--signal", "CONT", "/lab/robot1/controller", "--")
+    sends = ("-P", "-m", "failover", "task", "run", "--signal", "CONT", "/lab/robot1/controller", "--")
     assert spec.launch.argv == (sys.executable, *sends, "/opt/controller", "--fast")
+
+
+def test_such_a_task_takes_no_module_from_the_directory_of_its_program(directory: Path, tmp_path: Path) -> None:
+    (tmp_path / "failover.py").write_text("print('theirs')")
+    settings = configuration.load(written(directory, *TASK, "period_ms = 10", 'wake = "signal"'))
+    (spec,) = node_config(settings).components
+    words = [*spec.launch.argv[: spec.launch.argv.index("task")], "--help"]
+    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert "theirs" not in said and "usage: failover" in said
 
 
 def test_a_task_without_a_period_runs_and_is_on_no_schedule(directory: Path) -> None:
@@ -113,6 +123,9 @@ def test_a_task_without_a_period_runs_and_is_on_no_schedule(directory: Path) -> 
         ("period_ms = 10\npriority = 100", "priority 100"),
         ("wake = 'signal'", 'wake = "signal" without period_ms'),
         ("period_ms = 10\nwake = 'signal'\nwake_signal = 'BELL'", "wake_signal is 'BELL'; give the name of a signal"),
+        ("period_ms = 10\nwake = 'signal'\nwake_signal = '_DFL'", "wake_signal is '_DFL'; give the name of a signal"),
+        ("period_ms = 10\nwake = 'signal'\nwake_signal = 'KILL'", "wake_signal is 'KILL'; give the name of a signal"),
+        ("period_ms = 10\nwake = 'signal'\nwake_signal = 'STOP'", "wake_signal is 'STOP'; give the name of a signal"),
         ("restart_limit = 101", "restart_limit is 101; at most 100, and 0 sets no limit"),
         ("restart_window_s = 0.5", "restart_window_s is 0.5; at least 1 and at most 3600"),
         ("user = 'no-such-user'", "user = 'no-such-user': this robot has no such user"),

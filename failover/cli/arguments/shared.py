@@ -117,3 +117,11 @@ def signal_number(text: str) -> int:
     except (ValueError, KeyError):
         meant = near(text.upper(), (one.name.removeprefix("SIG") for one in signal.Signals))
         raise argparse.ArgumentTypeError(f"{text!r} is no signal; give a number or a name such as TERM{meant}") from None
+
+
+def wake_signal(text: str) -> int:
+    """The number of a signal for which a program can have a handler."""
+    number = signal_number(text)
+    if number in (9, 19):  # SIGKILL, SIGSTOP
+        raise argparse.ArgumentTypeError(f"{text!r} ends or stops a program and wakes none; give a signal such as CONT or USR1")
+    return number

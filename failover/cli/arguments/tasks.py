@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Final
 
-from failover.cli.arguments.shared import add_act, add_json, add_place_of_board, add_repeated, signal_number
+from failover.cli.arguments.shared import add_act, add_json, add_place_of_board, add_repeated, wake_signal
 
 
 def ps(room: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def task(room: argparse.ArgumentParser) -> None:
             how = act.add_mutually_exclusive_group()
             how.add_argument("--loop", action="store_true", help="start CMD once; it calls failover wait-activation")
             said = "start CMD once, and send it signal N at each activation (CONT: it stops itself to wait for the next one)"
-            how.add_argument("--signal", metavar="N", type=signal_number, default=0, help=said)
+            how.add_argument("--signal", metavar="N", type=wake_signal, default=0, help=said)
         else:
             act.add_argument("--in-ms", metavar="MS", type=float, default=0, help="not before so many milliseconds (default: 0)")
         act.set_defaults(function=f"failover.cli.verbs.task_programs:{function}")

@@ -45,7 +45,7 @@ def resumes_first(component: Component) -> bool:
 
 
 def is_wanted(component: Component, cause: Cause) -> bool:
-    """Whether its rules want another start after such an end, if the limit allows it. A program that was protected has no command."""
+    """Whether its rules want another start after such an end, if the limit allows it; a protected program has no command."""
     spec, ends = component.spec, CAUSES.get(component.rules.restart, ())
     return cause in ends and not component.ending and spec is not None and not spec.launch.pid
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from failover.cli import parser
+from failover.cli import key_pairs, parser
 from failover.client.control import Output, Refused, Request, Result, Update
 from tests.failover.cli.stand_in import Answer, StandIn
 
@@ -500,3 +500,9 @@ def test_a_mistake_with_the_team_is_named_and_changes_nothing(tmp_path: Path, wo
     assert ran.returncode == 1
     assert sentence in ran.stderr
     assert (tmp_path / "team.toml").read_text() == before
+
+
+def test_keys_are_made_by_no_module_of_the_present_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "agent.py").write_text("raise SystemExit('theirs')")
+    monkeypatch.chdir(tmp_path)
+    assert [len(key) for key in key_pairs.new_pair()] == [40, 40]

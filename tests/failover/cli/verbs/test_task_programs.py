@@ -91,6 +91,13 @@ def test_a_script_waits_for_its_activations(place: Path) -> None:
         assert ended_of(place, "logger") == 3
 
 
+@pytest.mark.parametrize("name", ["KILL", "9", "SIGSTOP"])
+def test_a_signal_that_no_program_can_take_wakes_none(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    with pytest.raises(SystemExit):
+        main.main(["task", "run", "--signal", name, "logger", "period_ms=20", "--", "sleep", "9"])
+    assert f"{name!r} ends or stops a program and wakes none" in capsys.readouterr().err
+
+
 STOPS = """
 #include <signal.h>
 #include <stdio.h>
