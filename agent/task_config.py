@@ -70,9 +70,7 @@ class TaskConfig:
         if not 1 <= self.restart_window_s <= RESTART_WINDOW_S_MAX:
             raise ValueError(f"restart_window_s is {self.restart_window_s:g}; at least 1 and at most {RESTART_WINDOW_S_MAX}")
         if f"SIG{self.wake_signal}" not in signal.Signals.__members__ or self.wake_signal in UNTAKEN:
-            raise ValueError(
-                f"wake_signal is {self.wake_signal!r}; give the name of a signal, other than KILL and STOP, such as CONT"
-            )
+            raise ValueError(f"wake_signal is {self.wake_signal!r}; give the name of a signal such as CONT, not KILL or STOP")
         if self.wake == "signal" and not self.period_ms:
             raise ValueError('wake = "signal" without period_ms: a program is sent a signal at each activation of its task')
         for name in self.environment:

@@ -187,6 +187,7 @@ class Component(Struct):
     claimed: bool = False
     begun: bool = False
     bare: bool = False
+    ended: tuple[int, int] = (0, 0)
 
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
@@ -345,6 +346,7 @@ class Component(Struct):
             self.claimed,
             self.has_begun,
             self.bare,
+            self.ended,
         )
 
     @classmethod
@@ -364,6 +366,7 @@ class Component(Struct):
             record.claimed,
             record.begun,
             record.bare,
+            record.ended,
             remembered_epoch=record.epoch,
         )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
+from checkpoint.model import Position
 from failover.core import acts, commands
 from failover.core.acts import Ready
 from failover.core.beat_builder import Speaker, entry_of
@@ -219,8 +220,13 @@ class Node:
             if one.component in self._components:
                 component = self._components[one.component]
                 component.keeps_state = one.keeps_state
-                component.held = [position for position in one.positions if position.generation not in component.lost]
+                component.held = [position for position in one.positions if self._may_resume(component, position)]
                 standby.remember(component, self._config)
+
+    def _may_resume(self, component: Component, position: Position) -> bool:
+        """Not from a line that lost; nor, where the program that was started anew is still there, from the one before it."""
+        is_older = (position.generation, position.sequence) <= component.ended
+        return position.generation not in component.lost and not (is_older and component.name in self._found)
 
     def _begin(self, turn: Turn) -> None:
         """The first step of this life: take over what the last one left running, clear away what it should not have left."""

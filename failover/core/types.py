@@ -400,6 +400,7 @@ class Record(Struct, frozen=True):
         claimed: this robot's claim of ``epoch`` needs consent that it did not have yet.
         begun: there is a checkpoint of it, or there was one when this robot heard last: it is not to begin anew.
         bare: this robot was among those that held all that was acknowledged, and has lost its checkpoints: others hold it.
+        ended: generation and sequence of the last snapshot of the program before, since when another one was started anew.
     """
 
     name: str
@@ -415,6 +416,7 @@ class Record(Struct, frozen=True):
     claimed: bool = False
     begun: bool = False
     bare: bool = False
+    ended: tuple[int, int] = (0, 0)
 
 
 class VoteRecord(Struct, frozen=True):

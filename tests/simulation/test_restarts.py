@@ -122,6 +122,27 @@ def test_an_operators_start_that_fails_is_a_failure_and_forgets_nothing(restart:
     assert f"failover start {PART} starts it" in "; ".join(view.notes)
 
 
+def test_an_agent_that_is_back_resumes_nothing_from_before_a_fresh_start() -> None:
+    """Of the program that has ended; its numbers are not used again."""
+    one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE))
+    robot = one.world.robots["robot1"]
+    before = set(robot.store[PART])
+    robot.slow = 20  # no checkpoint yet of the program that is started anew
+    one.world.program_ends("robot1", PART, FAILS)
+    while state_at(one.world, "robot1", PART) is not State.PRIMARY or not one.world.acting(PART):
+        one.world.run(one.world.now_ns + 1 * MS)
+    one.world.agent_dies("robot1")
+    robot.slow = 1
+    one.world.power_on("robot1")
+    one.world.run(one.world.now_ns + 5 * MS)
+    assert robot.node is not None
+    assert not before & set(robot.node._components[PART].held)
+    one.world.run(one.world.now_ns + 1_000 * MS)
+    assert state_at(one.world, "robot1", PART) is State.PRIMARY
+    numbers = [(position.generation, position.sequence) for position in robot.store[PART]]
+    assert len(numbers) == len(set(numbers))
+
+
 def test_a_fresh_start_lost_nothing() -> None:
     one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE))
     component = one.world.robots["robot1"].node._components[PART]

@@ -145,7 +145,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     """Open a new epoch as its primary-to-be. The vote record holds it before another robot hears of it."""
     component.alone_right = not component.freezes or _right_to_act_alone(component, turn)
     component.claimed = not component.alone_right
-    component.begun, component.bare = component.has_begun, False
+    component.begun, component.bare, component.ended = component.has_begun, False, (0, 0)
     component.stood, component.rival_ns = _begins_in_the_dark(component, turn), 0
     component.move(Cause.CLAIM)
     component.epoch = max(component.epoch, component.seen) + 1
@@ -222,7 +222,8 @@ def generation_of(component: Component, turn: Turn) -> int:
 def open_line(component: Component, turn: Turn) -> None:
     """A new generation, unlike any other robot's: the next snapshot is a base. An agent that came back goes on counting."""
     component.generation = generation_of(component, turn)
-    component.sequence = max((held.sequence for held in component.held if held.generation == component.generation), default=0)
+    last = component.ended[1] if component.ended[0] == component.generation else 0
+    component.sequence = max((held.sequence for held in component.held if held.generation == component.generation), default=last)
     restart_line(component, turn)
 
 

@@ -69,6 +69,7 @@ def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str)
     component.restart_ns = turn.now_ns + pause_ms * MS
     component.status, component.reason = status, ""
     component.crashes.clear()
+    component.ended = (component.generation, component.sequence)
     component.held = []  # of the program that has ended: a crash of the next one resumes from none of them. The store keeps them.
     component.acked, component.acked_ns, component.crashed = None, -1, 0
     component.resumed_ns = component.lost_ns = -1
