@@ -20,7 +20,7 @@ from failover.client.control import Control
 from failover.core.schedule import layout, orders
 from failover.core.schedule.course import Overrun
 from failover.core.schedule.orders import Change
-from failover.core.schedule.terms import Declaration, Kind, Terms, nanoseconds
+from failover.core.schedule.terms import CPUS_MAX, Declaration, Kind, Terms, nanoseconds
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, ScheduleError
 from failover.schedule.overview import Seen, is_none_there, judged, open_schedule, overview
 
@@ -119,13 +119,13 @@ def parsed(words: Sequence[str]) -> tuple[dict[str, object], tuple[str, ...] | N
         if key in SPANS:
             fields[SPANS[key]] = nanoseconds(_number(key, value) / 1000, key.removesuffix("_ms"))
         elif key == "priority":
-            fields[key] = int(_number(key, value))
+            fields[key] = _whole(key, value)
         elif key == "overrun" and value in OVERRUNS:
             fields[key] = OVERRUNS[value]
         elif key == "strict" and value in ("true", "false"):
             fields[key] = value == "true"
         elif key == "cpus":
-            fields[key] = sum(1 << int(_number(key, place)) for place in set(value.split(",")) if place)
+            fields[key] = sum(1 << place for place in {_processor(place) for place in value.split(",") if place})
         elif key == "after":
             after = tuple(name for name in value.split(",") if name)
         elif key == "mode":
@@ -153,6 +153,20 @@ def _number(key: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise ScheduleError(f"{key}={text}: {text!r} is no number") from None
+
+
+def _whole(key: str, text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise ScheduleError(f"{key}={text}: {text!r} is no whole number") from None
+
+
+def _processor(text: str) -> int:
+    number = _whole("cpus", text)
+    if not 0 <= number < CPUS_MAX:
+        raise ScheduleError(f"cpus={text}: processors have the numbers 0 to {CPUS_MAX - 1}")
+    return number
 
 
 def given(arguments: argparse.Namespace, order: Order, told: str = "") -> int:

@@ -197,3 +197,23 @@ def test_a_process_that_is_stopped_misses_its_deadline(place: Path, capsys: pyte
         told = tasks(capsys)["stops"]
         assert (told["misses"] >= 1, told["ended"]) == (True, ended)
         os.kill(stopping.pid, signal.SIGCONT)
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("cpus=-1", "cpus=-1: processors have the numbers 0 to 63"),
+        ("cpus=0,99999999999", "cpus=99999999999: processors have the numbers 0 to 63"),
+        ("cpus=nan", "cpus=nan: 'nan' is no whole number"),
+        ("cpus=1.5", "cpus=1.5: '1.5' is no whole number"),
+        ("priority=inf", "priority=inf: 'inf' is no whole number"),
+        ("priority=nan", "priority=nan: 'nan' is no whole number"),
+        ("priority=1.5", "priority=1.5: '1.5' is no whole number"),
+        ("period_ms=nan", "period is nan: give seconds"),
+    ],
+)
+def test_a_number_that_cannot_be_is_a_sentence(
+    task: ScheduledTask, capsys: pytest.CaptureFixture[str], word: str, sentence: str
+) -> None:
+    status, _, err = said(capsys, "task", "add", "logger", "period_ms=20", word)
+    assert status == 1 and sentence in err
