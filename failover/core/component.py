@@ -145,7 +145,8 @@ class Component(Struct):
         rival_ns: when this copy, which never stopped acting, first heard of the present rival.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         restart_ns: its program has ended, and is started anew at this instant; 0: it is not. restarts: when that was ordered, the
-            last times; restarted: how often in this life of the agent. said: by the program that has ended.
+            last times; restarted: how often in this life of the agent. ended_how: the program, or a start that failed.
+            said: by the program that has ended.
         safe: on a primary, the newest position that counts as acknowledged and is not here alone. vouched: on any other member,
             the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
@@ -237,6 +238,7 @@ class Component(Struct):
     restart_ns: int = 0
     restarts: deque[int] = field(default_factory=lambda: deque(maxlen=RESTARTS_MAX))
     restarted: int = 0
+    ended_how: str = ""
     said: str = ""
     handing: Handing | None = None
     ending: bool = False

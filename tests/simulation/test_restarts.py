@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from failover.core import acts
 from failover.core.events import ActFailed, Exited, Run, Started, Stop, Tick
-from failover.core.types import MS, ComponentSpec, Launch, Restart, Rule, Rules, State
+from failover.core.types import MS, ComponentSpec, Launch, Restart, Rule, Rules, State, WhenAlone
 from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
@@ -143,6 +143,20 @@ def test_an_agent_that_is_back_resumes_nothing_from_before_a_fresh_start() -> No
     assert len(numbers) == len(set(numbers))
 
 
+def test_the_status_tells_of_a_start_that_failed_and_of_the_robot_that_must_hear_this_one() -> None:
+    one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE, when_alone=WhenAlone.FREEZE))
+    one.world.program_ends("robot1", PART, FAILS)
+    while state_at(one.world, "robot1", PART) is not State.STARTING:
+        one.world.run(one.world.now_ns + 1 * MS)
+    robot = one.world.robots["robot1"]
+    one.world.feed(robot, ActFailed(PART, seen_at(one.world, "robot1", PART).epoch, "no such file: part"))
+    one.world.network.cuts |= {("robot1", "robot2"), ("robot2", "robot1")}
+    one.world.run(one.world.now_ns + 20 * MS)
+    assert "no such file: part; it is started anew in 0.2 s" in one.notes()
+    one.world.run(one.world.now_ns + 210 * MS)
+    assert "no such file: part; it is started anew as soon as another robot hears this one" in one.notes()
+
+
 def test_a_fresh_start_lost_nothing() -> None:
     one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE))
     component = one.world.robots["robot1"].node._components[PART]
@@ -160,7 +174,7 @@ def test_while_it_waits_the_status_says_so() -> None:
     assert view.restarting
     assert view.protection == "none"
     assert (
-        "it ended with exit status 3 and is started anew in 0.1 s, start 1 of 5 in 60 s; failover stop ends that" in one.notes()
+        "it ended with exit status 3; it is started anew in 0.1 s, start 1 of 5 in 60 s; failover stop ends that" in one.notes()
     )
 
 

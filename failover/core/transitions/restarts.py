@@ -77,8 +77,8 @@ def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str)
     component.unprotected = False
     restart_line(component, turn)
     turn.order(acts.Stop(component.name, component.epoch))
-    ended = why or f"it ended with {how(status)}"
-    turn.say(component, f"{turn.me} {Cause.RESTART} in {pause_ms / 1000:g} s: {ended}{component.said}")
+    component.ended_how = why or f"it ended with {how(status)}"
+    turn.say(component, f"{turn.me} {Cause.RESTART} in {pause_ms / 1000:g} s: {component.ended_how}{component.said}")
     return True
 
 
@@ -110,11 +110,12 @@ def note(component: Component, now_ns: int) -> str:
     """For the status: that it waits, for how long, and for which time in its window; "" where it does not."""
     if not component.restart_ns:
         return ""
-    rules, left_s = component.rules, max(component.restart_ns - now_ns, 0) / 10**9
+    rules, left_s = component.rules, (component.restart_ns - now_ns) / 10**9
+    heard = "a majority hears" if component.elects else "another robot hears"
+    when = f"in {left_s:.1f} s" if left_s > 0 else f"as soon as {heard} this one"
     limit = f" of {rules.restart_limit}" if rules.restart_limit else ""
     which = f"start {len(component.restarts)}{limit} in {rules.restart_window_ms / 1000:g} s"
-    told = f"it ended with {how(component.status)} and is started anew in {left_s:.1f} s, {which}; failover stop ends that"
-    return f"{told}{component.said}"
+    return f"{component.ended_how}; it is started anew {when}, {which}; failover stop ends that{component.said}"
 
 
 def _may_once_more(component: Component) -> bool:
