@@ -8,6 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from failover.core import acts
+from failover.core.component import Component
 from failover.core.events import ActFailed, Exited, Run, Started, Stop, Tick
 from failover.core.types import MS, ComponentSpec, Launch, Restart, Rule, Rules, State, WhenAlone
 from tests.simulation.invariants import seen_at, state_at
@@ -37,6 +38,12 @@ class Service:
 
     def notes(self) -> str:
         return "; ".join(seen_at(self.world, "robot1", PART).notes)
+
+
+def at_robot1(one: Service) -> Component:
+    node = one.world.robots["robot1"].node
+    assert node is not None
+    return node._components[PART]
 
 
 def service(rule: Rule, rules: Rules) -> Service:
@@ -80,8 +87,8 @@ def test_after_the_limit_a_good_end_of_a_program_that_is_always_to_run_is_a_fail
 
 def test_a_program_that_was_protected_has_no_command_to_start_anew() -> None:
     one = service(Rule.PAIR, Rules(restart=Restart.ALWAYS))
-    robot = one.world.robots["robot1"]
-    component = robot.node._components[PART]
+    component = at_robot1(one)
+    assert component.spec is not None
     component.spec = replace(component.spec, launch=Launch(pid=7))
     one.world.program_ends("robot1", PART, 0)
     one.world.run(one.world.now_ns + 500 * MS)
@@ -159,7 +166,7 @@ def test_the_status_tells_of_a_start_that_failed_and_of_the_robot_that_must_hear
 
 def test_a_fresh_start_lost_nothing() -> None:
     one = service(Rule.PAIR, Rules(restart=Restart.ON_FAILURE))
-    component = one.world.robots["robot1"].node._components[PART]
+    component = at_robot1(one)
     component.resumed_ns, component.lost_ns = 1, 9_000 * MS
     one.fail()
     assert (component.resumed_ns, component.lost_ns) == (-1, -1)
