@@ -255,9 +255,11 @@ class Posting:
         poller.register(self._wake, select.POLLIN)
         why = "the proxy was closed"
         try:
-            while not self._is_over:
+            while True:
                 with contextlib.suppress(BlockingIOError):
                     os.eventfd_read(self._wake)
+                if self._is_over:  # looked at after the read: a close in between is not lost
+                    break
                 if self._sending.is_idle:
                     poller.poll()
                     continue
