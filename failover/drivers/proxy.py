@@ -38,6 +38,9 @@ from failover.errors import CallRefusedError, DriverError, EnvelopeError, NoAnsw
 TIMEOUT_S: Final = 5.0
 """How long a call waits unless told otherwise; and the end of a ``with`` block for what was posted in it."""
 
+NUMBERS_SIZE: Final = 4 << 10
+"""Bytes of a message for its sender, id and numbers, which it gets when it is taken."""
+
 _NUMBERS: Final = itertools.count(1)
 
 T = TypeVar("T")
@@ -192,7 +195,9 @@ class Proxy:
     def _envelope(self, verb: str, body: Any, deadline_s: float | None) -> Envelope:
         deadline_ms = None if deadline_s is None else deadline_s * 1_000
         hops = (Hop(self.sender, self.now_ns()),)
-        return Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
+        found = Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
+        envelopes.check_size(found, NUMBERS_SIZE)
+        return found
 
     def told(self, verb: str, kind: type[T], body: Any = None, /, *, timeout: float = TIMEOUT_S) -> T:
         """`call` for a verb whose answer has a form of failover's own: the answer, checked. Fields of newer drivers are left out.

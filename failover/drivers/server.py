@@ -369,7 +369,7 @@ class Serving:
 
     def _publish(self, whose: Whose, envelope: Envelope) -> bool:
         """Send to one, if it is there and takes it now: who misses an answer to what matters sends it again."""
-        content = envelopes.encode(envelope)
+        content = envelopes.encode_answer(envelope)
         if isinstance(whose, Near):
             connection = self._near.get(whose)
             if connection is None:

@@ -91,7 +91,7 @@ class Loaded:
     def call(self, order: Call) -> Done:
         """Carry out one message."""
         assert self._actor is not None, "the host begins first"
-        answer = envelopes.encode(self._actor.carried_out([envelopes.decode(order.message)]), "msgpack")
+        answer = envelopes.encode_answer(self._actor.carried_out([envelopes.decode(order.message)]), "msgpack")
         before = self._last
         try:
             state = self._state()

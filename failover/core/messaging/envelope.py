@@ -355,6 +355,30 @@ def check_hops(hops: tuple[Hop, ...]) -> None:
 # --- Answers and hops -------------------------------------------------------------------------------------------------
 
 
+def check_size(envelope: Envelope, room: int) -> None:
+    """Refuse what every receiver refuses unread, before it is sent again and again.
+
+    Args:
+        room: bytes that the message still needs, for what its sender writes into it.
+
+    Raises:
+        EnvelopeError: it is too large, or a name in it is.
+    """
+    _check_head(envelope)
+    if (size := len(encode(envelope)) + room) > MESSAGE_SIZE_MAX:
+        raise EnvelopeError(f"the message has {size} bytes, {MESSAGE_SIZE_MAX} are the most; send the name of a file instead")
+
+
+def encode_answer(said: Envelope, encoding: Encoding = "json") -> bytes:
+    """An answer's bytes; where these are more than a message has: those of a refusal of the kind ``bad_result``."""
+    content = encode(said, encoding)
+    if len(content) <= MESSAGE_SIZE_MAX:
+        return content
+    why = f"its answer has {len(content)} bytes, and a message has {MESSAGE_SIZE_MAX} at most: have it return the name of a file"
+    fault = Fault("bad_result", f"it was carried out, and {why}")
+    return encode(msgspec.structs.replace(said, ok=UNSET, error=fault, rest={}), encoding)
+
+
 def answer(asked: Envelope, ok: Any) -> Envelope:
     """That a message was carried out, with its result."""
     return Envelope(to=asked.sender, re=asked.id, boot=asked.boot, seq=asked.seq, ok=ok)

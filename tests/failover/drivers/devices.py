@@ -43,6 +43,16 @@ class Engine:
     def huge(self) -> int:
         return 1 << 60
 
+    @failover.query
+    def picture(self, size: int = 1_100_000, kind: str = "") -> str:
+        if kind == "error":
+            raise RuntimeError("x" * size)
+        return "x" * size
+
+    @failover.stream(rate_hz=200)
+    def film(self) -> str:
+        return "x" * 1_100_000
+
     @failover.stream(rate_hz=200)
     def current(self) -> float:
         return self.duty * 2

@@ -159,3 +159,30 @@ def test_posts_outlive_deaths_of_a_driver_that_keeps_its_state(here: Here, folde
     assert lives == 5
     assert [one.result(0) for one in done] == list(range(1, count + 1)), "each answer is that of its message"
     assert [number for _, number in found["log"]] == list(range(count))
+
+
+def test_an_answer_that_no_message_can_carry_is_refused_once_and_the_next_goes_on(here: Here) -> None:
+    with serving(Engine, here), called(here, "engine") as proxy:
+        for kind in ("", "error"):
+            with pytest.raises(CallRefusedError, match="a message has 1048576 at most") as refused:
+                proxy.call("picture", kind=kind)
+            assert refused.value.kind == "bad_result"
+        done, after = proxy.post("picture"), proxy.post("read")
+        with pytest.raises(CallRefusedError, match="1048576"):
+            done.result(LIMIT_S)
+        assert after.result(LIMIT_S) == {"duty": 0.0}
+        with pytest.raises(CallRefusedError, match="1048576"):
+            next(proxy.stream("film"))
+
+
+@pytest.mark.parametrize("is_posting", [False, True])
+def test_a_body_that_no_message_can_carry_is_not_taken(here: Here, is_posting: bool) -> None:
+    with serving(Engine, here), called(here, "engine") as proxy:
+        if is_posting:
+            proxy.post("set", duty=0.5).result(LIMIT_S)
+        for take in (proxy.call, proxy.post):
+            with pytest.raises(EnvelopeError, match="send the name of a file instead"):
+                take("set", "x" * (1 << 20))
+            with pytest.raises(EnvelopeError, match="512 are the most"):
+                take("v" * 513)
+        assert proxy.call("picture", size=1_000_000) == "x" * 1_000_000
