@@ -6,15 +6,18 @@ they are checked like bundles that a person sends: key, signature, form and righ
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import TypeVar
 
 import msgspec
 
-from failover.core.programs import states
-from failover.core.programs.states import Shelf
+from failover.core.programs import states, versions
+from failover.core.programs.manifest import Manifest
+from failover.core.programs.states import Shelf, Version
 from failover.drivers.declare import Declaration
 from failover.drivers.keeping import Keeping
-from failover.errors import BundleRefusedError, ProgramError
+from failover.errors import BundleRefusedError, FailoverError, ProgramError
 from failover.kept_state.agent_link import has_guard
 from failover.kept_state.component import kept
 from failover.programs.sources import Place
@@ -86,23 +89,61 @@ def unpack(carried: Carried, place: Place) -> None:
         raise ProgramError(f"the kept state is that of the program {shelf.name}, and this host is for {place.name}")
     store = place.store
     refused: dict[str, BundleRefusedError] = {}
-    for digest, content in carried.bundles.items():
+    present: set[str] = set()
+    for one in shelf.versions:
+        if one.digest not in carried.bundles:
+            continue
+        check = functools.partial(_check_entry, shelf, one)
         try:
-            store.bring(digest, content, place.team)
+            if not _is_admitted(one.digest, place, check):
+                store.bring(one.digest, carried.bundles[one.digest], place.team, check)
+            present.add(one.digest)
         except BundleRefusedError as error:
-            refused[digest] = error
+            refused[one.digest] = error
     with store.locked():
         mine = store.find(place.name)
-        here = {one.digest for one in shelf.versions if one.digest not in refused and store.has(one.digest)}
-        found = states.carried_over(shelf, mine, here)
+        known = {(one.version, one.digest) for one in mine.versions} if mine is not None else set()
+        present |= {one.digest for one in shelf.versions if (one.version, one.digest) in known and store.has(one.digest)}
+        found = states.carried_over(shelf, mine, present - refused.keys())
         if found.active is None:
             lost = shelf.active
             raise refused.get(lost.digest if lost is not None else "") or ProgramError(
                 f"{shelf.name} cannot go on here: the bundle of its active version did not come with its state"
             )
         store.put(found)
+    if mine is not None and mine.floor and versions.order(found.active.version) < versions.order(mine.floor):
+        store.log(shelf.name, f"{found.active.version} goes on here, older than {mine.floor}: so it was where it ran last")
     for digest, why in refused.items():
         store.log(shelf.name, f"{digest[:12]}, which came with the state, may not run here: {why}")
+
+
+def _is_admitted(digest: str, place: Place, check: Callable[[Manifest], None]) -> bool:
+    """Whether this robot's own copy of a bundle may run: it may have a newer signature than the one that came.
+
+    Raises:
+        BundleRefusedError: by `check`.
+    """
+    if not place.store.has(digest):
+        return False
+    try:
+        said = place.store.admitted(digest, place.team).program.manifest
+    except FailoverError:
+        return False
+    check(said)
+    return True
+
+
+def _check_entry(shelf: Shelf, one: Version, said: Manifest) -> None:
+    """The shelf is not signed: what it says of a bundle counts only if the bundle says the same.
+
+    Raises:
+        BundleRefusedError: it says something else.
+    """
+    if (said.name, said.path) != (shelf.name, shelf.path) or versions.order(said.version) != versions.order(one.version):
+        raise BundleRefusedError(
+            f"the bundle {one.digest[:12]} came under another name: the shelf calls it {shelf.name} {one.version} "
+            f"for {shelf.path}, and its manifest {said.name} {said.version} for {said.path}"
+        )
 
 
 def _read(content: bytes, kind: type[T]) -> T:

@@ -17,7 +17,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -30,6 +30,7 @@ from failover.core.messaging.mailbox import Stream
 from failover.core.programs import manifest, states, versions
 from failover.core.programs.archive import Member
 from failover.core.programs.bundle import Program
+from failover.core.programs.manifest import Manifest
 from failover.core.programs.states import Shelf, State, Version
 from failover.errors import BundleRefusedError, ProgramError
 from failover.programs import packing
@@ -148,8 +149,11 @@ class Store:
         finally:
             shutil.rmtree(aside, ignore_errors=True)
 
-    def bring(self, digest: str, content: bytes, team: Path) -> None:
+    def bring(self, digest: str, content: bytes, team: Path, check: Callable[[Manifest], None]) -> None:
         """Check a bundle that came with a program's state, and unpack it; the shelf is not changed.
+
+        Args:
+            check: raises BundleRefusedError for a manifest of another program or version than was said.
 
         Raises:
             BundleRefusedError: it may not run here.
@@ -159,6 +163,7 @@ class Store:
         if found.program.digest != digest:
             other = found.program.digest
             raise BundleRefusedError(f"the bundle {digest[:12]} that came with the state has the content of {other[:12]}")
+        check(found.program.manifest)
         with self.locked():
             self._unpack(found.program, content)
 

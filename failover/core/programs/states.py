@@ -231,7 +231,7 @@ def carried_over(shelf: Shelf, here: Shelf | None, present: Collection[str]) -> 
     """The shelf of a program that goes on here: as it was where it ran, with the versions that are on this robot besides.
 
     Args:
-        shelf: of the robot where it ran last; its floor counts, also where a person went back there.
+        shelf: of the robot where it ran last. The higher floor of both counts: what came is not signed.
         here: of this robot; None: the program was never here.
         present: digests of those bundles of ``shelf`` that are here and may run.
 
@@ -251,4 +251,6 @@ def carried_over(shelf: Shelf, here: Shelf | None, present: Collection[str]) -> 
     needed = [one for one in newest if one.state is State.ACTIVE or one.version == before]
     others = [one for one in newest if one not in needed][-(VERSIONS_MAX - len(needed)) :]
     both = tuple(one for one in newest if one in needed or one in others)
-    return Shelf(shelf.name, shelf.path, both, shelf.floor, before, here.uid if here is not None else 0)
+    floors = [one for one in (shelf.floor, here.floor if here is not None else "") if one]
+    floor = max(floors, key=versions.order, default="")
+    return Shelf(shelf.name, shelf.path, both, floor, before, here.uid if here is not None else 0)

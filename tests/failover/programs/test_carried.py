@@ -149,3 +149,72 @@ def test_what_another_robot_could_not_check_does_not_run_under_an_agent(lab: Lab
     ):
         with pytest.raises(ProgramError, match="under an agent: another robot takes over signed bundles only"):
             open_carried(place)
+
+
+def test_a_bundle_that_is_here_with_a_newer_signature_stays(lab: Lab, other: Place) -> None:
+    lab.send("1")
+    carried = ran(lab, "1")
+    ((digest, _),) = carried.bundles.items()
+    newer = lab.bundle(lab.source("1"), until_s=4_000_000_000)
+    other.store.take(newer, other.team)
+    unpack(carried, other)
+    assert other.store.bundle(digest) == newer
+    (other.store.tree(digest) / "engine.py").unlink()
+    unpack(carried, other)
+    assert source_of_store(other, "").digest == digest, "one whose files were changed here comes again"
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ({"name": "arm"}, "the shelf calls it arm 1 for Lab/robot1/Engine"),
+        ({"path": "Lab/robot1/Arm"}, "the shelf calls it engine 1 for Lab/robot1/Arm"),
+        ({"version": "9"}, "the shelf calls it engine 9 for Lab/robot1/Engine"),
+    ],
+)
+@pytest.mark.parametrize("is_here", [False, True])
+def test_a_shelf_that_says_something_else_than_its_bundle_is_refused(
+    lab: Lab, other: Place, said: dict[str, str], words: str, is_here: bool
+) -> None:
+    lab.send("1")
+    carried = ran(lab, "1")
+    if is_here:
+        (bundle,) = carried.bundles.values()
+        other.store.take(bundle, other.team)
+    shelf = msgspec.json.decode(carried.shelf, type=Shelf)
+    if "version" in said:
+        shelf = msgspec.structs.replace(shelf, versions=(msgspec.structs.replace(shelf.versions[0], version="9"),))
+    else:
+        shelf = msgspec.structs.replace(shelf, **said)
+    carried.shelf = msgspec.json.encode(shelf)
+    before = other.store.find("engine")
+    with pytest.raises(ProgramError, match=f"{words}, and its manifest engine 1 for Lab/robot1/Engine|give one another name"):
+        unpack(carried, msgspec.structs.replace(other, name=shelf.name))
+    assert is_here or list(Path(other.store.place / "bundles").iterdir()) == []
+    assert other.store.find("engine") == before and other.store.find("arm") is None
+
+
+def test_a_bundle_that_is_only_here_counts_for_what_this_robot_knows_it_as(lab: Lab, other: Place) -> None:
+    lab.send("1")
+    carried = ran(lab, "1")
+    other.store.take(lab.bundle(lab.source("7")), other.team)
+    there = other.store.shelf("engine").find("7")
+    assert there is not None
+    shelf = msgspec.json.decode(carried.shelf, type=Shelf)
+    forged = (*shelf.versions, Version("8", there.digest, State.RETIRED))
+    carried.shelf = msgspec.json.encode(msgspec.structs.replace(shelf, versions=forged, before="8"))
+    unpack(carried, other)
+    assert [one.version for one in other.store.shelf("engine").versions] == ["1", "7"]
+
+
+def test_the_floor_of_a_robot_does_not_sink_by_what_comes(lab: Lab, other: Place) -> None:
+    lab.send("1")
+    lab.send("2", engine(extra="return 2"))
+    high, low = ran(lab, "2"), Carried()
+    shelf = states.fall_back(lab.store.shelf("engine"), "a person took it back")
+    low.take_shelf(shelf, Place(lab.store, lab.team, "engine"))
+    unpack(high, other)
+    unpack(low, other)
+    found = other.store.shelf("engine")
+    assert (found.active.version, found.floor) == ("1", "2")  # type: ignore[union-attr]
+    assert "1 goes on here, older than 2" in str(other.store.lines("engine")[-1]["what"])
