@@ -459,6 +459,8 @@ class HostActor(Actor):
         """In the thread."""
         running: Running | None = None
         try:
+            if source.digest:  # a key or a right may have gone since it was started
+                self._place.store.admitted(source.digest, self._place.team)
             running = self._begun(source, state)
             for command in owed:
                 try:

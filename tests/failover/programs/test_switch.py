@@ -456,3 +456,25 @@ def test_a_host_that_gets_no_process_says_so_and_goes_on(lab: Lab) -> None:
                 Running(source)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_a_version_that_may_not_run_any_more_is_not_started_anew_either(lab: Lab) -> None:
+    lab.send("1")
+    with lab.hosting() as host, lab.proxy() as proxy:
+        proxy.call("step", number=1, timeout=60)
+        (lab.team / "programs.toml").write_text("")
+        os.kill(host.actor._running.pid, signal.SIGKILL)  # type: ignore[union-attr]
+        until(proxy, lambda found: "it cannot be started anew: the bundle is signed by the key" in str(found["said"]))
+        lab.trust()
+        until(proxy, lambda found: found["active"] == "1")
+        assert proxy.call("read", timeout=60) == [1]
+
+
+def test_a_result_that_no_message_can_carry_is_refused_and_ends_no_version(lab: Lab) -> None:
+    lab.send("1", engine(extra="return 'x' * 1_100_000"))
+    with lab.hosting() as host, lab.proxy() as proxy:
+        pid = host.actor._running.pid  # type: ignore[union-attr]
+        with pytest.raises(CallRefusedError, match="1048576 at most") as refused:
+            proxy.call("fly", timeout=60)
+        assert refused.value.kind == "bad_result"
+        assert proxy.call("step", number=1, timeout=60) == 1 and host.actor._running.pid == pid  # type: ignore[union-attr]
