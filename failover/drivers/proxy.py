@@ -95,7 +95,8 @@ class Proxy:
         self._by = accounts.name_of(os.geteuid()) if place.robot != here.robot else ""
         self._sending = sending(here, place, self.sender, queue)
         self._posting: Posting | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._is_closed = False
 
     @property
     def place(self) -> Place:
@@ -104,8 +105,11 @@ class Proxy:
 
     def close(self) -> None:
         """Let the connection go. What was posted and has no answer is sent no more; its futures say so."""
-        if self._posting is not None:
-            self._posting.close()
+        self._is_closed = True  # a call that waits looks at it
+        with self._lock:
+            posting = self._posting
+        if posting is not None:
+            posting.close()
         self._sending.close()
 
     def __enter__(self) -> Proxy:
@@ -134,10 +138,11 @@ class Proxy:
             NoAnswerError: no answer came in time. Whether it was carried out is not known.
             EnvelopeError: no message can say this body.
             MailboxFullError: too many earlier messages have had no answer.
+            DriverError: the proxy is closed.
         """
         with self._lock:
-            posting = self._posting
-            if posting is None:
+            self._refuse_closed("call")
+            if self._posting is None:
                 answer = self._answered(self._envelope(verb, self._body(body, fields), timeout), round(timeout * SECOND_NS))
                 self.last = answer
                 if answer.error is not UNSET:
@@ -145,6 +150,8 @@ class Proxy:
                 return None if answer.ok is UNSET else answer.ok
         try:
             return self.post(verb, body, deadline_s=timeout, **fields).result(timeout)
+        except NoAnswerError:  # a TimeoutError too, which knows more
+            raise
         except concurrent.futures.TimeoutError as error:
             raise NoAnswerError(self._no_answer(verb, timeout, "")) from error
         except CallRefusedError as error:
@@ -173,9 +180,14 @@ class Proxy:
         """
         envelope = self._envelope(verb, self._body(body, fields), deadline_s)
         with self._lock:
+            self._refuse_closed("post to")
             if self._posting is None:
                 self._posting = Posting(self._sending)
         return self._posting.post(envelope, self.now_ns())
+
+    def _refuse_closed(self, what: str) -> None:
+        if self._is_closed:
+            raise DriverError(f"cannot {what} {self.path}: the proxy is closed; make a new one")
 
     def flush(self, timeout: float | None = None) -> None:
         """Return when all that was posted has its result, an error included.
@@ -241,6 +253,8 @@ class Proxy:
                     busy = answer.error.sentence
                 elif self.now_ns() < until_ns:
                     return answer
+            if self._is_closed:
+                raise NoAnswerError(f"{self.path} has not answered: the proxy was closed; it may have been carried out")
             now_ns = self.now_ns()
         raise NoAnswerError(self._no_answer(envelope.verb, timeout_ns / SECOND_NS, busy))
 
