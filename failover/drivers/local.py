@@ -207,7 +207,10 @@ class LocalWay:
 
     def _open(self) -> socket.socket | None:
         if self._end is None and not self.closed:
-            end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+            try:
+                end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+            except OSError:  # no descriptor is free: it is tried again like a driver that is not there
+                return None
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIME.pack(SEND_LIMIT_S, 0))
             try:
                 end.connect(self._path)

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import os
 import select
+import sys
 import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final
@@ -25,7 +26,7 @@ from failover.drivers.here import Here
 from failover.drivers.local import SCHEME, LocalWay
 from failover.drivers.lookup import lookup
 from failover.drivers.name_service import new_boot
-from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, FailoverError, NoAnswerError
 
 if TYPE_CHECKING:
     from failover.drivers.sockets import TeamWay
@@ -127,12 +128,12 @@ class Sending:
         answer = decoded(content)
         if answer is None:
             return []
+        kind = "" if answer.error is UNSET else answer.error.kind
+        if kind in MOVED:  # before the epoch is looked at: a copy that was replaced says it under its lower one
+            self._moved()
         if 0 < answer.epoch < self._epoch:
             return []  # of a copy that was replaced: what it did is lost
         self._epoch = max(self._epoch, answer.epoch)
-        kind = "" if answer.error is UNSET else answer.error.kind
-        if kind in MOVED:
-            self._moved()
         with self._lock:
             is_final = self._outbox.answered(answer, self._heard_ns)
         return [answer] if is_final or kind == "busy" else []
@@ -196,7 +197,7 @@ class Sending:
     def _look_again(self, until_ns: int) -> bool:
         """It does not answer: it may have been started anew, at another address; whether it was."""
         limit_ns = min(until_ns - self.now_ns(), LOOK_NS)
-        with contextlib.suppress(NameUnknownError, DriverError):  # it is waited for where it was
+        with contextlib.suppress(*_may_pass()):  # it is waited for where it was
             place = lookup(self.here, self.path, limit_ns)
             address = address_of(self.here, place)
             if address != self.address:
@@ -335,6 +336,12 @@ def address_of(here: Here, place: Place) -> str:
         why = here.alone or f"its driver on {place.robot} opened no port: the key of the team could not be read there"
         raise DriverError(f"cannot reach {place.record.path} on {place.robot}: {why}")
     return found
+
+
+def _may_pass() -> tuple[type[Exception], ...]:
+    """What may be over at the next look: no name, no descriptor, no memory of the kernel."""
+    zmq = sys.modules.get("zmq")  # loaded only by who needs other robots
+    return (FailoverError, OSError, *((zmq.ZMQError,) if zmq is not None else ()))
 
 
 def decoded(content: bytes) -> Envelope | None:
