@@ -93,18 +93,27 @@ class Actor:
         self._routes: OrderedDict[str, tuple[int, Whose]] = OrderedDict()
         """Sender → its life, and the way back to it."""
 
+    def turned_away(self, envelope: Envelope) -> Fault | None:
+        """Why a message is not taken in, whoever sends it; None if it may be. The answer goes back the way the message came."""
+        if why := self.fence(envelope.epoch):
+            return Fault("moved", why)
+        known = max(self._routes.get(envelope.sender, (0, None))[0], self._mailbox.boot_of(envelope.sender))
+        if not envelope.sender or not (envelope.boot or envelope.seq) or envelope.boot >= known:
+            return None
+        return Fault(
+            "outlived",
+            f"{envelope.sender} was started again, or runs twice, or its clock was set back: a later life of it is heard here, "
+            "and this one no more; give each process a sender of its own, and set the clock right",
+        )
+
     def came(self, envelope: Envelope, whose: Whose, now_ns: int, size: int = 0) -> list[Envelope]:
         """Take in a message of so many bytes; answers that leave at once."""
         if not envelope.sender:
             envelope = msgspec.structs.replace(envelope, sender=f"by-hand-{hash(whose) & 0xFFFFFFFF:08x}")
         known = self._routes.get(envelope.sender, (0, None))[0]
-        if 0 < envelope.boot < known:
-            return []  # its sender was started again: no process waits for an answer
         self._routes[envelope.sender] = (max(envelope.boot, known), whose)
         if len(self._routes) > SENDERS_MAX:
             self._routes.popitem(last=False)
-        if why := self.fence(envelope.epoch):
-            return [refusal(envelope, "moved", why)]
         if not self._is_meant(envelope.to):
             here = f"this is {self._declaration.path}, and not {envelope.to}: look the name up anew"
             return [refusal(envelope, "wrong_driver", here)]

@@ -27,9 +27,16 @@ FAREWELL_NS: Final = 50_000_000
 """How long a driver that ends answers those that ask what has changed."""
 
 
+_boots_lock: Final = threading.Lock()
+_last_boot = 0
+
+
 def new_boot() -> int:
-    """Greater than in all lives before, unless the wall clock was set back."""
-    return time.time_ns() >> BOOT_SHIFT
+    """Greater than all that this process has got, and than in all lives before, unless the wall clock was set back."""
+    global _last_boot
+    with _boots_lock:
+        _last_boot = max(_last_boot + 1, time.time_ns() >> BOOT_SHIFT)
+        return _last_boot
 
 
 class NameService:

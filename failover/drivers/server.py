@@ -353,6 +353,10 @@ class Serving:
                 envelopes.refusal(envelope, "wrong_sender", f"{envelope.sender!r} is no process of {robot}, whose key this is"),
             )
             return
+        if fault := self._actor.turned_away(envelope):  # before its rights: those of the copy that acts count
+            said = envelopes.refusal(envelope, fault.kind, fault.sentence)
+            self._publish(whose, msgspec.structs.replace(said, epoch=self._epoch_told))
+            return
         uid = None if isinstance(whose, Peer) else whose.uid
         if not envelope.verb.startswith("_") or envelope.verb == "_subscribe":
             denied = self._rights.refusal(uid, robot, envelope.by)

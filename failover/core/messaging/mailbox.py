@@ -330,6 +330,11 @@ class Mailbox:
                 self._packed[sender] = _pack((sender, stream))
         return b"\xdd" + len(self._streams).to_bytes(4, "big") + b"".join(self._packed[sender] for sender in self._streams)
 
+    def boot_of(self, sender: str) -> int:
+        """The sender's newest life of which something was taken; 0: it is not known."""
+        taken = self._taken.get(sender)
+        return taken.boot if taken is not None else 0
+
     # --- A message arrives ------------------------------------------------------------------------------------------------
 
     def arrived(self, envelope: Envelope, now_ns: int) -> list[Envelope]:

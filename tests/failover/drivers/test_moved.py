@@ -109,3 +109,24 @@ def test_what_waits_in_a_mailbox_that_is_given_back_comes_again_as_if_it_had_nev
     assert box.arrived(sent[2], 0) == [] and box.take(0) is None, "the one before it must come again"
     box.arrived(sent[1], 0)
     assert [box.take(0).seq for _ in range(2)] == [2, 3]  # type: ignore[union-attr]
+
+
+def test_a_stale_copy_that_says_moved_under_its_lower_epoch_is_believed(lab: Lab) -> None:
+    with arm(lab.here("robot1"), 1) as (old, _), Proxy(lab.here("robot1"), lookup(lab.here("robot1"), "arm")) as proxy:
+        assert proxy.call("move", number=1, timeout=LIMIT_S) == 1
+        proxy._sending._epoch = 2  # it has heard of it
+        looked: list[int] = []
+        proxy._sending._moved = lambda: looked.append(1)  # type: ignore[method-assign]
+        with pytest.raises(failover.NoAnswerError):
+            proxy.call("move", number=2, timeout=0.2)
+        assert looked and old.instance.heard == [1]
+
+
+def test_a_stale_copy_asks_no_rights_but_says_that_it_has_moved(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    with arm(lab.here("robot1"), 1) as (old, _), Proxy(lab.here("robot1"), lookup(lab.here("robot1"), "arm")) as proxy:
+        assert proxy.call("move", number=1, timeout=LIMIT_S) == 1
+        monkeypatch.setattr(old._rights, "refusal", lambda *_: "no rule gives it")
+        with arm(lab.here("robot2"), 2) as (new, _):
+            until(lambda: is_fenced(old))
+            assert proxy.call("move", number=2, timeout=LIMIT_S) == 2
+            assert (old.instance.heard, new.instance.heard) == ([1], [2])

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 
 from failover.core.messaging.mailbox import FLIGHT_MAX, MAILBOX_MAX
+from failover.core.naming.tree import Place
+from failover.drivers import sending
 from failover.drivers.here import Here
 from failover.drivers.lookup import lookup
 from failover.drivers.name_service import new_boot
 from failover.drivers.proxy import Proxy
 from failover.drivers.server import Serving
-from failover.errors import CallRefusedError, DriverError, EnvelopeError, MailboxFullError, NoAnswerError
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, MailboxFullError, NameAmbiguousError, NoAnswerError
 from tests.failover.drivers.devices import Engine
 from tests.failover.drivers.serving import LIMIT_S, called, serving, until
 from tests.failover.drivers.test_kept import counter, reached
@@ -130,8 +135,8 @@ def test_a_program_that_is_started_again_is_not_overtaken_by_what_its_process_be
         until(lambda: new_boot() > boot)
         new = Proxy(here, place, sender="mission")
         new.call("set", duty=0.2)
-        with pytest.raises(NoAnswerError):
-            old.call("set", duty=0.3, timeout=0.1)
+        with pytest.raises(CallRefusedError, match="was started again"):
+            old.call("set", duty=0.3, timeout=LIMIT_S)
         assert new.sender == "robot1/mission" and new.call("read") == {"duty": 0.2}
         assert engine.instance.heard == [0.1, 0.2]
         old.close()
@@ -186,3 +191,71 @@ def test_a_body_that_no_message_can_carry_is_not_taken(here: Here, is_posting: b
             with pytest.raises(EnvelopeError, match="512 are the most"):
                 take("v" * 513)
         assert proxy.call("picture", size=1_000_000) == "x" * 1_000_000
+
+
+@pytest.mark.parametrize("is_posting", [False, True])
+def test_a_proxy_that_is_closed_takes_nothing_more_and_ends_a_call_that_waits(here: Here, is_posting: bool) -> None:
+    with shut(here):
+        proxy = called(here, "engine")
+        if is_posting:
+            proxy.post("set", duty=0.1)
+        ended: list[BaseException] = []
+
+        def call() -> None:
+            try:
+                proxy.call("set", duty=0.2, timeout=LIMIT_S)
+            except NoAnswerError as error:
+                ended.append(error)
+
+        waiting = threading.Thread(target=call)
+        waiting.start()
+        until(lambda: proxy._sending._left == 1 + is_posting)
+        proxy.close()
+        waiting.join()
+        assert "the proxy was closed; it may have been carried out" in str(ended[0])
+        for take in (proxy.post, proxy.call):
+            with pytest.raises(DriverError, match="the proxy is closed; make a new one"):
+                take("set", duty=0.3)
+
+
+def test_a_thread_that_sends_goes_on_when_the_names_cannot_be_asked(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    errors: list[Exception] = [
+        OSError(errno.EMFILE, "Too many open files"),
+        NameAmbiguousError("two"),
+        zmq.ZMQError(errno.EMFILE),
+    ]
+    asked: list[Exception] = []
+
+    def fails(*_: object) -> Place:
+        asked.append(errors[len(asked) % len(errors)])
+        raise asked[-1]
+
+    with serving(Engine, here):
+        place = lookup(here, "engine")
+    with Proxy(here, place) as proxy:
+        monkeypatch.setattr(sending, "lookup", fails)
+        done = proxy.post("set", duty=0.1)
+        until(lambda: len(asked) >= len(errors) or done.done())
+        assert not done.done()
+        with serving(Engine, here):
+            assert done.result(LIMIT_S) is None
+
+
+def test_two_processes_of_one_sender_are_told_which_one_is_heard(here: Here) -> None:
+    with serving(Engine, here) as engine:
+        place = lookup(here, "engine")
+        with Proxy(here, place, sender="mission") as old, Proxy(here, place, sender="mission") as new:
+            assert new._sending._outbox._boot > old._sending._outbox._boot, "also within a millisecond"
+            new.call("set", duty=0.2)
+            with pytest.raises(CallRefusedError, match="robot1/mission was started again, or runs twice") as refused:
+                old.call("set", duty=0.3, timeout=LIMIT_S)
+            assert refused.value.kind == "outlived" and engine.instance.heard == [0.2]
+            with pytest.raises(CallRefusedError, match="give each process a sender of its own"):
+                old.post("set", duty=0.3).result(LIMIT_S)
+            assert new.call("read") == {"duty": 0.2}
+
+
+def test_the_lives_of_one_process_grow_when_the_clock_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = new_boot()
+    monkeypatch.setattr(time, "time_ns", lambda: 1 << 40)
+    assert first < new_boot() < new_boot()
