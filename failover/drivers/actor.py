@@ -182,10 +182,9 @@ class Actor:
         first = self.following(now_ns)
         is_turn = first is not None and not (self._is_paced(first) and self._pace.wait_ns(now_ns))
         if self._keeping is None:
-            if not is_turn:
-                return []
-            self._handle(now_ns, clock)
-            return self._mailbox.committed()
+            if is_turn:
+                self._handle(now_ns, clock)
+            return self._mailbox.committed()  # also of what expired while nothing could be handled
         if is_turn and not self._mailbox.is_ahead:
             with self._keeping.message():
                 self._handle(now_ns, clock)

@@ -105,7 +105,7 @@ def query(function: F, /) -> F:
 
 def stream(*, rate_hz: float) -> Callable[[F], F]:
     """A method without arguments whose value is sent to all that have subscribed, so many times a second."""
-    _check_rate(rate_hz)
+    check_rate(rate_hz)
     return _marker(None, Marked("stream", rate_hz=rate_hz), "stream")  # type: ignore[no-any-return]
 
 
@@ -149,7 +149,7 @@ def driver(
     except NameFormatError as error:
         raise DriverError(f"cannot declare a driver: {error}") from error
     if rate_hz is not None:
-        _check_rate(rate_hz)
+        check_rate(rate_hz)
 
     def declared(chosen: type[C]) -> type[C]:
         if not isinstance(chosen, type):
@@ -234,6 +234,7 @@ def _schema(arguments: type[Struct]) -> dict[str, Any]:
     }
 
 
-def _check_rate(rate_hz: float) -> None:
+def check_rate(rate_hz: float) -> None:
+    """Raises DriverError: nothing can be done so often a second."""
     if not 0 < rate_hz <= RATE_HZ_MAX:
-        raise DriverError(f"rate_hz={rate_hz} is no rate: write a number above 0, at most {RATE_HZ_MAX:.0f}")
+        raise DriverError(f"rate_hz={rate_hz} is no rate in Hz: write a number above 0, at most {RATE_HZ_MAX:.0f}")

@@ -140,10 +140,14 @@ class HostActor(Actor):
     # --- One message ------------------------------------------------------------------------------------------------------
 
     def handle(self, clock: Callable[[], int]) -> list[Envelope]:
-        """Between two messages: switch, if a version has become warm; judge the one on trial. Then the next message."""
-        self._turn(clock)
+        """Between two messages: switch, if a version has become warm; judge the one on trial. Then the next message.
+
+        While another copy acts, nothing of that: versions that start, switch and carry out commands again act on the device.
+        """
+        if not self.fence(0):
+            self._turn(clock)
         answers = super().handle(clock)
-        if self._is_changed:
+        if self._may_keep:
             self._keep()
         if self._is_unsettled:
             self._settle()
@@ -152,13 +156,20 @@ class HostActor(Actor):
     def _handle(self, now_ns: int, clock: Callable[[], int]) -> None:
         """Under an agent, what a message did and that it was handled is one commit."""
         super()._handle(now_ns, clock)
-        if self._keeping is not None and self._is_changed:
+        if self._keeping is not None and self._may_keep:
             self._carry(self._keeping)
+
+    @property
+    def _may_keep(self) -> bool:
+        """Whether there is something to keep. While a trial's commands are owed, only what was kept before has them."""
+        return self._is_changed and not self._owed
 
     def following(self, now_ns: int) -> Envelope | None:
         """While no version runs, only what is the host's own is carried out."""
         if self._running is None:
+            handled = self._mailbox.handled
             self._mailbox.bring_forward(_is_hosts, now_ns)
+            self._is_changed |= self._mailbox.handled != handled  # what has expired is kept, then answered
         first = super().following(now_ns)
         return first if first is None or self._running is not None or _is_hosts(first) else None
 
@@ -171,7 +182,9 @@ class HostActor(Actor):
     def wait_ns(self, now_ns: int) -> int | None:
         """Not longer than until something of the versions is due."""
         waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
-        if self._coming is not None or self._started is not None or self._is_changed:
+        if self.fence(0):
+            return min(*waits, LOOK_NS) if waits else LOOK_NS
+        if self._coming is not None or self._started is not None or self._may_keep:
             waits.append(0)
         if self._trial is not None:
             due = self._trial.wait_ns(now_ns)
@@ -223,7 +236,7 @@ class HostActor(Actor):
             text = f"no version of {self._place.name} runs now: {self._why_lost}; {message.verb} may have been carried out"
             return refusal(message, "no_version", text)
         try:
-            found = self._running.call(message)
+            found = _checked(message, self._running.call(message))
             why = found.answer.error.sentence if found.answer.error is not UNSET and found.answer.error.kind == "failed" else ""
         except FailoverError as error:
             found, why = None, str(error)
@@ -266,12 +279,15 @@ class HostActor(Actor):
         self._number += 1
         carried.newest = msgspec.msgpack.encode(Kept(self._number, self.version, self._state, {}, time.time()))
         if self._is_shelf_new:
-            self._is_shelf_new = False
-            carried.switched = msgspec.msgpack.encode(self._switched) if self._switched is not None else b""
             try:
                 carried.take_shelf(self._place.store.shelf(self._place.name), self._place)
-            except ProgramError as error:
-                self._say(f"a standby cannot take {self.version} over: {error}")
+            except ProgramError as error:  # tried again with the next message
+                why = f"a standby cannot take {self.version} over: {error}"
+                if why != self._said:
+                    self._say(why)
+            else:
+                carried.switched = msgspec.msgpack.encode(self._switched) if self._switched is not None else b""
+                self._is_shelf_new = False
 
     def _write(self, *, is_lasting: bool = False) -> None:
         if self._keeping is not None:
@@ -693,7 +709,8 @@ class HostActor(Actor):
             except FailoverError as error:
                 log.warning("%s", error)
         try:
-            self._write(is_lasting=True)
+            if not self._owed:
+                self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
         for thread in (self._starter, self._reviver):
@@ -707,6 +724,20 @@ class HostActor(Actor):
 def _is_hosts(message: Envelope) -> bool:
     """Whether the host itself answers it."""
     return message.verb.startswith("_")
+
+
+FAULTS: Final = frozenset(("unknown_verb", "bad_body", "bad_result", "failed"))
+"""Kinds of errors that are a version's to say; others mean the host, and a sender obeys them."""
+
+
+def _checked(message: Envelope, found: Answered) -> Answered:
+    """A version says what came of a message; to whom that goes, and as what, is the host's."""
+    said = found.answer
+    if said.error is UNSET:
+        anew = answer(message, None if said.ok is UNSET else said.ok)
+    else:
+        anew = refusal(message, said.error.kind if said.error.kind in FAULTS else "failed", said.error.sentence)
+    return msgspec.structs.replace(found, answer=anew)
 
 
 def _again(running: Running, command: Command) -> Any:

@@ -18,7 +18,8 @@ from msgspec import Struct
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope
 from failover.core.programs.manifest import Manifest
-from failover.errors import ProgramError
+from failover.drivers.declare import check_rate
+from failover.errors import DriverError, ProgramError
 from failover.kept_state.api import Resumed
 from failover.programs.channel import (
     Begin,
@@ -106,6 +107,7 @@ class Running:
                 raise ChannelClosedError("its process said something else")
             if hello.path != source.manifest.path:
                 raise ProgramError(f"it speaks for {hello.path}, and its manifest says {source.manifest.path}")
+            _check_rates(hello)
             self.hello = hello
         except ProgramError as error:
             self.end()
@@ -204,3 +206,13 @@ class Running:
             os.killpg(self._process.pid, signal.SIGKILL)
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(END_S)
+
+
+def _check_rates(hello: Hello) -> None:
+    """Raises ProgramError: the host cannot keep such a pace. The program's own process could tell anything."""
+    streams = [one.rate_hz for one in hello.verbs.values() if one.role == "stream"]
+    try:
+        for rate_hz in (*streams, *(() if hello.rate_hz is None else (hello.rate_hz,))):
+            check_rate(rate_hz)
+    except DriverError as error:
+        raise ProgramError(str(error)) from error

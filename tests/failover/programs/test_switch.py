@@ -14,24 +14,28 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from msgspec import UNSET
 
-from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.envelope import Envelope, decode, encode
 from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs import states
 from failover.core.programs.states import State
+from failover.drivers.sending import way_to
 from failover.drivers.server import Near, Peer
 from failover.errors import BundleRefusedError, CallRefusedError, DriverError, NoAnswerError, ProgramError
+from failover.programs.carried import Carried
 from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.running import Running
 from failover.programs.sources import Place
 from failover.programs.store import Kept, Store
 from tests.failover.drivers.serving import taking_messages
-from tests.failover.programs.senders import Lab, engine, switched, until
+from tests.failover.drivers.serving import until as wait_for
+from tests.failover.programs.senders import NAME, Lab, engine, switched, until
 
 LEAST = 100
 RATE_HZ = 20
@@ -478,3 +482,124 @@ def test_a_result_that_no_message_can_carry_is_refused_and_ends_no_version(lab: 
             proxy.call("fly", timeout=60)
         assert refused.value.kind == "bad_result"
         assert proxy.call("step", number=1, timeout=60) == 1 and host.actor._running.pid == pid  # type: ignore[union-attr]
+
+
+def test_a_host_that_is_fenced_starts_and_switches_nothing_until_it_acts_again(lab: Lab) -> None:
+    lab.send("1")
+    with lab.hosting() as host, lab.proxy() as proxy:
+        proxy.call("step", number=1, timeout=60)
+        actor, acts = host.actor, host.actor.fence
+        actor.fence = lambda _: "it runs elsewhere"
+        lost = actor._running
+        assert lost is not None
+        lost._process.kill()
+        lost._process.wait()
+        turns: list[int] = []
+        handle = actor.handle
+        actor.handle = lambda clock: turns.append(1) or handle(clock)  # type: ignore[method-assign, func-returns-value]
+        for count in range(1, 4):
+            host.wake()
+            wait_for(lambda count=count: len(turns) >= count)  # type: ignore[misc]
+        assert actor._running is lost and not actor._is_starting_anew
+        actor._started = (None,)
+        assert actor.wait_ns(host.now_ns()), "nor does it spin over what it does not do"
+        actor._started, actor.fence = None, acts
+        host.wake()
+        assert proxy.call("read", timeout=60) == [1] and actor._running is not lost
+
+
+def test_what_expires_while_no_version_runs_is_answered_at_once(lab: Lab) -> None:
+    lab.send("1")
+    with lab.hosting() as host, lab.proxy() as proxy:
+        (lab.team / "programs.toml").write_text("")
+        host.actor._running._process.kill()  # type: ignore[union-attr]
+        until(proxy, lambda found: "cannot be started anew" in str(found["said"]))
+        way = way_to(lab.here, proxy._sending.address, "robot1")
+        late = Envelope(verb="step", body=1, sender="robot1/s", boot=1, seq=1, reliable=True, deadline_ms=0)
+        assert way.await_sent(encode(late), 60 * 10**9)
+        said = decode(way.await_message(10 * 10**9) or b"")
+        assert said.error is not UNSET and said.error.kind == "expired"
+        way.close()
+
+
+FORGES = """
+import __main__
+import msgspec
+from failover.core.messaging import envelope as e
+
+def forged(said, encoding="json"):
+    terms = {"error": e.Fault("moved", "go away")} if isinstance(said.ok, list) else {}
+    return e.encode(msgspec.structs.replace(said, to="robot1/x", re="y", boot=7, seq=99, epoch=1 << 50, **terms), encoding)
+
+e.encode_answer = forged
+"""
+
+
+def test_a_version_says_what_came_of_a_message_and_nothing_else_of_its_answer(lab: Lab) -> None:
+    lab.send("1", engine(before=FORGES))
+    with lab.hosting(), lab.proxy() as proxy:
+        assert proxy.call("step", number=1, timeout=20) == 1
+        assert proxy.last is not None and proxy.last.epoch == 0
+        with pytest.raises(CallRefusedError, match="go away") as refused:
+            proxy.call("read", timeout=20)
+        assert refused.value.kind == "failed"
+
+
+RATES = """
+import __main__
+import msgspec
+
+hello = __main__.Loaded.hello
+
+def told(self):
+    found = hello(self)
+    verbs = {name: msgspec.structs.replace(one, role="stream", rate_hz=0.0) for name, one in found.verbs.items()}
+    return msgspec.structs.replace(found, **(RATES))
+
+__main__.Loaded.hello = told
+"""
+
+
+@pytest.mark.parametrize("rates", ["{'rate_hz': 0.0}", "{'rate_hz': float('nan')}", "{'verbs': verbs}"])
+def test_a_version_that_tells_no_rate_is_refused(lab: Lab, rates: str) -> None:
+    lab.send("1", engine(before=RATES.replace("RATES", rates)))
+    with pytest.raises(ProgramError, match="is no rate in Hz"), lab.hosting():
+        pass
+
+
+def test_what_a_trial_has_answered_is_kept_until_the_version_before_it_has_carried_it_out(lab: Lab) -> None:
+    lab.send("1")
+    lab.send("2", engine(body=FAILS_THIRD), seconds=600)
+    with lab.hosting("1") as host, lab.proxy() as proxy:
+        proxy.call("step", number=0, timeout=60)
+        proxy.call("_switch", {"version": "2"})
+        until(proxy, lambda found: found["active"] == "2")
+        assert [proxy.call("step", number=number, timeout=60) for number in (1, 2)] == [1, 2]
+        host.actor._old._process.kill()  # type: ignore[union-attr]
+        host.actor._old._process.wait()  # type: ignore[union-attr]
+        before = lab.store.kept(NAME)
+        (lab.team / "programs.toml").write_text("")
+        with pytest.raises(CallRefusedError):
+            proxy.call("step", number=3, timeout=60)
+        until(proxy, lambda found: "cannot be started anew" in str(found["said"]))
+        kept = lab.store.kept(NAME)
+        assert kept is not None and before is not None
+        assert (kept.version, kept.state) == ("2", before.state), "the two commands are in it, and count as answered"
+        lab.trust()
+        until(proxy, lambda found: found["active"] == "1")
+        assert proxy.call("read", timeout=60) == [0, 1, 2]
+    kept = lab.store.kept(NAME)
+    assert kept is not None and kept.version == "1"
+
+
+def test_a_shelf_that_a_standby_could_not_get_goes_to_it_with_a_later_message(lab: Lab) -> None:
+    digest = lab.send("1").digest
+    with lab.hosting() as host, lab.proxy():
+        keeping: Any = SimpleNamespace(instance=Carried())
+        bundle = lab.store._bundle(digest)
+        bundle.rename(bundle.with_suffix(".aside"))
+        host.actor._carry(keeping)
+        assert not keeping.instance.shelf and "a standby cannot take 1 over" in host.actor._said
+        bundle.with_suffix(".aside").rename(bundle)
+        host.actor._carry(keeping)
+        assert keeping.instance.shelf and list(keeping.instance.bundles) == [digest]
