@@ -169,11 +169,15 @@ class RightsFile:
             return self.mistake != before
         if at == self._read_at:
             return False
+        before, was_unread = self.mistake, self._read_at == UNREADABLE
         self._read_at, self.exists, self.rights, self.mistake = at, at is not None, None, ""
         try:
             self.rights = read(self.path.parent)
         except (FailoverError, OSError) as error:
             self.mistake = str(error)
+            if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
+                self._read_at = UNREADABLE  # the system could not, and may at the next look
+                return not was_unread or self.mistake != before
         return True
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from failover.config import rights
-from failover.config.rights import RIGHTS_FILE
+from failover.config.rights import RIGHTS_FILE, RightsFile
 from failover.core.rights.rules import Subject, decide
 from failover.errors import FileMistakeError
 
@@ -80,3 +82,19 @@ def test_the_commands_tell_the_rules_and_one_answer(tmp_path: Path) -> None:
     alone = typed("why", "anna", "see", "a", "--socket", str(tmp_path / "none"))
     assert alone.returncode == 3 and "name groups to try: --groups a,b" in json.loads(alone.stdout)["message"]
     assert stranger.returncode == 1 and "has no user 'no-such-user'" in json.loads(stranger.stdout)["message"]
+
+
+def test_a_file_that_could_not_be_read_for_want_of_a_descriptor_is_read_at_the_next_look(tmp_path: Path) -> None:
+    file = RightsFile(written(tmp_path, RULE))
+    free = os.open(tmp_path, os.O_RDONLY)
+    os.close(free)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
+    try:
+        looks = [file.look(), file.look()]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert looks == [True, False] and file.rights is None and "Too many open files" in file.mistake
+    assert file.look() and file.rights is not None and not file.mistake
+    written(tmp_path, "[")
+    assert file.look() and file.mistake and not file.look(), "a mistake in it stays until it changes"
