@@ -163,6 +163,9 @@ class NameService:
                 self.record = self._scan.put(msgspec.structs.replace(self.record, epoch=epoch), now_ns, urgent=True)
 
     def _find_rival(self) -> None:
+        if not self._epoch():
+            self.rival = None  # without an agent no copy is fenced
+            return
         places = self.tree().claimants(self.record.path)
         others = [one for one in places if one.origin != self._scan.origin and one.reach is Reach.LIVE and not one.refused]
         self.rival = max(others, key=lambda one: one.record.epoch, default=None)

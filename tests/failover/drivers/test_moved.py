@@ -130,3 +130,13 @@ def test_a_stale_copy_asks_no_rights_but_says_that_it_has_moved(lab: Lab, monkey
             until(lambda: is_fenced(old))
             assert proxy.call("move", number=2, timeout=LIMIT_S) == 2
             assert (old.instance.heard, new.instance.heard) == ([1], [2])
+
+
+def test_a_driver_without_an_epoch_looks_for_no_rival_until_it_has_one(lab: Lab) -> None:
+    with arm(lab.here("robot1"), 0) as (old, primacy), arm(lab.here("robot2"), 2):
+        until(lambda: len(old.service.tree().claimants("Lab/Arm")) == 2)
+        old.service._find_rival()
+        assert old.service.rival is None and not is_fenced(old)
+        primacy.epoch = 1
+        old.service.look()
+        until(lambda: is_fenced(old))
