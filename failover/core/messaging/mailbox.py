@@ -385,11 +385,16 @@ class Mailbox:
             self._taken[sender] = taken
 
     def _again(self, envelope: Envelope) -> list[Envelope]:
-        """One that was taken before: its answer, once what it did is kept."""
+        """One that was taken before, or passed over: its answer, once what it did is kept.
+
+        A sender passes over what expires before it leaves. If it is killed before it keeps that, it sends the message after all.
+        """
         stream = self._streams.get(envelope.sender)
         if stream is None or stream.boot != envelope.boot or envelope.seq > self._free.get(envelope.sender, 0):
             return []
         answer = stream.answers.get(envelope.seq)
+        if answer is None and envelope.reliable and envelope.deadline_ms is not None and envelope.seq > envelope.had:
+            answer = refusal(envelope, "expired", "its sender has passed it over; it was not handled")
         return [] if answer is None else [answer]
 
     def _hold(self, taken: Taken, arrived: Arrived) -> None:
