@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
+from checkpoint.store.whole_file import write_all
 from failover.core.event_log.decisions import Line
 
 DIRECTORY: Final = "story"
@@ -99,7 +100,7 @@ class EventLogFile:
         if self._is_torn:
             content = b"\n" + content
         self._is_torn = True  # until all of it is there
-        _write_whole(self._descriptor, content)
+        write_all(self._descriptor, content)
         os.fdatasync(self._descriptor)
         self._is_torn = False
         if os.fstat(self._descriptor).st_size >= HALF_SIZE_MAX:
@@ -123,9 +124,3 @@ class EventLogFile:
     def _turn_over(self) -> None:
         self.close()
         (self._directory / NEWER).replace(self._directory / OLDER)
-
-
-def _write_whole(descriptor: int, content: bytes) -> None:
-    rest = memoryview(content)
-    while rest:
-        rest = rest[os.write(descriptor, rest) :]

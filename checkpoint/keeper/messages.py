@@ -24,6 +24,7 @@ from checkpoint.model import Position
 from checkpoint.sentences import in_words
 from checkpoint.snapshot.credentials import Owner
 from checkpoint.store.digest_cache import KnownDigest
+from checkpoint.store.whole_file import write_all
 
 INLINE: Final = b"\x00"
 IN_MEMFD: Final = b"\x01"
@@ -151,9 +152,7 @@ def memfd_holding(content: bytes | memoryview, name: str) -> int:
     Sealed: neither end can change or cut what the other is reading.
     """
     descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    view = memoryview(content)
-    while view:
-        view = view[os.write(descriptor, view) :]
+    write_all(descriptor, content)
     seal(descriptor)
     return descriptor
 

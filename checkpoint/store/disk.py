@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from checkpoint.store.whole_file import sync_directory
+from checkpoint.store.whole_file import sync_directory, write_all
 
 FILE_MODE = 0o600
 FOLDER_MODE = 0o700
@@ -39,9 +39,7 @@ class Disk:
 
     def write(self, descriptor: int, content: bytes | memoryview) -> int:
         """Append all of the content."""
-        rest = memoryview(content).cast("B")
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
+        write_all(descriptor, content)
         return len(content)
 
     def is_unnamed(self, descriptor: int) -> bool:

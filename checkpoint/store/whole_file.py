@@ -1,4 +1,7 @@
-"""Writes a small file anew, so that its name stands for the old content or for the new one, and never for a part."""
+"""Writes a small file anew, so that its name stands for the old content or for the new one, and never for a part.
+
+Also the loop that writes all of a content, for every writer.
+"""
 
 from __future__ import annotations
 
@@ -54,9 +57,14 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600, lasts: Lasting
         OSError: it cannot be written; the old one stands.
     """
     with written_aside(path, mode=mode, lasts=lasts) as descriptor:
-        rest = memoryview(content)
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
+        write_all(descriptor, content)
+
+
+def write_all(descriptor: int, content: bytes | memoryview) -> None:
+    """Write a content by as many write(2) as it takes."""
+    rest = memoryview(content).cast("B")
+    while rest:
+        rest = rest[os.write(descriptor, rest) :]
 
 
 def sync_directory(directory: Path) -> None:

@@ -18,6 +18,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, cast
 
 from msgspec import Struct
 
+from checkpoint.store.whole_file import write_all
 from failover.core.board.recording import Schema as SchemaText
 from failover.errors import RecordingError
 
@@ -79,10 +80,8 @@ class _Stream:
         Raises:
             OSError: it failed.
         """
-        left = memoryview(bytes(self._waiting))
         try:
-            while left:
-                left = left[os.write(self._descriptor, left) :]
+            write_all(self._descriptor, bytes(self._waiting))
         except OSError:
             os.ftruncate(self._descriptor, self.written)
             raise
