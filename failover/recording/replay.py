@@ -29,6 +29,7 @@ from failover.core.frames.frame import Portion
 from failover.errors import BoardError, ItemError, RecordingError
 from failover.recording.follower import Choice
 from failover.recording.mcap_file import Recorded
+from failover.recording.stream import Endable
 
 NAME: Final = "failover board replay"
 """Of this program among the board's users."""
@@ -36,8 +37,6 @@ TURN_S: Final = 0.1
 """What a turn of a replay takes at least that begins again and again, also where all was recorded in one instant."""
 ROOM_LEFT: Final = 4
 """One of so many parts of an agent's table stays free for programs."""
-SLEEP_S: Final = 0.1
-"""The longest sleep without a look at the signal that ends the replay."""
 
 
 class Contents(Struct):
@@ -346,8 +345,8 @@ def _prefixed(prefix: str, channel: Channel) -> str:
     return f"{prefix}.{channel.robot}.{channel.wanted.name}"
 
 
-class Player:
-    """Plays a recording on a stage. ``is_ended``: set it, also in a signal's function, to end it."""
+class Player(Endable):
+    """Plays a recording on a stage."""
 
     def __init__(self, source: Source, contents: Contents, stage: Stage, pace: float) -> None:
         self._source = source
@@ -355,7 +354,6 @@ class Player:
         self._stage = stage
         self._pace = pace
         self._coders = {topic: Coder(channel) for topic, channel in contents.channels.items()}
-        self.is_ended = False
         self.puts = 0
 
     def run(self, least_s: float = 0.0) -> None:
@@ -368,7 +366,7 @@ class Player:
         begin_s = time.monotonic()
         for message in self._source.messages():
             due_s = begin_s + (message.log_ns - self._contents.first_ns) / 1e9 / self._pace
-            self._sleep_until(due_s)
+            self.sleep_until(due_s)
             if self.is_ended:
                 return
             if message.channel is None:
@@ -381,8 +379,4 @@ class Player:
             octets = self._coders[message.topic].octets_of(put)
             target.put(octets, message.age_ns, put.error_us)
             self.puts += 1
-        self._sleep_until(begin_s + least_s)
-
-    def _sleep_until(self, instant_s: float) -> None:
-        while not self.is_ended and (left_s := instant_s - time.monotonic()) > 0:
-            time.sleep(min(left_s, SLEEP_S))
+        self.sleep_until(begin_s + least_s)

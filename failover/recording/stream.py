@@ -140,8 +140,19 @@ class Counts(Struct):
     decisions: int = 0
 
 
-class Stream:
-    """Looks at a board, and says to a sink what is new. ``is_ended``: set it, also in a signal's function, to end `run`."""
+class Endable:
+    """An act that takes its time. ``is_ended``: set it, also in a signal's function, to end it."""
+
+    is_ended = False
+
+    def sleep_until(self, instant_s: float) -> None:
+        """Until an instant of `time.monotonic`, or the end."""
+        while not self.is_ended and (left_s := instant_s - time.monotonic()) > 0:
+            time.sleep(min(left_s, SLEEP_S))
+
+
+class Stream(Endable):
+    """Looks at a board, and says to a sink what is new."""
 
     def __init__(self, board: Board, follower: Follower, sink: Sink, decisions: Decisions | None = None) -> None:
         self._board = board
@@ -153,7 +164,6 @@ class Stream:
         self._channels: dict[str, tuple[Channel | None, int]] = {}
         self._pause = ""
         self.counts = Counts(set(), set(), [], set())
-        self.is_ended = False
 
     def begin_anew(self, sink: Sink) -> None:
         """Another sink, which gets the newest value of each item."""
@@ -180,15 +190,11 @@ class Stream:
                 each_second()
                 each_s = look_s + EACH_S
             look_s = max(look_s + 1 / rate, time.monotonic())
-            self._sleep_until(look_s if end_s is None else min(look_s, end_s))
+            self.sleep_until(look_s if end_s is None else min(look_s, end_s))
         self._look()
         if self._decisions is not None:
             self._decisions.stop()
             self._say_decisions()
-
-    def _sleep_until(self, instant_s: float) -> None:
-        while not self.is_ended and (left_s := instant_s - time.monotonic()) > 0:
-            time.sleep(min(left_s, SLEEP_S))
 
     def _look(self) -> None:
         try:

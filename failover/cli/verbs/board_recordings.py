@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from failover import __version__
 from failover.boards import directory
@@ -20,17 +20,13 @@ from failover.cli.output.team_tree import size
 from failover.cli.verbs.board import board_there
 from failover.core.board import layout
 from failover.recording.follower import Choice, Follower
-from failover.recording.stream import Decisions, Stream
+from failover.recording.stream import Decisions, Endable, Stream
 
 LIBRARY: Final = f"failover {__version__}"
 
 
-class _Endable(Protocol):
-    is_ended: bool
-
-
 @contextlib.contextmanager
-def ended_by_signals(act: _Endable) -> Iterator[None]:
+def ended_by_signals(act: Endable) -> Iterator[None]:
     """Ctrl-C and SIGTERM end an act in order, instead of the process at once."""
 
     def end(_number: int, _frame: FrameType | None) -> None:

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import binascii
 import struct
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeVar
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
@@ -37,6 +37,8 @@ FORMAT_KEY: Final = "failover.format"
 ROBOTS_TOPIC: Final = "failover/robots"
 DECISIONS_TOPIC: Final = "failover/decisions"
 """No item is called so: topics of items begin with "/"."""
+
+T = TypeVar("T")
 
 
 class Robot(Struct, frozen=True):
@@ -362,10 +364,7 @@ def read_put(content: bytes, topic: str) -> Put:
     Raises:
         RecordingError: it is none.
     """
-    try:
-        return _decode_put(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RecordingError(f"damaged: a message of {topic[:80]}: {error}") from None
+    return _read(_decode_put, content, topic[:80])
 
 
 def read_robots(content: bytes) -> Robots:
@@ -374,7 +373,11 @@ def read_robots(content: bytes) -> Robots:
     Raises:
         RecordingError: it is none.
     """
+    return _read(_decode_robots, content, ROBOTS_TOPIC)
+
+
+def _read(decode: Callable[[bytes], T], content: bytes, topic: str) -> T:
     try:
-        return _decode_robots(content)
+        return decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RecordingError(f"damaged: a message of {ROBOTS_TOPIC}: {error}") from None
+        raise RecordingError(f"damaged: a message of {topic}: {error}") from None
