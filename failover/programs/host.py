@@ -307,6 +307,11 @@ class HostActor(Actor):
         """The one that carries out messages; "" while none does."""
         return self._running.source.manifest.version if self._running is not None else ""
 
+    @property
+    def _state_at_switch(self) -> Any:
+        """What the version before the active one left; None: its first one."""
+        return self._switched.state if self._switched is not None else None
+
     # --- Between two messages ---------------------------------------------------------------------------------------------
 
     def _turn(self, clock: Callable[[], int]) -> None:
@@ -410,7 +415,7 @@ class HostActor(Actor):
         self._record_anyway(lambda shelf: states.fall_back(shelf, why))
         if failed.source.manifest.on_rollback == "newest" and self._began_with(old, newest):
             told = f"goes on with the state of {version}"
-        elif self._resume(old, (self._switched.state if self._switched is not None else None)):
+        elif self._resume(old, self._state_at_switch):
             told = f"goes on with its state at the switch, and {self._replayed(trial.replay)} commands since then once more"
         else:
             self._owed = trial.replay
@@ -433,7 +438,7 @@ class HostActor(Actor):
     def _replayed(self, commands: Sequence[Command]) -> int:
         """How many commands were carried out again; their answers have left before."""
         assert self._running is not None
-        self._state = self._switched.state if self._switched is not None else None
+        self._state = self._state_at_switch
         for count, command in enumerate(commands):
             try:
                 self._running.state = self._state = _again(self._running, command)
@@ -635,7 +640,7 @@ class HostActor(Actor):
                     f"{old.source.manifest.version} cannot read the state of {version}; with --old-state it goes "
                     "on with its own state at the switch, and what came since then is lost"
                 )
-            self._resume(old, (self._switched.state if self._switched is not None else None))
+            self._resume(old, self._state_at_switch)
         self._record_anyway(lambda shelf: states.fall_back(shelf, "a person took it back"))
         if new is not None:
             new.end()
