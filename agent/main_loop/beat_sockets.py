@@ -128,10 +128,7 @@ class BeatLane:
         for at, link, address, _ in self._ways.get(peer, ()):
             if at == place:
                 for datagram in datagrams:
-                    try:
-                        link.sendto(datagram, address)
-                    except OSError:
-                        self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
+                    self._leave(link, datagram, address)
 
     def _leave(self, link: socket.socket, datagram: bytes, address: tuple[str, int]) -> None:
         try:
