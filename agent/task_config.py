@@ -7,12 +7,11 @@ import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
+from failover.core.types import PERIOD_MS_MAX, RESTARTS_MAX
+
 if TYPE_CHECKING:
     from failover.core.schedule.terms import Declaration
 
-RESTART_LIMIT_MAX: Final = 100
-RESTART_WINDOW_S_MAX: Final = 3_600
-"""As `failover.core.types.Rules` has them."""
 UNTAKEN: Final = ("KILL", "STOP")
 """No program can have a handler for them."""
 
@@ -65,10 +64,10 @@ class TaskConfig:
             raise ValueError("command, directory or environment holds a zero byte; no program can be given one")
         if not self.directory.startswith("/"):
             raise ValueError(f"directory = {self.directory!r} is not absolute; an agent has no directory of its own")
-        if not 0 <= self.restart_limit <= RESTART_LIMIT_MAX:
-            raise ValueError(f"restart_limit is {self.restart_limit}; at most {RESTART_LIMIT_MAX}, and 0 sets no limit")
-        if not 1 <= self.restart_window_s <= RESTART_WINDOW_S_MAX:
-            raise ValueError(f"restart_window_s is {self.restart_window_s:g}; at least 1 and at most {RESTART_WINDOW_S_MAX}")
+        if not 0 <= self.restart_limit <= RESTARTS_MAX:
+            raise ValueError(f"restart_limit is {self.restart_limit}; at most {RESTARTS_MAX}, and 0 sets no limit")
+        if not 1 <= self.restart_window_s <= PERIOD_MS_MAX / 1000:
+            raise ValueError(f"restart_window_s is {self.restart_window_s:g}; at least 1 and at most {PERIOD_MS_MAX / 1000:g}")
         if f"SIG{self.wake_signal}" not in signal.Signals.__members__ or self.wake_signal in UNTAKEN:
             raise ValueError(f"wake_signal is {self.wake_signal!r}; give the name of a signal such as CONT, not KILL or STOP")
         if self.wake == "signal" and not self.period_ms:
