@@ -18,16 +18,10 @@ from failover.cli import main
 from failover.core.schedule import layout
 from tests.failover.boards.conftest import place
 from tests.failover.boards.programs import program
+from tests.failover.cli.verbs.test_tasks import ODOMETRY
 
 __all__ = ["place"]
 
-ODOMETRY = """
-with failover.scheduled("odometry", period=0.02) as task:
-    task.wait_activation()
-    say("begun")
-    for tick in task:
-        pass
-"""
 ROOT = Path(__file__).parents[4]
 FAILOVER = [sys.executable, "-m", "failover"]
 
