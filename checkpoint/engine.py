@@ -297,6 +297,14 @@ class Session(Protocol):
         to be read once, when they are written to a file. It cannot be acknowledged."""
         ...
 
+    def unchanged(self, epoch: int) -> Position | None:
+        """The newest acknowledged position, if a delta now would say nothing new; None: capture.
+
+        Args:
+            epoch: of the primacy; the program has yet to be told of a newer one by a capture.
+        """
+        ...
+
     def acknowledge(self, position: Position) -> None:
         """A standby holds everything up to ``position``: the session may forget the pages written before it."""
         ...

@@ -444,15 +444,17 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
 
 
 class Unchanged(msgspec.Struct, frozen=True, tag=True):
-    """A program that commits has committed nothing since the newest acknowledged position: no snapshot was made.
+    """The program is as the newest acknowledged position has it, or has committed nothing since: no snapshot was made.
 
     Attributes:
         age_ns: how old that commit is.
+        is_current: what it is now was looked at; the last commit of a program that commits grows older.
     """
 
     position: Position
     commit: int
     age_ns: int
+    is_current: bool = False
 
 
 class Filled(msgspec.Struct, frozen=True, tag=True):

@@ -487,9 +487,10 @@ def _commit_at(session: Session, position: Position) -> tuple[int, int]:
 
 def _unchanged(session: Session, request: messages.Capture) -> messages.Unchanged | None:
     """The answer in place of an empty delta; a base, and the last delta of a handover, are always made."""
-    task = None if request.base or request.hold else _as_task(session)
-    position = task.unchanged() if task else None
-    return messages.Unchanged(position, *_commit_at(session, position)) if position else None
+    position = None if request.base or request.hold else session.unchanged(request.epoch)
+    if position is None:
+        return None
+    return messages.Unchanged(position, *_commit_at(session, position), is_current=_as_task(session) is None)
 
 
 def _as_task(session: Session) -> GuardedTask | None:

@@ -66,16 +66,18 @@ class Captured(Struct, frozen=True):
 
 
 class Unchanged(Struct, frozen=True):
-    """The act Capture found what was acknowledged at ``position``: a program that commits has committed nothing since.
+    """The act Capture found what was acknowledged at ``position``: the program rests, or has committed nothing since.
 
     Attributes:
         sequence: as ordered; no snapshot was made under this number.
+        is_current: the program was looked at; else the state is as old as the commit.
     """
 
     component: str
     epoch: int
     sequence: int
     position: Position
+    is_current: bool = False
 
 
 class UnderWay(Struct, frozen=True):

@@ -294,7 +294,7 @@ class Component:
             lag_ns: see `failover.core.acts.Capture`.
 
         Returns:
-            `Unchanged` only where a delta of a program that keeps its state, and is not to be held, would say nothing new.
+            `Unchanged` only where a delta of a program that is not to be held would say nothing new.
 
         Raises:
             checkpoint.errors.NothingCommittedError: there is nothing to capture yet; `committed` is called when there is.

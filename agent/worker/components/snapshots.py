@@ -45,7 +45,7 @@ class Snapshots(Struct, frozen=True):
         if captured.commit:
             self.figures.commits.note(captured.commit, clock.now_ns() - captured.age_ns)
         if isinstance(captured, Unchanged):
-            self.around.tell(events.Unchanged(self.name, act.epoch, act.sequence, captured.position))
+            self.around.tell(events.Unchanged(self.name, act.epoch, act.sequence, captured.position, captured.is_current))
             return
         try:
             await to_its_end(self.around.store.put, captured.snapshot, prove=False)

@@ -105,8 +105,8 @@ class GuardedTask:
         """Nothing is copied while it stands still: it never does."""
         return 0
 
-    def unchanged(self) -> Position | None:
-        """The newest acknowledged position, if a capture would say nothing new; None: capture."""
+    def unchanged(self, epoch: int) -> Position | None:
+        """See `checkpoint.engine.Session.unchanged`."""
         if self._session is None or self._session.reader.is_superseded or procfs.status(self.pid).has_ended:
             return None
         return self._session.unchanged()

@@ -114,7 +114,7 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
 
 
 def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
-    """The newest checkpoint is all there is to know: nothing travels, and it goes on growing older."""
+    """The newest checkpoint is all there is to know: nothing travels. It grows older, unless the program was looked at."""
     flight = component.flight
     if flight is None or flight.position is not None or (event.epoch, event.sequence) != (component.epoch, component.sequence):
         return
@@ -125,6 +125,8 @@ def unchanged(component: Component, turn: Turn, event: Unchanged) -> None:
         component.base_wanted, component.due_ns = True, turn.now_ns
         return
     component.undelivered = ""
+    if event.is_current:
+        component.acked_ns = max(component.acked_ns, flight.started_ns)
     component.due_ns = max(flight.started_ns + _period_ns(component, turn, flight), turn.now_ns)
 
 

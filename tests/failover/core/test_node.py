@@ -131,6 +131,19 @@ def test_a_program_that_commits_nothing_makes_no_snapshots_and_its_lag_grows() -
     assert not only(node.step(Tick(), 4_002 * MS), acts.Capture), "a late answer to an older order is none to this one"
 
 
+def test_a_program_that_rests_makes_no_snapshots_and_its_checkpoint_does_not_grow_older() -> None:
+    node = Node(ALONE, 1, VoteRecord(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    held = Position(capture.generation, capture.sequence, b"d")
+    node.step(Captured("/lab/x", 1, held, None, age_ns=1 * MS), 5 * MS)
+    (later,) = only(node.step(Tick(), 2_000 * MS), acts.Capture)
+    assert isinstance(later, acts.Capture)
+    assert not node.step(Unchanged("/lab/x", 1, later.sequence, held, is_current=True), 2_001 * MS).act
+    seen = node.status(2_100 * MS).components[0]
+    assert (seen.lag_ns, seen.positions) == (100 * MS, (held,)), "as old as the look, which was ordered at 2,000"
+
+
 def test_an_unchanged_state_that_is_not_the_newest_checkpoint_is_sent_whole() -> None:
     node = Node(ALONE, 1, VoteRecord(), 0)
     (capture,) = only(running(node), acts.Capture)

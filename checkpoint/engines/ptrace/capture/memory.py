@@ -23,6 +23,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct, field
 
+from checkpoint.engines.ptrace.capture.at_rest import REST_PAGES, LastLook
 from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget, OverBudgetError
 from checkpoint.engines.ptrace.capture.memory_result import Taken, Unacknowledged, joined, since, with_one_tail
 from checkpoint.errors import CaptureError, ProcessGoneError
@@ -246,6 +247,25 @@ class MemoryCapture:
         self._left_out = NONE
 
     # While the program runs
+
+    def has_rested(self, last: LastLook) -> bool:
+        """Whether its pages are as they were at the last look, whose snapshot is acknowledged."""
+        if self.acknowledged is None or not self._is_armed or not self._tracker.scans_running or self._shared_lines:
+            return False
+        if any(held.position is not None for held in self._unacknowledged):
+            return False
+        if count := self._backlog(REST_PAGES):
+            if count >= REST_PAGES:
+                return False
+            self._catch_up(RunningCopy())
+        if not self._unacknowledged:
+            return True
+        (tail,) = self._unacknowledged
+        if len(tail.cleared) or page_set.total_size(tail.written) > REST_PAGES * abi.PAGE_SIZE:
+            return False
+        content = memoryview(bytearray(page_set.total_size(tail.written)))
+        self._memory.read_pages_into(tail.written, content)
+        return last.are_equal(tail.written, content)
 
     def copy_running(self, *, base: bool, enough: int = 0, copied: RunningCopy | None = None) -> RunningCopy:
         """Copy beforehand what is worth it, so that little is left for the freeze.

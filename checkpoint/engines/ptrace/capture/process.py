@@ -16,6 +16,7 @@ from msgspec import Struct
 from checkpoint.arch import extended
 from checkpoint.engine import ProtectOrder
 from checkpoint.engines.ptrace.capture import eintr_syscalls, enter
+from checkpoint.engines.ptrace.capture.at_rest import LastLook
 from checkpoint.engines.ptrace.capture.describe_process import process_state, thread_states
 from checkpoint.engines.ptrace.capture.enter import Entered
 from checkpoint.engines.ptrace.capture.exited_leader import EndedFirst
@@ -122,6 +123,8 @@ class CapturedProcess:
         self.detached: Collection[tuple[int, int]] = frozenset()
         self._flags = FlagsReader(self.pid)
         self._of_mappings = Memo[tuple[str, ...]]()
+        self._looked: Look | None = None
+        self._last: LastLook | None = None
 
     @classmethod
     def entered(cls, met: Met, order: ProtectOrder, slot: int = 0) -> CapturedProcess:
@@ -176,6 +179,13 @@ class CapturedProcess:
         self.onlooker.close()
         self.threads.close()
 
+    def has_rested(self) -> bool:
+        """Whether it is as the last look found it, and as was acknowledged; see `checkpoint.engines.ptrace.capture.at_rest`."""
+        if (looked := self._looked) is not None:
+            self._looked, self._last = None, LastLook.of(self.pid, looked.standing, looked.taken)
+        last = self._last
+        return last is not None and last.waits_there(self.pid) and self.memory.has_rested(last)
+
     def settle(self, position: Position) -> None:
         """The last look has become part of the snapshot with this position."""
         self.memory.settle(position)
@@ -220,6 +230,7 @@ class CapturedProcess:
         So the processor has our code, the kernel's and the page tables in its caches, and need not fetch them while the program
         stands still; between two captures it has done other things.
         """
+        self._looked = self._last = None  # the freeze takes the memory of their pages
         with contextlib.suppress(CheckpointError, OSError):  # `look` reports the cause
             self.onlooker.rehearse()
             self.memory.rehearse()
@@ -243,7 +254,8 @@ class CapturedProcess:
         taken = self.memory.take(copied, base=base) if copied is not None else self.memory.take_unread()
         if self.memory.has_rings and not is_awaited:
             raise CaptureError(f"cannot capture {self.order.component}: it has just made a ring of asynchronous I/O; try again")
-        return Look(self.onlooker.ask(place, outputs, opened), taken)
+        self._looked = Look(self.onlooker.ask(place, outputs, opened), taken)
+        return self._looked
 
     # Afterwards
 

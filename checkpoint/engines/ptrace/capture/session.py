@@ -26,6 +26,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from checkpoint.engine import CaptureOrder, ProtectOrder, Report
+from checkpoint.engines.ptrace.capture.at_rest import REST_MAX_S
 from checkpoint.engines.ptrace.capture.detached_memory import DetachedMemory
 from checkpoint.engines.ptrace.capture.freeze_budget import FreezeBudget, OverBudgetError
 from checkpoint.engines.ptrace.capture.frozen_component import Frozen, opened, shared_inodes
@@ -106,6 +107,7 @@ class PtraceSession:
         self._builder = SnapshotBuilder(self.pid, order, self._budget, outputs, trees, self._refuse, lasting)
         self._owner = order.terms.owner
         self._epoch = 0
+        self._rests_until = 0.0
         self._closed = False
 
     @property
@@ -180,6 +182,24 @@ class PtraceSession:
 
     # Capturing
 
+    def unchanged(self, epoch: int) -> Position | None:
+        """See ``checkpoint.engine.Session.unchanged``."""
+        known = self._first.memory.acknowledged
+        if (
+            known is None
+            or epoch > self._epoch
+            or time.monotonic() >= self._rests_until
+            or self._carried
+            or self._standstill.is_held
+        ):
+            return None
+        try:
+            processes = {process.pid: process for process in self._tree.processes()}
+            has_rested = self._first.has_rested() and all(process.has_rested() for process in processes.values())
+            return known if has_rested and processes.keys() == set(self._tree.others()) else None
+        except CheckpointError:  # the capture that follows says why
+            return None
+
     def capture(self, order: CaptureOrder) -> Snapshot:
         """See ``checkpoint.engine.Session.capture``."""
         captured = self._captured(order, may_stay=False)
@@ -207,6 +227,7 @@ class PtraceSession:
         )
 
     def _captured_once(self, order: CaptureOrder, *, may_stay: bool) -> Snapshot | UnreadBase:
+        began = time.monotonic()
         parent = None if order.base else self._first.memory.acknowledged
         if self._refused:
             self._look_from_outside()
@@ -224,6 +245,7 @@ class PtraceSession:
         try:
             built = self._builder.built(order, parent, frozen, self._first, self._surroundings, self._detached)
             self._builder.forget_unneeded(self._first.memory.positions())
+            self._rests_until = began + REST_MAX_S
             return built
         except (FileNotFoundError, ProcessLookupError) as error:
             gone = ProcessGoneError(f"{self.component} (pid {self.pid}) ended while failover captured it")

@@ -224,6 +224,10 @@ class CapturedTree:
         """The processes that are followed."""
         return tuple(self._known.values())
 
+    def others(self) -> list[int]:
+        """All processes besides the first one, as the kernel has them now, zombies included."""
+        return self._kin.others()
+
     def acknowledge(self, position: Position) -> None:
         """See ``checkpoint.engine.Session.acknowledge``."""
         for process in self._known.values():

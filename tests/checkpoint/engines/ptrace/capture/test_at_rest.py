@@ -1,0 +1,145 @@
+"""A program that waits where the last look found it has nothing new to say; one that did anything in between is captured."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from checkpoint.engine import CaptureOrder, Session
+from checkpoint.engines.ptrace.capture import at_rest
+from checkpoint.linux.procfs import procfs
+from checkpoint.model import Position
+from tests.checkpoint.round_trip import Program, captured_at_last, ended, protected, start
+
+pytestmark = [pytest.mark.root, pytest.mark.write_protection]
+
+WAITS = """
+import ctypes, os, sys, threading
+words, memory, never = open(sys.argv[1]), bytearray(1 << 20), threading.Event()
+for _ in range(int(sys.argv[2])):
+    threading.Thread(target=never.wait, daemon=True).start()
+print("ready", flush=True)
+for word in words:
+    word = word.strip()
+    if word == "write":
+        memory[-1] += 1
+    elif word == "thread":
+        threading.Thread(target=never.wait, daemon=True).start()
+    elif word == "fork" and not os.fork():
+        ctypes.CDLL(None).prctl(1, 9)  # it ends with its parent
+        print("born", flush=True)
+        never.wait()
+    print(word, flush=True)
+"""
+PATIENCE_S = 60.0
+
+
+class Waiting:
+    """A program that waits for words, and its session; the positions that were captured are acknowledged at once."""
+
+    def __init__(self, program: Program, session: Session, words: int) -> None:
+        self.program = program
+        self.session = session
+        self._words = words
+        self._sequence = 0
+
+    def say(self, word: str) -> None:
+        os.write(self._words, f"{word}\n".encode())
+        self.program.wait_for_line("born" if word == "fork" else word)
+
+    def capture(self, *, base: bool = False) -> Position:
+        self._sequence += 1
+        snapshot = captured_at_last(self.session, CaptureOrder(base=base, sequence=self._sequence))
+        self.session.acknowledge(snapshot.position)
+        return snapshot.position
+
+    def until_at_rest(self) -> None:
+        """Capture until it says that it is unchanged; a thread that has just printed takes its time to wait again."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            position = self.capture()
+            for _ in range(20):
+                if (known := self.session.unchanged(0)) is not None:
+                    assert known == position
+                    return
+                time.sleep(0.005)
+            assert time.monotonic() < deadline, "it never rests"
+
+
+@contextmanager
+def waiting(directory: Path, threads: int = 0) -> Iterator[Waiting]:
+    fifo = directory / "words"
+    os.mkfifo(fifo)
+    words = os.open(fifo, os.O_RDWR)
+    try:
+        with ended(start([sys.executable, "-c", WAITS, fifo, str(threads)], directory)) as program:
+            program.wait_for_line("ready")
+            with protected(program) as session:
+                found = Waiting(program, session, words)
+                found.capture(base=True)
+                yield found
+    finally:
+        os.close(words)
+
+
+@pytest.mark.parametrize("threads", [0, 5])
+def test_a_program_that_waits_is_unchanged_until_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    with waiting(tmp_path, threads) as one:
+        one.until_at_rest()
+        assert one.session.unchanged(0) is not None, "and again, while nothing happens"
+        assert one.session.unchanged(1) is None, "a newer epoch is told by a capture"
+        one.say("write")
+        assert one.session.unchanged(0) is None
+        one.until_at_rest()
+
+
+def _until_stopped(one: Waiting) -> None:
+    os.kill(one.program.pid, signal.SIGSTOP)
+    while procfs.stat(one.program.pid).state != "T":
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda one: one.say("thread"), id="a thread"),
+        pytest.param(lambda one: one.say("fork"), id="a child"),
+        pytest.param(lambda one: one.say("nothing"), id="it ran and waits again"),
+        pytest.param(_until_stopped, id="it was stopped"),
+        pytest.param(lambda one: one.program.kill(), id="it was killed"),
+    ],
+)
+def test_whatever_happens_to_it_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Waiting], None]) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    with waiting(tmp_path) as one:
+        one.until_at_rest()
+        change(one)
+        assert one.session.unchanged(0) is None
+
+
+def test_a_child_that_waits_rests_with_its_parent_and_what_it_writes_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    with waiting(tmp_path) as one:
+        one.say("fork")
+        one.until_at_rest()
+        one.say("write")
+        assert one.session.unchanged(0) is None
+
+
+def test_a_look_is_believed_for_a_while_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", 0.0)
+    with waiting(tmp_path) as one:
+        one.capture()
+        time.sleep(0.05)
+        assert one.session.unchanged(0) is None
+    assert at_rest.REST_MAX_S <= 2.0, "docs/limits.md says so"
