@@ -72,7 +72,7 @@ class DirectoryProcess:
                 *in_a_unit(self._starter, "directory", name)[1:],
             ]  # our stdin is the service's
         with theirs:
-            command = [*way, sys.executable, "-m", "agent.directory.process", *self._places, "0"]
+            command = [*way, sys.executable, "-P", "-m", "agent.directory.process", *self._places, "0"]
             self._child = subprocess.Popen(command, stdin=theirs.fileno(), process_group=0)
         self._channel = Channel(ours, Answer)
         return self._channel

@@ -116,7 +116,7 @@ class WorkerProcess:
             AgentError: it cannot be started.
         """
         module = "agent.worker.witness" if self._settings.me.role == "witness" else "agent.worker.process"
-        command = [sys.executable, "-m", "agent.system.child_main", module, str(self._settings.path), str(theirs.fileno())]
+        command = [sys.executable, "-P", "-m", "agent.system.child_main", module, str(self._settings.path), str(theirs.fileno())]
         try:
             return subprocess.Popen(
                 command,

@@ -241,7 +241,10 @@ class ProcessPool:
         way = in_a_unit(self._starter, kind, name) if self._starter else []
         try:
             child = subprocess.Popen(
-                [*way, sys.executable, "-m", *module], pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
+                [*way, sys.executable, "-P", "-m", *module],
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
             )
         except OSError as error:
             raise GuardError(f"cannot start a {kind}: {error.strerror}; is memory or the process limit used up?") from error

@@ -110,7 +110,7 @@ def can_unshare_network() -> bool:
 
 def host_command(own_pids: bool, command: list[str]) -> list[str]:
     """The command line of a host process around ``command``."""
-    return [sys.executable, "-m", "failover.cli.demo.host", *(["--pids"] if own_pids else []), "--", *command]
+    return [sys.executable, "-P", "-m", "failover.cli.demo.host", *(["--pids"] if own_pids else []), "--", *command]
 
 
 class RobotMachine(Struct):
@@ -356,7 +356,7 @@ def ip_inside(robot: RobotMachine, *words: str) -> list[str]:
 
 def agent_command(config: Path) -> list[str]:
     """The command line of an agent."""
-    return [sys.executable, "-m", "agent.system.child_main", "agent.main", "--config", str(config)]
+    return [sys.executable, "-P", "-m", "agent.system.child_main", "agent.main", "--config", str(config)]
 
 
 def wait_for_network(robot: RobotMachine) -> None:
