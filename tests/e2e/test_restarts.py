@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from failover.cli.demo.robots import RobotMachine
+from failover.cli.demo.robots import RobotMachine, Stage
 from tests.e2e import robots
 
 FRAGILE = """
@@ -34,6 +34,11 @@ restart = "never"
 
 [tasks."/lab/robot1/done"]
 command = ["/bin/true"]
+"""
+
+AT_ROBOT1 = """
+[tasks."/lab/robot1/tour"]
+command = ["/bin/sh", "-c", "while [ ! -e {sign} ]; do sleep 0.05; done"]
 """
 
 
@@ -81,3 +86,29 @@ def test_declared_programs_are_started_anew_as_their_tables_say_and_a_stop_is_a_
         again = robots.failover(first, "start", "fragile")
         assert again.returncode == 1
         assert "it runs here" in again.stderr
+
+
+@pytest.mark.root
+def test_the_robot_that_declares_a_program_starts_it_where_it_ended_at_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sign, configuration = tmp_path / "over", Stage.configuration
+
+    def at_one(stage: Stage, name: str, directory: Path) -> str:
+        return configuration(stage, name, directory) + (AT_ROBOT1.format(sign=sign) if name == "robot1" else "")
+
+    monkeypatch.setattr(Stage, "configuration", at_one)
+    with robots.two_robots(tmp_path) as (first, second):
+        robots.until_protected(first, "tour")
+        assert robots.failover(first, "handover", "tour").returncode == 0
+        robots.until_taken_over(second, "tour")
+        sign.touch()
+        robots.until(lambda: state_of(second, "tour") == state_of(first, "tour") == "ended", "its end")
+        refused = robots.failover(second, "start", "tour")
+        assert refused.returncode == 1
+        assert "robot2 does not declare it" in refused.stderr and "ask at a robot that does" in refused.stderr
+        assert state_of(second, "tour") == "ended"
+        sign.unlink()
+        started = robots.failover(first, "start", "tour")
+        assert started.returncode == 0, started.stderr
+        assert state_of(first, "tour") == "running"

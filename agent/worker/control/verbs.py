@@ -117,7 +117,8 @@ class Verbs(Questions):
         primary = (await self._view(name)).get("primary", "")
         told = await self._worker.ask("status")
         living = {peer.robot for peer in told.status.peers if peer.state in ("alive", "suspect")} if told.status else set()
-        if primary in living:
+        is_declared = verb == "start" and name in self._worker.settings.config.tasks
+        if primary in living and not is_declared:
             return await self._worker.errands.send(primary, verb, arguments, say.caller.uid)
         return await self.orders()[verb](arguments, say.caller.uid)
 
@@ -220,9 +221,12 @@ class Verbs(Questions):
         if task is None:
             raise RefusedError(
                 f'cannot start {name}: {settings.path} of {settings.config.robot} does not declare it ([tasks."{name}"]); '
-                f"failover run --name {name} -- COMMAND starts one that is not declared"
+                f"ask at a robot that does, or start one that is not declared with failover run --name {name} -- COMMAND"
             )
-        supervisor = await self._spec_begun(declared(settings, name, task), by)
+        spec = declared(settings, name, task)
+        if self._rules() is None:
+            check_right(by, name, spec.owner)  # as whom it would run now: the record may be of an earlier declaration
+        supervisor = await self._spec_begun(spec, by)
         return {"name": name, "robot": settings.config.robot, "notes": list(supervisor.figures.notes)}
 
     async def stop(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
@@ -415,12 +419,18 @@ class Verbs(Questions):
         name, launch = spec.name, spec.launch
         supervisor = self._worker.supervisor(name)
         supervisor.guest = guest
+        had_started, before = supervisor.started.is_set(), supervisor.ended
         supervisor.started.clear()
-        supervisor.ended = None
+        if before is not None and before.done():
+            supervisor.ended = None
         end = supervisor.end()
         try:
             await self._command(by, lambda number: events.Run(number, spec))
         except RefusedError as refusal:
+            if had_started:
+                supervisor.started.set()
+            if not end.done():
+                supervisor.ended = before
             raise RefusedError(str(refusal), refusal.kind, supervisor.figures.reasons) from refusal
         begun = asyncio.ensure_future(supervisor.started.wait())
         try:
