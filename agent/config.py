@@ -23,7 +23,7 @@ from failover.config import strict_toml
 from failover.config import team as team_directory
 from failover.config.quantities import size_bytes, span_ms
 from failover.config.team import Robot, Team
-from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, COMPONENTS_MAX, PERIOD_MS_MAX
+from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, COMPONENTS_MAX, CPU_SHARES, PERIOD_MS_MAX, is_cpu_share
 from failover.core.wire.names import check_component
 from failover.errors import FailoverError, NameFormatError
 
@@ -88,7 +88,7 @@ class ComponentConfig:
         on_unsupported: it turned into something that cannot be captured: keep the last checkpoint, or stop protecting.
         standby: the robot that keeps its snapshots; "" lets the team choose.
         prefer: the robot that should run it; "" for wherever it is.
-        snapshot_period_ms: 0 for the agent's own.
+        snapshot_period_ms, cpu_share: 0 for the agent's own.
         freeze_budget_ms: how long it may stand still for a snapshot here: a longer freeze is given up; 0: as short as can be.
         freeze_overrun_s: when no capture has kept to the budget for so long, one may take longer; 0: none may.
         portable: a level of processors that it must be able to go on at, see `checkpoint.program.cpu_baseline`; true for
@@ -118,6 +118,7 @@ class ComponentConfig:
     standby: str = ""
     prefer: str = ""
     snapshot_period_ms: int = 0
+    cpu_share: float = 0
     freeze_budget_ms: float = 0
     freeze_overrun_s: float = 20
     portable: bool | str = ""
@@ -186,6 +187,7 @@ class Config:
         rule: how the team decides to replace a silent robot: pair, majority, or auto: a majority wherever more than two belong.
         when_alone: under the pair rule: while this robot hears no other one, components started here run on, or are held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
+        cpu_share: the most that the captures of a component may take of one core's time; 0 for no limit.
         realtime: ask for SCHED_FIFO and locked memory.
         link_mbit_s: cap on snapshot traffic; 0 for none.
         xor_cache: of this robot, for all components together, run or kept here: memory for pages that deltas are told as
@@ -215,6 +217,7 @@ class Config:
     patience_s: int = 30
     boot_patience_s: int = 60
     snapshot_period_ms: int = 100
+    cpu_share: float = 0
     realtime: bool = True
     link_mbit_s: int = 0
     xor_cache: str = "64MB"
@@ -258,6 +261,8 @@ class Config:
             raise ValueError(
                 f"snapshot_period_ms is {self.snapshot_period_ms}; it must be at least 1 and at most {PERIOD_MS_MAX}"
             )
+        if not is_cpu_share(self.cpu_share):
+            raise ValueError(f"cpu_share is {self.cpu_share:g}; {CPU_SHARES}; 0: no limit")
         if not 1 <= self.patience_s <= PATIENCE_S_MAX:
             raise ValueError(f"patience_s is {self.patience_s}; it must be at least 1 and at most {PATIENCE_S_MAX}")
         if not 0 <= self.boot_patience_s <= PATIENCE_S_MAX:
@@ -385,6 +390,8 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             raise ConfigError(
                 f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
             )
+        if not is_cpu_share(component.cpu_share):
+            raise ConfigError(f"{where}: cpu_share is {component.cpu_share:g}; {CPU_SHARES}; 0 means the agent's own")
         if not 0 <= component.freeze_budget_ms <= PERIOD_MS_MAX:
             raise ConfigError(
                 f"{where}: freeze_budget_ms is {component.freeze_budget_ms:g}; at most {PERIOD_MS_MAX}; 0: as short as can be"

@@ -104,6 +104,7 @@ def rules_for(config: Config, component: ComponentConfig) -> Rules:
     """The rules of one component: its own table, the agent's defaults behind it."""
     return Rules(
         period_ms=component.snapshot_period_ms or config.snapshot_period_ms,
+        cpu_share=component.cpu_share or config.cpu_share,
         on_loss=OnLoss(component.on_loss),
         on_crash=OnCrash(component.on_crash),
         when_alone=WhenAlone(config.when_alone),

@@ -425,6 +425,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
         slack: None: the program runs no task of the schedule, or the capture was not to wait.
         totals: bytes that the component had written to standard output and standard error at the freeze, or the commit.
         commit: its number, of a cooperative snapshot; ``age_ns``: how old it was by then.
+        cpu_us: processor time that it took of the keeper, in µs.
     """
 
     position: Position
@@ -441,6 +442,7 @@ class Captured(msgspec.Struct, frozen=True, tag=True):
     remembered_bytes: int = 0
     wanted_bytes: int = 0
     slack: Slack | None = None
+    cpu_us: int = 0
 
 
 class Unchanged(msgspec.Struct, frozen=True, tag=True):

@@ -202,7 +202,7 @@ class Keeper:
             messages.close_all(descriptors)
 
     def _captured(self, request: messages.Capture, target: int | None) -> Answer:
-        session = self._following("capture")
+        began_ns, session = time.process_time_ns(), self._following("capture")
         self._sender.limit(request.xor_cache)
         if unchanged := _unchanged(session, request):
             return unchanged, ()
@@ -228,6 +228,7 @@ class Keeper:
             remembered_bytes=self._sender.held,
             wanted_bytes=self._sender.wanted,
             slack=gate.outcome if gate is not None else None,
+            cpu_us=(time.process_time_ns() - began_ns) // 1_000,
         )
         return answer, made.descriptors
 

@@ -151,6 +151,7 @@ class Component(Struct):
             the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
         freeze_us: how long it stood still for the last snapshot; ``still_us``: the shorter of the last two times.
+        cpu_us: processor time that the last delta took; ``cost_us``: the shorter of the last two times.
         due_ns: next capture; ``until_ns``: when the present claim, start or restore is overdue.
         resumed_ns: how old the state is that this primacy began with, as an instant, -1 for a fresh start; time in which the
             program did not run is left out. lost_ns: how much of its work was lost then, at most.
@@ -216,6 +217,8 @@ class Component(Struct):
     took_ns: int = 0
     freeze_us: int = 0
     still_us: int = 0
+    cpu_us: int = 0
+    cost_us: int = 0
     degraded: str = ""
     awaited: str = ""
     undelivered: str = ""

@@ -54,6 +54,7 @@ class Captured(Struct, frozen=True):
     Attributes:
         size: bytes of the encoded snapshot.
         age_ns: how old the state in it was by then: of a program that commits, since its commit.
+        cpu_us: processor time that it took, in µs.
     """
 
     component: str
@@ -63,6 +64,7 @@ class Captured(Struct, frozen=True):
     size: int = 0
     freeze_us: int = 0
     age_ns: int = 0
+    cpu_us: int = 0
 
 
 class Unchanged(Struct, frozen=True):

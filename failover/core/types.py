@@ -183,11 +183,22 @@ class Launch(Struct, frozen=True):
     shared_memory: str = REFUSE
 
 
+CPU_SHARE_MIN = 0.001
+"""Of a core: a delta of 10 ms is then taken each ten seconds."""
+CPU_SHARES = f"it lies between {CPU_SHARE_MIN:g} and 1, which is a whole core"
+
+
+def is_cpu_share(value: float) -> bool:
+    """Whether it can be ``Rules.cpu_share``."""
+    return value == 0 or CPU_SHARE_MIN <= value <= 1
+
+
 class Rules(Struct, frozen=True):
     """The operator's choices for one component.
 
     Attributes:
         period_ms: between two captures while a standby keeps up.
+        cpu_share: the most that captures may take of the processor time of one core; 0: as much as ``period_ms`` asks for.
         crash_limit: resumptions from the newest checkpoint inside ``crash_window_ms``; the next one goes one checkpoint back,
             the one after that is not made: the component has failed.
         prefer: robot that should run it whenever it can; "" leaves it where it runs.
@@ -197,6 +208,7 @@ class Rules(Struct, frozen=True):
     """
 
     period_ms: int = 100
+    cpu_share: float = 0.0
     on_loss: OnLoss = OnLoss.TAKEOVER
     on_crash: OnCrash = OnCrash.RESUME
     crash_limit: int = 3
@@ -216,6 +228,8 @@ class Rules(Struct, frozen=True):
             raise RulesError(f"restart_window_ms = {self.restart_window_ms}: the window lies between 1 s and an hour")
         if not 1 <= self.period_ms <= PERIOD_MS_MAX:
             raise RulesError(f"period_ms = {self.period_ms}: a capture period lies between 1 ms and an hour")
+        if not is_cpu_share(self.cpu_share):
+            raise RulesError(f"cpu_share = {self.cpu_share:g}: {CPU_SHARES}; 0: no limit")
         if not 0 <= self.crash_limit <= 100:
             raise RulesError(f"crash_limit = {self.crash_limit}: choose between 0 and 100")
 

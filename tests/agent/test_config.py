@@ -211,6 +211,8 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (("beat_ms = 100_000",), 4, "at most 10000"),
         (("beat_ms = 100", "lease_ms = 200"), 5, "one lost beat would count as a death"),
         (("# fine", "snapshot_period_ms = 0"), 5, "must be at least 1"),
+        (("# fine", "cpu_share = 5"), 5, "between 0.001 and 1, which is a whole core; 0: no limit"),
+        (('[components."/lab/a"]', "cpu_share = nan"), 4, "cpu_share is nan"),
         (('[components."/lab/a"]', "freeze_budget_ms = -1"), 4, "0: as short as can be"),
         (('[components."/lab/a"]', "freeze_budget_ms = nan"), 4, "freeze_budget_ms is nan"),
         (('[components."/lab/a"]', "freeze_overrun_s = -1"), 4, "0: none takes longer"),

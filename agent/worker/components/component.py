@@ -61,6 +61,7 @@ class Captured(Struct, frozen=True):
         slack: how it met the activations of the program's tasks; None: it has none, or the capture was not to wait.
         known_bytes: of its pages, those whose last content was remembered.
         frozen_bytes: of its pages, those that were copied while the program stood still.
+        cpu_us: processor time that it took of the keeper.
     """
 
     position: Position
@@ -75,6 +76,7 @@ class Captured(Struct, frozen=True):
     known_bytes: int = 0
     frozen_bytes: int = 0
     slack: keeper_messages.Slack | None = None
+    cpu_us: int = 0
 
 
 class Prepared(Struct, frozen=True):
@@ -333,6 +335,7 @@ class Component:
             captured.known_bytes,
             captured.frozen_bytes,
             captured.slack,
+            captured.cpu_us,
         )
 
     async def acknowledge(self, position: Position, *, is_safe: bool = True) -> None:

@@ -61,6 +61,7 @@ class Snapshots(Struct, frozen=True):
                 captured.size,
                 captured.freeze_us,
                 captured.age_ns,
+                captured.cpu_us,
             )
         )
 

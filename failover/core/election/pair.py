@@ -165,6 +165,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.ordered = False
     component.crashed, component.reason = 0, ""
     component.lease_ns = component.told_ns = component.took_ns = component.freeze_us = component.still_us = 0
+    component.cpu_us = component.cost_us = 0
     admit(component, turn, "")
     open_line(component, turn)
     start = "its newest checkpoint" if plan else "the beginning"

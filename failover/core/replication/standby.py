@@ -94,6 +94,8 @@ def captured(component: Component, turn: Turn, event: Captured) -> None:
     component.hold(event.position)
     component.still_us = min(component.freeze_us or event.freeze_us, event.freeze_us)
     component.freeze_us, component.degraded, component.awaited = event.freeze_us, "", ""
+    if event.parent is not None:  # a base costs more, and there are few
+        component.cpu_us, component.cost_us = event.cpu_us, min(component.cpu_us or event.cpu_us, event.cpu_us)
     component.base_wanted = False
     flight.position, flight.parent = event.position, event.parent
     flight.state_ns = max(flight.started_ns - event.age_ns, 0)
@@ -257,8 +259,14 @@ def _period_ns(component: Component, turn: Turn, flight: Flight) -> int:
 
 
 def least_period_ns(component: Component) -> int:
-    """Shorter, and the program would stand still for more than its share of the time."""
-    return STILL_SHARE * component.still_us * NS_PER_US
+    """Shorter, and the program would stand still for more than its share of the time, or captures would cost more than theirs."""
+    return max(STILL_SHARE * component.still_us * NS_PER_US, cost_period_ns(component))
+
+
+def cost_period_ns(component: Component) -> int:
+    """Shorter, and captures would take more processor time than the operator allows."""
+    share = component.rules.cpu_share
+    return round(component.cost_us * NS_PER_US / share) if share else 0
 
 
 def _give_up(component: Component, turn: Turn, why: str = "") -> None:

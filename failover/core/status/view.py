@@ -108,6 +108,11 @@ def _slow(component: Component, turn: Turn) -> str:
     if least_ns > took_ns:
         still_ms, part = component.still_us / US_PER_MS, f"1/{standby.STILL_SHARE}"
         why = f"each capture stops it for {still_ms:.0f} ms, and captures may take {part} of its time"
+        if least_ns == standby.cost_period_ns(component):
+            share, cost_ms = component.rules.cpu_share, component.cost_us / US_PER_MS
+            why = (
+                f"each capture takes {cost_ms:.0f} ms of processor time, and captures may take {share:.1%} of a core (cpu_share)"
+            )
     return (
         f"captured every {max(took_ns, least_ns) / NS_PER_S:.1f} s instead of every {period_ns / NS_PER_S:.1f} s: {why}; "
         "pages that it writes meanwhile travel once, in the next one"

@@ -11,7 +11,7 @@ from failover.core import acts
 from failover.core.election.consent import STATES
 from failover.core.events import Captured, CaptureFailed, Event, Received, Run, Started, Tick
 from failover.core.node import Node
-from failover.core.types import MS, ComponentSpec, Config, Launch, State, VoteRecord
+from failover.core.types import MS, ComponentSpec, Config, Launch, Rules, State, VoteRecord
 from failover.core.wire.messages import Beat, Echo, Entry
 
 PART = "/lab/x"
@@ -24,6 +24,7 @@ INSTEAD = "instead of every"
 class Primary:
     """robot1, which runs the component and was told that robot2 follows it."""
 
+    rules: Rules = field(default_factory=Rules)
     node: Node = field(
         default_factory=lambda: Node(Config("robot1", ("robot2",), beat_ms=BEAT_MS, grace_ms=100), 1, VoteRecord(), 0)
     )
@@ -49,19 +50,19 @@ class Primary:
             self.step(Received(Beat("robot2", 1, self.beats, 1, 0, 1, echoes, (word,)), "wire"))
             self.step(Tick())
 
-    def begin(self) -> None:
+    def begin(self, cpu_us: int = 0) -> None:
         """Until a first checkpoint has arrived."""
-        self.step(Run(1, ComponentSpec(PART, launch=Launch(("x",)))))
+        self.step(Run(1, ComponentSpec(PART, launch=Launch(("x",)), rules=self.rules)))
         self.pass_ms(200)
         self.step(Started(PART, 1))
-        self.deliver(BEAT_MS)
+        self.deliver(BEAT_MS, cpu_us=cpu_us)
 
-    def deliver(self, ms: int, freeze_us: int = 0) -> None:
+    def deliver(self, ms: int, freeze_us: int = 0, cpu_us: int = 0) -> None:
         """The next snapshot, which arrives so much later."""
         capture = self.ordered()
         parent = None if capture.base else self.held
         taken = Position(capture.generation, capture.sequence, b"d" * 16)
-        self.step(Captured(PART, 1, taken, parent, freeze_us=freeze_us))
+        self.step(Captured(PART, 1, taken, parent, freeze_us=freeze_us, cpu_us=cpu_us))
         self.pass_ms(ms)
         self.held = taken
         self.pass_ms(BEAT_MS)
@@ -125,4 +126,23 @@ def test_one_long_freeze_among_short_ones_changes_nothing() -> None:
     primary.begin()
     for freeze_us in (2_000, 2_000, 90_000):
         primary.deliver(BEAT_MS, freeze_us=freeze_us)
+    assert ordered_after_ms(primary) <= 100
+
+
+def test_captures_take_no_more_processor_time_than_their_share() -> None:
+    primary = Primary(Rules(cpu_share=0.05))
+    primary.begin()
+    for _ in range(2):
+        primary.deliver(BEAT_MS, cpu_us=40_000)
+    assert "captured every 0.8 s instead of every 0.1 s: each capture takes 40 ms of processor time" in primary.notes()
+    assert "captures may take 5.0% of a core (cpu_share)" in primary.notes()
+    assert 700 <= ordered_after_ms(primary) <= 800
+    primary.deliver(BEAT_MS, cpu_us=4_000)
+    assert INSTEAD not in primary.notes()
+    assert ordered_after_ms(primary) <= 100
+
+
+def test_what_a_base_takes_does_not_slow_the_deltas_down() -> None:
+    primary = Primary(Rules(cpu_share=0.05))
+    primary.begin(cpu_us=3_000_000)
     assert ordered_after_ms(primary) <= 100

@@ -117,7 +117,9 @@ def _until_stopped(one: Waiting) -> None:
         pytest.param(lambda one: one.program.kill(), id="it was killed"),
     ],
 )
-def test_whatever_happens_to_it_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Waiting], None]) -> None:
+def test_whatever_happens_to_it_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Waiting], None]
+) -> None:
     monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
     with waiting(tmp_path) as one:
         one.until_at_rest()
