@@ -3,7 +3,7 @@
 python -m benchmarks                     all of it, some fifteen minutes; writes benchmarks/RESULTS.md
 python -m benchmarks --quick             fewer cases and repetitions, some minutes; prints only
 python -m benchmarks --quick restore     one of them
-python -m benchmarks load --load 8       beside eight busy loops, and without
+python -m benchmarks load --load 8       beside eight busy loops, and without; no part of the whole run
 python -m benchmarks soak --for 2h       what grows over hours; no part of the whole run
 
 As root more is measured (CRIU, beats on the wire). Nothing else should run meanwhile; a busy machine is warned of.
@@ -114,7 +114,6 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "outage": _outage,
     "cuts": cuts.cuts,
     "overload": overload.overload,
-    "load": load.load,
     "throughput": interference.throughput,
     "costs": costs.costs,
     "beats": interference.beats,
@@ -129,8 +128,8 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "driver_call": driver_call.driver_call,
 }
 
-BY_ITSELF: Final = "soak"
-"""Not a part of the whole run: it takes hours."""
+BY_ITSELF: Final = ("load", "soak")
+"""No parts of the whole run: one takes twenty minutes, the other hours."""
 
 
 def main() -> int:
@@ -144,9 +143,9 @@ def main() -> int:
     if warning:
         print(f"WARNING: {warning}", file=sys.stderr)
     began, before = time.monotonic(), machine.ticks()
-    loads = {"load": partial(load.load, loads=(0, arguments.load))} if arguments.load else {}
-    spans = {BY_ITSELF: partial(soak.soak, span_s=arguments.span_ms / 1_000 if arguments.span_ms else None)}
-    benchmarks = BENCHMARKS | loads | spans
+    loads = (0, arguments.load) if arguments.load else load.LOADS
+    span_s = arguments.span_ms / 1_000 if arguments.span_ms else None
+    benchmarks = BENCHMARKS | {"load": partial(load.load, loads=loads), "soak": partial(soak.soak, span_s=span_s)}
     findings = [_measure(name, benchmarks[name], arguments.quick) for name in arguments.names or BENCHMARKS]
     facts["it took"] = f"{time.monotonic() - began:.0f} s"
     facts["given to others by the host meanwhile"] = f"{(machine.ticks() - before).stolen_share:.1%} of its cores' time"
@@ -179,12 +178,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "names",
         nargs="*",
-        choices=[*BENCHMARKS, BY_ITSELF, []],
+        choices=[*BENCHMARKS, *BY_ITSELF, []],
         metavar="NAME",
-        help=f"which: {', '.join(BENCHMARKS)}; {BY_ITSELF}",
+        help=f"which: {', '.join(BENCHMARKS)}; {', '.join(BY_ITSELF)}",
     )
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; nothing is written")
-    parser.add_argument("--for", dest="span_ms", type=span_ms, metavar="SPAN", help=f"of {BY_ITSELF}: 25m, 2h (the default)")
+    parser.add_argument("--for", dest="span_ms", type=span_ms, metavar="SPAN", help="of soak: 25m, 2h (the default)")
     parser.add_argument("--load", type=int, metavar="N", help="of load: N busy loops (default: 2, and 8)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write there (default: a whole run writes into benchmarks/)")
     return parser

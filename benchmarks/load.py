@@ -70,7 +70,7 @@ def load(quick: bool, directory: Path, loads: tuple[int, ...] = LOADS) -> Findin
         f"The same programs alone and beside {' and '.join(map(str, loads[1:]))} loops that calculate without a pause. "
         "*Freeze*: of deltas, twenty a second, by the keeper alone. *Age*: of the newest checkpoint that the other robot holds, "
         f"looked at each {POLL_S * 1e3:.0f} ms; two robots on this machine with all their processes, defaults. "
-        "*First checkpoint*: since the program was started. *Power cut*: see Outage.",
+        "*First checkpoint*: of the program with all its memory, since it was started. *Power cut*: see Outage.",
         tuple(figures),
     )
 
@@ -109,24 +109,25 @@ def _ages(case: str, count: int, span_s: float, directory: Path) -> Iterator[Fig
     with Stage(directory / f"age-{program}-{arguments[:1]}-{count}", means()) as stage, busy(count):
         stage.directory.mkdir()
         stage.start()
-        primary = stage.robots[0]
+        primary, standby = stage.robots
         began = time.monotonic()
         with primary.control() as link:
             link.ask("run", argv=argv, name="measured", cwd="/", wait=False, engine="ptrace")
-        _until_protected(primary)
+        _until_held(standby)
         first_s = time.monotonic() - began
         ages = list(_looked_at(primary, span_s))
     yield Figure("first checkpoint at the other robot", _beside(case, count), "s", (first_s,))
     yield Figure("age of the newest checkpoint", _beside(case, count), "s", tuple(ages))
 
 
-def _until_protected(robot: RobotMachine) -> None:
+def _until_held(standby: RobotMachine) -> None:
+    """Until it holds a checkpoint of the program with all its memory, which it has made before it says "ready"."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
-        if any(one["protection"] == "protected" for one in robot.status()["components"]):
+        if any(b"ready" in log.read_bytes() for log in (standby.directory / "state" / "logs").glob("*/stdout.log")):
             return
         time.sleep(POLL_S)
-    raise BenchmarkError(f"no checkpoint in {PATIENCE_S:.0f} s: {robot.last_words()}")
+    raise BenchmarkError(f"no checkpoint in {PATIENCE_S:.0f} s: {standby.last_words()}")
 
 
 def _looked_at(robot: RobotMachine, span_s: float) -> Iterator[float]:
