@@ -62,7 +62,7 @@ DOORS = {
     "foxglove": ("failover/recording/foxglove_server.py",),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
-    "psutil": ("agent/processes.py",),
+    "psutil": ("failover/client/process_use.py",),
     "rich": ("failover/cli/output/render.py",),
     "shtab": ("failover/cli/completion.py",),
 }

@@ -147,6 +147,7 @@ SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
 SOCKET_VARIABLE: Final = "FAILOVER_SOCKET"
 CONNECT_TIMEOUT_S: Final = 5
+_CREDENTIALS: Final = struct.Struct("iII")
 _TIMEVAL: Final = struct.Struct("@ll")
 """Source: socket(7), SO_SNDTIMEO; unix(7)."""
 
@@ -236,6 +237,11 @@ class Control:
             raise NoAgentError(_why_not(path, error)) from error
         link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(0, 0))
         return cls(link, path)
+
+    @property
+    def peer_pid(self) -> int:
+        """The pid by which we see the process that answers; 0 if it lives in a PID namespace that we do not see into."""
+        return int(_CREDENTIALS.unpack(self._link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[0])
 
     def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
         """Make a request and wait for its result, past any updates and output.

@@ -9,12 +9,16 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from failover.cli.output.board_tree import ms, span
-from failover.cli.output.team_tree import Mood, Row, mood_of, state_of
+from failover.cli.output.team_tree import Mood, Row, mood_of, size, state_of
 from failover.client.health import sight
+from failover.client.process_use import Use
 from failover.schedule.overview import Seen
 
-COLUMNS: Final = ("", "state", "period", "phase", "misses", "late p50", "p99", "took p50", "p99", "overruns", "after")
-NARROWER: Final = (0, 1, 2, 3, 4, 5, 6, 10)
+COLUMNS: Final = (
+    *("", "state", "cpu", "memory", "period", "phase", "misses"),
+    *("late p50", "p99", "took p50", "p99", "overruns", "after"),
+)
+NARROWER: Final = (0, 1, 4, 5, 6, 7, 8, 12)
 """Of these, those that stand in a table of fewer columns than"""
 WHOLE_WIDTH: Final = 140
 
@@ -22,15 +26,22 @@ OTHERS: Final = "other programs"
 """Those of this robot that are no components, or whose processes this user may not look at."""
 T = TypeVar("T")
 
+NO_USES: Final[Mapping[str, Use | None]] = {}
 UNWELL: Final = frozenset({"failed", "restarting"})
 
 
 class Component(Struct, frozen=True):
-    """One component and what its program runs. ``view``: of the status; empty for `OTHERS`."""
+    """One component and what its program runs.
+
+    Attributes:
+        view: of the status; empty for `OTHERS`.
+        use: of its processes; None where this machine does not tell.
+    """
 
     name: str
     view: Mapping[str, Any]
     tasks: tuple[Seen, ...]
+    use: Use | None = None
 
 
 class Robot(Struct, frozen=True):
@@ -41,7 +52,13 @@ class Robot(Struct, frozen=True):
     components: tuple[Component, ...]
 
 
-def robots(here: str, seen: Sequence[Seen], status: Mapping[str, Any] | None, owners: Mapping[str, str]) -> tuple[Robot, ...]:
+def robots(
+    here: str,
+    seen: Sequence[Seen],
+    status: Mapping[str, Any] | None,
+    owners: Mapping[str, str],
+    uses: Mapping[str, Use | None] = NO_USES,
+) -> tuple[Robot, ...]:
     """This robot first.
 
     Args:
@@ -49,6 +66,7 @@ def robots(here: str, seen: Sequence[Seen], status: Mapping[str, Any] | None, ow
         seen: all its tasks, in the order in which they are shown.
         status: see `failover.client.control.STATUS`; None: no agent answers.
         owners: task → component.
+        uses: component of this robot → what its processes use.
     """
     if status is None:
         return (Robot(here, "", (Component(OTHERS, {}, tuple(seen)),)),)
@@ -59,7 +77,10 @@ def robots(here: str, seen: Sequence[Seen], status: Mapping[str, Any] | None, ow
     for name, state in [(str(status["robot"]), "live"), *((str(peer["name"]), str(peer["state"])) for peer in status["peers"])]:
         own = [
             Component(
-                _name(view), view, tuple(one for one in seen if name == status["robot"] and owners.get(one.task) == _name(view))
+                _name(view),
+                view,
+                tuple(one for one in seen if name == status["robot"] and owners.get(one.task) == _name(view)),
+                uses.get(_name(view)) if name == status["robot"] else None,
             )
             for view in views
             if view.get("primary") == name
@@ -110,7 +131,12 @@ def is_well(tree: Sequence[Robot]) -> bool:
 def _robot_told(robot: Robot) -> dict[str, Any]:
     kept = ("state", "pid", "restarts", "exit_status")
     components = [
-        {"name": one.name, **{key: one.view.get(key) for key in kept}, "tasks": [task.task for task in one.tasks]}
+        {
+            "name": one.name,
+            **{key: one.view.get(key) for key in kept},
+            "use": asdict(one.use) if one.use is not None else None,
+            "tasks": [task.task for task in one.tasks],
+        }
         for one in robot.components
     ]
     return {"robot": robot.name, "state": robot.state or None, "components": components}
@@ -133,7 +159,8 @@ def _component_row(component: Component, branch: str, robot: str) -> Row:
     state, restarts = state_of(component.view), component.view.get("restarts")
     state += f", started anew {restarts} times" if restarts and restarts > 1 else ", started anew once" if restarts else ""
     name = component.name.partition(f"/{robot}/")[2] or component.name
-    return Row((branch + name, state, *[""] * (len(COLUMNS) - 2)), mood_of(component.view))
+    used = (f"{component.use.cpu:.0%}", size(component.use.memory)) if component.use is not None else ("", "")
+    return Row((branch + name, state, *used, *[""] * (len(COLUMNS) - 4)), mood_of(component.view))
 
 
 def _task_row(one: Seen, branch: str, component: str) -> Row:
@@ -142,7 +169,8 @@ def _task_row(one: Seen, branch: str, component: str) -> Row:
     after = ", ".join(f"{name} (not declared)" if name in one.missing else name for name in one.after)
     name = one.task.rsplit("/", 1)[-1] if one.task == component else one.task  # the component's whole name stands above it
     cells = (
-        *(branch + name, state, span(one.period_ns) if one.period_ns else one.kind, span(one.phase_ns) if one.phase_ns else ""),
+        *(branch + name, state, "", "", span(one.period_ns) if one.period_ns else one.kind),
+        span(one.phase_ns) if one.phase_ns else "",
         *(f"{one.misses} ({one.blamed} was late)" if one.blamed else str(one.misses), span(one.late_p50_ns or None)),
         *(span(one.late_p99_ns or None), span(one.took_p50_ns or None), span(one.took_p99_ns or None), str(one.overruns), after),
     )

@@ -17,6 +17,7 @@ from failover.boards.schedule_file import Order, ScheduleFile
 from failover.cli.output import render, task_tree
 from failover.cli.output.board_tree import span
 from failover.client.control import Control
+from failover.client.process_use import Meter, Use
 from failover.core.schedule import layout, orders
 from failover.core.schedule.course import Overrun
 from failover.core.schedule.orders import Change
@@ -50,9 +51,10 @@ def show(arguments: argparse.Namespace) -> int:
 
     Exit status 1: a task is idle, or past its deadline, or a component has failed.
     """
+    meter = Meter()
     with render.live_table() if arguments.watch else contextlib.nullcontext(render.painted) as draw:
         while True:
-            here, seen, tree = _looked_at(arguments)
+            here, seen, tree = _looked_at(arguments, meter)
             if arguments.json:
                 render.as_json(task_tree.told(here, seen, tree))
             else:
@@ -63,31 +65,35 @@ def show(arguments: argparse.Namespace) -> int:
     return 0  # Ctrl-C ended the watch
 
 
-def _looked_at(arguments: argparse.Namespace) -> tuple[str, list[Seen], tuple[task_tree.Robot, ...]]:
+def _looked_at(arguments: argparse.Namespace, meter: Meter) -> tuple[str, list[Seen], tuple[task_tree.Robot, ...]]:
     """This robot, its tasks and the tree; of a robot whose agent answers, also where no program has run a task yet.
 
     Raises:
         ScheduleError: there is no schedule, and no agent.
     """
-    status = team_status()
+    status, uses = _team(meter)
     try:
         with opened(arguments) as file:
             seen, here = overview(file), file.header.robot
-            return here, seen, task_tree.robots(here, seen, status, owners(file, seen, status))
+            return here, seen, task_tree.robots(here, seen, status, owners(file, seen, status), uses)
     except ScheduleError:
         if status is None or arguments.board or not is_none_there():
             raise
         here = str(status["robot"])
-        return here, [], task_tree.robots(here, [], status, {})
+        return here, [], task_tree.robots(here, [], status, {}, uses)
 
 
-def team_status() -> dict[str, Any] | None:
-    """What the agent of this robot says of the team; None where none answers."""
+def _team(meter: Meter) -> tuple[dict[str, Any] | None, dict[str, Use | None]]:
+    """What the agent of this robot says of the team, and what its components use; None where no agent answers."""
     try:
         with Control.open() as agent:
-            return agent.ask("status", team=True)
+            status = agent.ask("status", team=True)
+            if agent.peer_pid != status.get("lanes_pid"):  # it counts its processes in a PID namespace of its own
+                return status, {}
     except (NoAgentError, LostAgentError, AgentRefusedError):
-        return None
+        return None, {}
+    here = [one for one in status["components"] if one.get("primary") == status["robot"] and one.get("pid")]
+    return status, {one["name"]: meter.of(one["pid"]) for one in here}
 
 
 def owners(file: ScheduleFile, seen: Sequence[Seen], status: Mapping[str, Any] | None) -> dict[str, str]:

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from failover.cli.output import render, task_tree
+from failover.client.process_use import Use
 from failover.schedule.overview import Seen
 
 MS = 1_000_000
@@ -63,8 +64,11 @@ STATUS = {
 }
 
 
+USES = {"/lab/robot1/controller": Use(cpu=0.034, memory=24_500_000, processes=2), "/lab/robot1/navigation": None}
+
+
 def tree() -> tuple[task_tree.Robot, ...]:
-    return task_tree.robots("robot1", TASKS, STATUS, OWNERS)
+    return task_tree.robots("robot1", TASKS, STATUS, OWNERS, USES)
 
 
 def drawn(width: int) -> str:
@@ -81,6 +85,7 @@ def test_robots_components_and_tasks_are_there_whole_at_each_width(width: int) -
     said = " ".join(" ".join(lines).replace("│", " ").split())
     assert all(word in said for word in ("camera", "controller", "navigation", "arm", "other programs", "odometry", "logger"))
     assert all(word in said for word in ("failed (exit 1)", "10 ms", "50 ms", "2.00 ms", "0.07 ms", "0.26 ms", "idle", "dead"))
+    assert width < task_tree.WHOLE_WIDTH or all(word in said for word in ("3%", "24.5 MB"))
 
 
 def test_on_a_narrow_terminal_a_row_stays_inside_the_lines_of_the_tree() -> None:
@@ -100,6 +105,9 @@ def test_json_has_the_tree_by_names_and_each_task_with_its_component() -> None:
     assert found["/lab/robot1/controller"] == ("running", 2, None, ["/lab/robot1/controller"])
     assert found["/lab/robot1/camera"] == ("failed", None, 256, [])
     assert found["/lab/robot1/navigation"][3] == ["odometry", "mapper"]
+    uses = {one["name"]: one["use"] for one in (*here["components"], *other["components"])}
+    assert uses["/lab/robot1/controller"] == {"cpu": 0.034, "memory": 24_500_000, "processes": 2}
+    assert uses["/lab/robot1/navigation"] is None and uses["/lab/robot2/arm"] is None
 
 
 @pytest.mark.parametrize(("state", "primary"), [("released", "robot1"), ("running", "robot2")])
