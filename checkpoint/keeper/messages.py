@@ -233,6 +233,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
         hold: leave the program standing still afterwards, until `Release`: an end now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
         lag_ns: how long it may wait for a moment between two activations of the program's tasks; 0: it does not wait.
+        if_changed: answer `Unchanged` where a delta would say nothing new.
     """
 
     base: bool
@@ -242,6 +243,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     hold: bool = False
     xor_cache: int = 0
     lag_ns: int = 0
+    if_changed: bool = False
 
 
 class Acknowledge(msgspec.Struct, frozen=True, tag=True):

@@ -488,8 +488,7 @@ def _commit_at(session: Session, position: Position) -> tuple[int, int]:
 
 def _unchanged(session: Session, request: messages.Capture) -> messages.Unchanged | None:
     """The answer in place of an empty delta; a base, and the last delta of a handover, are always made."""
-    position = None if request.base or request.hold else session.unchanged(request.epoch)
-    if position is None:
+    if request.base or request.hold or not request.if_changed or (position := session.unchanged(request.epoch)) is None:
         return None
     return messages.Unchanged(position, *_commit_at(session, position), is_current=_as_task(session) is None)
 

@@ -307,7 +307,7 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share(), lag_ns)
+        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share(), lag_ns, if_changed=True)
         async with self._standing_still(is_held_by_guard):
             with self._patience():
                 captured, descriptors = await self.keeper.ask(order)
