@@ -123,7 +123,8 @@ class CapturedProcess:
         self.detached: Collection[tuple[int, int]] = frozenset()
         self._flags = FlagsReader(self.pid)
         self._of_mappings = Memo[tuple[str, ...]]()
-        self._looked: Look | None = None
+        self._look: Look | None = None
+        self._settled: Look | None = None
         self._last: LastLook | None = None
 
     @classmethod
@@ -181,14 +182,15 @@ class CapturedProcess:
 
     def has_rested(self) -> bool:
         """Whether it is as the last look found it, and as was acknowledged; see `checkpoint.engines.ptrace.capture.at_rest`."""
-        if (looked := self._looked) is not None:
-            self._looked, self._last = None, LastLook.of(self.pid, looked.standing, looked.taken)
+        if (settled := self._settled) is not None:
+            self._settled, self._last = None, LastLook.of(self.pid, settled.standing, settled.taken)
         last = self._last
         return last is not None and last.waits_there(self.pid) and self.memory.has_rested(last)
 
     def settle(self, position: Position) -> None:
         """The last look has become part of the snapshot with this position."""
         self.memory.settle(position)
+        self._settled, self._look = self._look, None
         self.is_new = False
 
     @property
@@ -230,7 +232,7 @@ class CapturedProcess:
         So the processor has our code, the kernel's and the page tables in its caches, and need not fetch them while the program
         stands still; between two captures it has done other things.
         """
-        self._looked = self._last = None  # the freeze takes the memory of their pages
+        self._look = self._settled = self._last = None  # the freeze takes the memory of their pages
         with contextlib.suppress(CheckpointError, OSError):  # `look` reports the cause
             self.onlooker.rehearse()
             self.memory.rehearse()
@@ -254,8 +256,8 @@ class CapturedProcess:
         taken = self.memory.take(copied, base=base) if copied is not None else self.memory.take_unread()
         if self.memory.has_rings and not is_awaited:
             raise CaptureError(f"cannot capture {self.order.component}: it has just made a ring of asynchronous I/O; try again")
-        self._looked = Look(self.onlooker.ask(place, outputs, opened), taken)
-        return self._looked
+        self._look = Look(self.onlooker.ask(place, outputs, opened), taken)
+        return self._look
 
     # Afterwards
 

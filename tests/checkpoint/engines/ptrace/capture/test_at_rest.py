@@ -14,6 +14,8 @@ import pytest
 
 from checkpoint.engine import CaptureOrder, Session
 from checkpoint.engines.ptrace.capture import at_rest
+from checkpoint.engines.ptrace.capture.snapshot_builder import SnapshotBuilder
+from checkpoint.errors import UnsupportedError
 from checkpoint.linux.procfs import procfs
 from checkpoint.model import Position
 from tests.checkpoint.round_trip import Program, captured_at_last, ended, protected, start
@@ -125,6 +127,23 @@ def test_whatever_happens_to_it_is_seen(
         one.until_at_rest()
         change(one)
         assert one.session.unchanged(0) is None
+
+
+def test_a_look_that_has_become_no_snapshot_is_nothing_to_compare_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    with waiting(tmp_path) as one:
+        one.until_at_rest()
+        one.say("write")
+        with monkeypatch.context() as patched:
+            patched.setattr(SnapshotBuilder, "built", _refused)
+            with pytest.raises(UnsupportedError):
+                one.capture()
+        time.sleep(0.05)
+        assert one.session.unchanged(0) is None, "what it wrote is in no snapshot"
+
+
+def _refused(*_: object) -> None:
+    raise UnsupportedError("cannot capture: it has a socket", ("it has a socket",))
 
 
 def test_a_child_that_waits_rests_with_its_parent_and_what_it_writes_is_seen(
