@@ -329,7 +329,7 @@ def _programs(member: Member, name: str) -> Iterator[int]:
             words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        if words[2:3] == [b"agent.guard.server"] or words[2:3] == [b"checkpoint"]:
+        if {b"agent.guard.server", b"checkpoint"} & set(words[:5]):
             continue
         if name.encode() in words or f"name={name}".encode() in words:
             yield pid

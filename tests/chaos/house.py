@@ -152,7 +152,7 @@ class Member:
         found = []
         for pid in self.machine.processes() if self.machine is not None else ():
             with contextlib.suppress(OSError):
-                if MODULES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:4]:
+                if MODULES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:5]:
                     found.append(pid)
         return found
 

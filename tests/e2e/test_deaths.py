@@ -60,7 +60,7 @@ def parts(robot: RobotMachine, name: str) -> list[int]:
     found = []
     for pid in robot.processes():
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            if NAMES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:4]:
+            if NAMES[name] in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[2:5]:
                 found.append(pid)
     return found
 

@@ -23,6 +23,6 @@ def mapped_by(robot: RobotMachine, part: str) -> str:
     """The mappings of a part of its agent, by what stands in the command line."""
     for pid in robot.processes():
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
-            if part in Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")[1:4]:
+            if part in Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")[1:5]:
                 return Path(f"/proc/{pid}/maps").read_text()
     raise AssertionError(f"{robot.name} has no {part}")
