@@ -41,8 +41,8 @@ PURE_FILES = (
 
 PURE_IMPORTS = frozenset(
     """
-    __future__ abc bisect binascii blake3 collections contextlib dataclasses difflib enum fractions functools hashlib heapq hmac
-    ipaddress itertools json math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
+    __future__ abc bisect binascii blake3 collections contextlib dataclasses difflib enum fastavro fractions functools hashlib
+    heapq hmac ipaddress itertools json math msgspec numpy operator re string struct types typing unicodedata xml xxhash zlib
     """.split()  # noqa: SIM905
 )
 
@@ -59,6 +59,7 @@ DOORS = {
     "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
     "cryptography": ("failover/programs/keys.py",),
     "mcap": ("failover/recording/mcap_file.py",),
+    "fastavro": ("failover/core/messaging/avro.py",),
     "foxglove": ("failover/recording/foxglove_server.py",),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),

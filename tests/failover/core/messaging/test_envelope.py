@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import random
 from pathlib import Path
@@ -32,6 +33,10 @@ from failover.core.messaging.envelope import (
 )
 from failover.errors import EnvelopeError
 
+HAS_AVRO = importlib.util.find_spec("fastavro") is not None
+ENCODINGS: list[Encoding] = ["json", "msgpack", *(("avro",) if HAS_AVRO else ())]  # type: ignore[list-item]
+needs_avro = pytest.mark.skipif(not HAS_AVRO, reason="needs fastavro: the extra avro")
+
 DOCUMENT = (Path(module.__file__).parent / "ENVELOPE.md").read_text()
 
 text = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
@@ -57,13 +62,16 @@ unknown = st.dictionaries(field.filter(lambda name: name not in module._KNOWN), 
 
 
 @settings(max_examples=150, deadline=None)
-@given(known, unknown, st.randoms(), st.sampled_from(["json", "msgpack"]), st.sampled_from(["json", "msgpack"]))
+@given(known, unknown, st.randoms(), st.sampled_from(ENCODINGS), st.sampled_from(ENCODINGS))
 def test_fields_come_in_any_order_and_unknown_ones_are_passed_on(
     fields: dict[str, Any], rest: dict[str, Any], rolled: random.Random, first: Encoding, then: Encoding
 ) -> None:
     order = list({**rest, **fields}.items())
     rolled.shuffle(order)
     content = json.dumps(dict(order)).encode() if first == "json" else msgspec.msgpack.encode(dict(order))
+    if first == "avro":
+        content = encode(decode(content), "avro")  # its schema has the order
+    assert module.encoding_of(content) == first
     read = decode(content)
     assert read.rest == rest
     assert read == decode(json.dumps({**fields, **rest}).encode())
@@ -71,6 +79,8 @@ def test_fields_come_in_any_order_and_unknown_ones_are_passed_on(
     again = decode(encode(passed, then))
     assert again == passed
     assert (again.rest, again.hops) == (rest, (Hop("robot1/ns", 1, 2),))
+    if then == "avro":
+        return
     written = msgspec.json.decode(encode(read)) if then == "json" else msgspec.msgpack.decode(encode(read, then))
     assert {name: one for name, one in written.items() if name in fields}.items() <= fields.items() or written == {
         **fields,
@@ -98,7 +108,7 @@ def test_no_bytes_raise_anything_but_a_sentence(content: bytes) -> None:
     [
         (b"", "neither a JSON object nor a msgpack map"),
         (b"[1]", "neither a JSON object"),
-        (b"\xc3\x01", "Avro"),
+        (b"\xc3\x01", "Avro of another schema" if HAS_AVRO else r"pip install 'failover\[avro\]'"),
         (b'{"to":"a"', "cannot be read"),
         (b'{"to":"a","to":"b"}', "'to' twice"),
         (b'{"to":"a","body":{"x":1,"x":1}}', "'x' twice"),
@@ -174,6 +184,119 @@ def test_an_answer_names_what_it_answers_and_none_is_an_answer_too() -> None:
     )
 
 
+# --- Avro -------------------------------------------------------------------------------------------------------------
+
+CANONICAL = (
+    '{"name":"failover.Envelope","type":"record","fields":[FIELDS]}',
+    '{"name":"failover.Hop","type":"record","fields":[{"name":"who","type":"string"},{"name":"came","type":"long"},'
+    '{"name":"left","type":["null","long"]}]}',
+    '{"name":"failover.Fault","type":"record","fields":[{"name":"kind","type":"string"},{"name":"sentence","type":"string"}]}',
+)
+
+
+def canonical() -> bytes:
+    """The schema in the form whose fingerprint counts, written here once more."""
+    whole, hop, fault = CANONICAL
+    texts = '["null","string"]'
+    kinds = {
+        **dict.fromkeys(("to", "verb", "id", "from", "by", "re"), '"string"'),
+        **dict.fromkeys(("boot", "seq", "after", "had", "epoch"), '"long"'),
+        "body": texts,
+        "ok": texts,
+        "reliable": '"boolean"',
+        "deadline_ms": '["null","double"]',
+        "hops": f'{{"type":"array","items":{hop}}}',
+        "error": f'["null",{fault}]',
+        "rest": '{"type":"map","values":"string"}',
+    }
+    first = ["to", "verb", "body", "id", "from", "by", "boot", "seq", "after", "had", "reliable", "deadline_ms", "epoch"]
+    order = [*first, "hops", "re", "ok", "error", "rest"]
+    return whole.replace("FIELDS", ",".join(f'{{"name":"{name}","type":{kinds[name]}}}' for name in order)).encode()
+
+
+def crc_64_avro(content: bytes) -> bytes:
+    """As the specification defines it, a bit at a time."""
+    empty = value = 0xC15D213AA4D7A795
+    for byte in content:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ (empty if value & 1 else 0)
+    return value.to_bytes(8, "little")
+
+
+@needs_avro
+def test_an_avro_message_begins_with_the_fingerprint_of_the_schema() -> None:
+    assert encode(Envelope("a"), "avro")[:10] == b"\xc3\x01" + crc_64_avro(canonical())
+
+
+@needs_avro
+@pytest.mark.parametrize(
+    "asked",
+    [
+        Envelope("a", "b", None, rest={"note": [1, {"x": None}]}, deadline_ms=0.5),
+        Envelope("a", ok=None, re="x", boot=1 << 53, hops=(Hop("r", str((1 << 53) + 1), None), Hop("s", 3, 4))),
+        Envelope(error=module.Fault("busy")),
+        Envelope(body="ä" * 70_000),
+    ],
+    ids=["rest", "stamps", "error", "text"],
+)
+def test_what_is_absent_null_and_large_stays_so_in_avro(asked: Envelope) -> None:
+    assert decode(encode(asked, "avro")) == asked
+    assert decode(encode(asked, "avro")).body is asked.body or asked.body
+
+
+def bad_avro() -> list[tuple[bytes, str]]:
+    """Bytes that begin as Avro, and why they are no message."""
+    if not HAS_AVRO:
+        return []
+    from failover.core.messaging import avro
+
+    begin = encode(Envelope(), "avro")[:10]
+    empty = avro.read(encode(Envelope(), "avro"))
+    whole = encode(Envelope("a", rest={"x": 1}), "avro")
+    twice = whole[:-6] + b"\x04" + b"\x02x\x021" * 2 + b"\x00"
+    return [
+        (begin, "cannot be read"),
+        (whole[:-1], "cannot be read"),
+        (whole + b"\x00", "more bytes than its fields"),
+        (begin + b"\xff\xff\xff\xff\xff\xff\xff\xff\x7f", "cannot be read"),
+        (begin + b"\x01" * 40, "cannot be read"),
+        (begin[:4] + b"\x00" + begin[5:], "another schema"),
+        (twice, "twice"),
+        (avro.write({**empty, "rest": {"to": '"x"'}}), "'to' twice"),
+        (avro.write({**empty, "rest": {"\x7frest": "{}"}}), "visible characters"),
+        (avro.write({**empty, "body": '{"x":1,"x":1}'}), "'x' twice"),
+        (avro.write({**empty, "body": "nonsense"}), "cannot be read"),
+        (avro.write({**empty, "body": "[" * 100_000 + "]" * 100_000}), f"deeper than {DEPTH_MAX}"),
+        (avro.write({**empty, "body": "9007199254740993"}), "above 2\\^53"),
+        (avro.write({**empty, "seq": -1}), "negative"),
+        (avro.write({**empty, "deadline_ms": float("inf")}), "not finite"),
+    ]
+
+
+@needs_avro
+@pytest.mark.parametrize(("content", "why"), bad_avro(), ids=lambda one: one if isinstance(one, str) else repr(one[10:24]))
+def test_what_is_no_message_in_avro_gets_a_sentence(content: bytes, why: str) -> None:
+    with pytest.raises(EnvelopeError, match=why):
+        decode(content)
+
+
+@needs_avro
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=80), st.randoms())
+def test_no_avro_raises_anything_but_a_sentence(content: bytes, rolled: random.Random) -> None:
+    whole = bytearray(encode(Envelope("a", "b", {"x": 1}, rest={"y": 2}, hops=(Hop("r", 1, 2),), deadline_ms=2.0), "avro"))
+    for byte in content[:4]:
+        whole[rolled.randrange(10, len(whole))] = byte
+    for odd in (bytes(whole[:10]) + content, bytes(whole)):
+        sentence = "the message"
+        try:
+            decode(odd)
+        except EnvelopeError as error:
+            sentence = str(error)
+        assert sentence.startswith("the message")
+
+
 # --- The document ---------------------------------------------------------------------------------------------------------
 
 
@@ -190,6 +313,16 @@ def test_each_sample_of_the_document_is_read_and_written_as_it_says() -> None:
         assert json.loads(encode(read)) == json.loads(message)
     (sample,) = samples("hex")
     assert encode(decode(messages[0].encode()), "msgpack") == bytes.fromhex(sample)
+
+
+@needs_avro
+def test_the_avro_of_the_document_is_what_is_written() -> None:
+    from failover.core.messaging import avro
+
+    assert [json.loads(one) for one in samples("avsc")] == [avro.SCHEMA]
+    (sample,) = samples("avro")
+    content = encode(decode(samples("json")[0].encode()), "avro")
+    assert content == bytes.fromhex(sample) and f", {len(content)} bytes" in DOCUMENT
 
 
 def test_the_document_names_every_field_and_limit() -> None:
