@@ -19,20 +19,21 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, get_args
 
 import msgspec
 from msgspec import UNSET, Struct
 
 from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import TEXT_MAX, Envelope, Hop
-from failover.core.messaging.mailbox import MS, WINDOW
+from failover.core.messaging.envelope import TEXT_MAX, Encoding, Envelope, Hop
+from failover.core.messaging.mailbox import WINDOW
 from failover.core.naming.tree import Place
-from failover.drivers.actor import LEASE_NS
 from failover.drivers.here import Here, here, lives
 from failover.drivers.lookup import lookup
-from failover.drivers.sending import EXPIRED, SECOND_NS, Posting, decoded, refused, sending, way_to
+from failover.drivers.route import Route
+from failover.drivers.sending import EXPIRED, SECOND_NS, Posting, refused, sending
+from failover.drivers.streaming import Streaming
 from failover.errors import CallRefusedError, DriverError, EnvelopeError, NoAnswerError
 
 TIMEOUT_S: Final = 5.0
@@ -58,26 +59,27 @@ class _Described(Struct, frozen=True):
     verbs: dict[str, _Role] = {}
 
 
-def proxy(name: str, *, queue: int = WINDOW, sender: str = "") -> Proxy:
+def proxy(name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json") -> Proxy:
     """The driver of that name: a path, an alias, or an address.
 
     Args:
         queue: messages that may wait for an answer, from 1 to 1,024; one more is refused.
         sender: a name of this program that stays the same when it is started again: what its process before has sent and was not
             carried out is then never carried out after what this one sends. One process at a time uses it. "": a new name.
+        encoding: of messages and their answers: json, msgpack or avro; a driver that cannot read it gets JSON.
 
     Raises:
         NameFormatError, NameUnknownError, NameAmbiguousError: it names nothing, or several things.
         DriverError: it is on another robot, and no key of the team can be read here; or an argument cannot work.
     """
     place = here()
-    return Proxy(place, lookup(place, name), queue=queue, sender=sender)
+    return Proxy(place, lookup(place, name), queue=queue, sender=sender, encoding=encoding)
 
 
 class Proxy:
     """One driver, as another process calls it; a context manager."""
 
-    def __init__(self, here: Here, place: Place, *, queue: int = WINDOW, sender: str = "") -> None:
+    def __init__(self, here: Here, place: Place, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json") -> None:
         """
         Raises:
             DriverError: it is on another robot that cannot be reached, or an argument cannot work.
@@ -88,12 +90,13 @@ class Proxy:
         """The newest answer to a call, with its hops."""
         if not 1 <= queue <= WINDOW:
             raise DriverError(f"queue={queue} is no number of messages that can wait: write one from 1 to {WINDOW}")
+        _check_encoding(encoding)
         if not sender.isprintable() or "/" in sender or len(sender) + len(here.robot) >= TEXT_MAX // 2:
             raise DriverError(f"sender={sender[:64]!r} cannot name a program: write visible characters without /, 200 at most")
         program = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python").stem
         self.sender = f"{here.robot}/{sender or f'{program}-{os.getpid()}-{next(_NUMBERS)}'}"
         self._by = accounts.name_of(os.geteuid()) if place.robot != here.robot else ""
-        self._sending = sending(here, place, self.sender, queue)
+        self._sending = sending(here, place, self.sender, queue, encoding)
         self._posting: Posting | None = None
         self._lock = threading.RLock()
         self._is_closed = False
@@ -101,7 +104,7 @@ class Proxy:
     @property
     def place(self) -> Place:
         """Where the driver is, as far as it is known."""
-        return self._sending.place
+        return self._sending.route.place
 
     def close(self) -> None:
         """Let the connection go. What was posted and has no answer is sent no more; its futures say so."""
@@ -269,37 +272,25 @@ class Proxy:
     def stream(self, name: str) -> Iterator[Any]:
         """The values of a stream, one after the other, while they are asked for; those that cannot be taken in time are lost.
 
+        They come on after a restart of the driver, and from another robot once it runs there.
+
         Raises:
             CallRefusedError: the driver has no such stream, or it failed at it.
             DriverError: it does not say which streams it has.
         """
         if self.told("_describe", _Described).verbs.get(name, _Role()).role != "stream":
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
-        way = way_to(self.here, self._sending.address, self.place.robot)
-        asked = Envelope(
-            to=self.path, verb="_subscribe", body={"stream": name}, sender=f"{self.sender}-{next(_NUMBERS)}", by=self._by
-        )
-        again_ns = self.now_ns()
+        number = f"{self.sender}-{next(_NUMBERS)}"
+        asked = Envelope(to=self.path, verb="_subscribe", body={"stream": name}, sender=number, by=self._by, id=number)
+        with Streaming(Route(self.here, self.place), asked, name) as streaming:
+            yield from streaming.values()
+
+
+def _check_encoding(encoding: str) -> None:
+    if encoding not in get_args(Encoding):
+        raise DriverError(f"encoding={encoding!r} is none: write one of {', '.join(get_args(Encoding))}")
+    if encoding == "avro":
         try:
-            while True:
-                now_ns = self.now_ns()
-                if now_ns >= again_ns and way.await_sent(envelopes.encode(asked), SECOND_NS):
-                    again_ns = now_ns + LEASE_NS // 3
-                content = way.await_message(max(again_ns - now_ns, MS))
-                again_ns = 0 if way.is_lost else again_ns
-                value = decoded(content) if content is not None else None
-                if value is None:
-                    continue
-                is_denied = value.error is not UNSET and value.error.kind == "denied"
-                if value.verb != name and not is_denied:
-                    continue
-                if value.error is not UNSET:
-                    raise CallRefusedError(value.error.sentence, value.error.kind)
-                yield None if value.ok is UNSET else value.ok
-        finally:
-            way.send(envelopes.encode(msgspec.structs.replace(asked, verb="_unsubscribe")))
-            way.close(LINGER_MS)
-
-
-LINGER_MS: Final = 100
-"""How long the farewell of a stream may take to leave."""
+            envelopes.encode(Envelope(), "avro")
+        except EnvelopeError as error:
+            raise DriverError(f"cannot send Avro: {error}") from error

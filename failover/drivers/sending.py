@@ -9,32 +9,23 @@ import contextlib
 import logging
 import os
 import select
-import sys
 import threading
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 from msgspec import UNSET
 
-from failover.boards import boottime
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.envelope import Encoding, Envelope
 from failover.core.messaging.mailbox import MOVED, RESEND_FIRST_NS, RESEND_MOST_NS, Outbox
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here
-from failover.drivers.local import SCHEME, LocalWay
-from failover.drivers.lookup import lookup
 from failover.drivers.name_service import new_boot
-from failover.errors import CallRefusedError, DriverError, EnvelopeError, FailoverError, NoAnswerError
-
-if TYPE_CHECKING:
-    from failover.drivers.sockets import TeamWay
+from failover.drivers.route import LOOK_NS, Route
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, NoAnswerError
 
 SECOND_NS: Final = 1_000_000_000
-
-LOOK_NS: Final = 2 * SECOND_NS
-"""How long it may take to look a name up while messages wait."""
 
 SLICE_NS: Final = SECOND_NS // 2
 """How often a way is looked at while an answer is waited for: ZeroMQ does not tell that its connection is lost."""
@@ -52,33 +43,30 @@ log = logging.getLogger("failover.drivers")
 class Sending:
     """What one sender has to tell one driver, and the way there. `post` may be called by any thread, `turn` by one at a time."""
 
-    def __init__(self, here: Here, place: Place, outbox: Outbox) -> None:
+    def __init__(self, here: Here, place: Place, outbox: Outbox, encoding: Encoding = "json") -> None:
         """
+        Args:
+            encoding: of messages; a driver that cannot read it gets JSON.
+
         Raises:
             DriverError: the driver is on another robot that cannot be reached.
         """
-        self.here = here
-        self.place = place
-        self.path = place.record.path
+        self._encoding: Encoding = encoding
+        self.route = Route(here, place)
+        self.path = self.route.path
+        self.now_ns = self.route.now_ns
         self._outbox = outbox
         self._lock = threading.Lock()
-        self._skew = boottime.skew_ns()
         self._epoch = place.record.epoch
         """The highest of the driver of which this sender has heard."""
         self._left = 0
         """The highest number of a message that was sent."""
         self._look_ns = self._heard_ns = 0
         self._pause_ns = RESEND_FIRST_NS
-        self.address = address_of(here, place)
-        self._way = way_to(here, self.address, place.robot)
-
-    def now_ns(self) -> int:
-        """The clock of this process's hops."""
-        return boottime.now_ns(self._skew)
 
     def close(self) -> None:
         """Let the connection go."""
-        self._way.close()
+        self.route.close()
 
     @property
     def is_idle(self) -> bool:
@@ -115,20 +103,29 @@ class Sending:
         if not self._is_open(until_ns, wake):
             return []
         self._send_due()
+        if not self._outbox.is_connected:
+            return []
         now_ns = self.now_ns()
         with self._lock:
             next_ns = self._outbox.next_ns()
         until_ns = min(until_ns, next_ns if next_ns is not None else until_ns, now_ns + SLICE_NS)
-        content = self._way.await_message(max(until_ns - now_ns, 0), wake)
+        content = self.route.way.await_message(max(until_ns - now_ns, 0), wake)
         if content is None:
-            if self._way.is_lost:  # the driver has ended, or the network is cut: it is asked anew once it is there again
+            if self.route.way.is_lost:  # the driver has ended, or the network is cut: it is asked anew once it is there again
                 self._disconnected()
             return []
         self._heard_ns = self.now_ns()
         answer = decoded(content)
         if answer is None:
             return []
+        with self._lock:
+            self._outbox.heard(self._heard_ns)
         kind = "" if answer.error is UNSET else answer.error.kind
+        if kind == "no_message" and self._encoding != "json":
+            self._encoding = "json"
+            with self._lock:
+                self._outbox.connected(self._heard_ns)  # all that has no answer is sent again
+            return []
         if kind in MOVED:  # before the epoch is looked at: a copy that was replaced says it under its lower one
             self._moved()
         if 0 < answer.epoch < self._epoch:
@@ -159,7 +156,7 @@ class Sending:
         now_ns = self.now_ns()
         with self._lock:
             next_ns = self._outbox.next_ns() or until_ns
-        if self._way.await_open(max(min(until_ns, next_ns, self._look_ns) - now_ns, 0), wake):
+        if self.route.way.await_open(max(min(until_ns, next_ns, self._look_ns) - now_ns, 0), wake):
             with self._lock:
                 self._outbox.connected(self.now_ns())
             self._pause_ns = RESEND_FIRST_NS
@@ -178,12 +175,15 @@ class Sending:
     def _send_due(self) -> None:
         now_ns = self.now_ns()
         with self._lock:
+            is_silent = self._outbox.must_look(now_ns)
+        if is_silent and self._look_again(now_ns + LOOK_NS):
+            self._disconnected()
+            return
+        with self._lock:
             self._outbox.committed()  # this sender keeps nothing: each answer that it has is had
             due = self._outbox.due(now_ns)
-        if due and due[0].seq <= self._left and now_ns >= max(self._look_ns, self._heard_ns + SLICE_NS):
-            self._look_again(now_ns + LOOK_NS)
         for place, one in enumerate(due):
-            if not self._way.send(self._encoded(one)):
+            if not self.route.way.send(self._encoded(one)):
                 self._disconnected(len(due) - place)
                 return
             self._left = max(self._left, one.seq)
@@ -192,21 +192,14 @@ class Sending:
         """As it leaves now. Of one that is sent again the first stamp stays."""
         if self._epoch:
             one = msgspec.structs.replace(one, epoch=self._epoch)
-        return envelopes.encode(envelopes.left(one, self.now_ns()))
+        return envelopes.encode(envelopes.left(one, self.now_ns()), self._encoding)
 
     def _look_again(self, until_ns: int) -> bool:
-        """It does not answer: it may have been started anew, at another address; whether it was."""
-        limit_ns = min(until_ns - self.now_ns(), LOOK_NS)
-        with contextlib.suppress(*_may_pass()):  # it is waited for where it was
-            place = lookup(self.here, self.path, limit_ns)
-            address = address_of(self.here, place)
-            if address != self.address:
-                way = way_to(self.here, address, place.robot)
-                self._way.close()
-                self.place, self.address, self._way = place, address, way
-                self._epoch = max(self._epoch, place.record.epoch)
-                return True
-        return False
+        """It does not answer: whether it was found at another address."""
+        is_elsewhere = self.route.look_again(until_ns - self.now_ns())
+        if is_elsewhere:
+            self._epoch = max(self._epoch, self.route.place.record.epoch)
+        return is_elsewhere
 
 
 class Posting:
@@ -303,45 +296,17 @@ def refused(answer: Envelope) -> CallRefusedError:
     return CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
 
 
-def sending(here: Here, place: Place, sender: str, limit: int) -> Sending:
+def sending(here: Here, place: Place, sender: str, limit: int, encoding: Encoding) -> Sending:
     """To the driver of a place.
 
     Args:
         limit: messages that may wait for an answer.
+        encoding: of messages.
 
     Raises:
         DriverError: it is on another robot that cannot be reached.
     """
-    return Sending(here, place, Outbox(sender, new_boot(), limit=limit))
-
-
-def way_to(here: Here, address: str, robot: str) -> LocalWay | TeamWay:
-    """A way to a driver at this address; `DriverError`: the team's keys are not here."""
-    if address.startswith(SCHEME):
-        return LocalWay(address.removeprefix(SCHEME))
-    from failover.drivers.sockets import TeamWay  # ZeroMQ is loaded only by who needs other robots
-
-    return TeamWay(address, here, robot)
-
-
-def address_of(here: Here, place: Place) -> str:
-    """By which address this process reaches a driver: a unix socket on its own robot, else tcp.
-
-    Raises:
-        DriverError: by none.
-    """
-    scheme = SCHEME if place.robot == here.robot else "tcp://"
-    found = next((address for address in place.record.addresses if address.startswith(scheme)), "")
-    if not found:
-        why = here.alone or f"its driver on {place.robot} opened no port: the key of the team could not be read there"
-        raise DriverError(f"cannot reach {place.record.path} on {place.robot}: {why}")
-    return found
-
-
-def _may_pass() -> tuple[type[Exception], ...]:
-    """What may be over at the next look: no name, no descriptor, no memory of the kernel."""
-    zmq = sys.modules.get("zmq")  # loaded only by who needs other robots
-    return (FailoverError, OSError, *((zmq.ZMQError,) if zmq is not None else ()))
+    return Sending(here, place, Outbox(sender, new_boot(), limit=limit), encoding)
 
 
 def decoded(content: bytes) -> Envelope | None:

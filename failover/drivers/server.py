@@ -20,7 +20,8 @@ from failover.boards import boottime
 from failover.config.team import Team
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.by_hand import Typed
-from failover.core.messaging.envelope import Envelope, Fault
+from failover.core.messaging.envelope import Encoding, Envelope, Fault
+from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.naming.records import Record, pack
 from failover.core.naming.scan import Terms
 from failover.core.naming.tables import BODY_SIZE_MAX
@@ -136,6 +137,8 @@ class Serving:
         self._rights = CallRights(self.here.rules, declaration.path)
         self._hands: dict[Hand, Typing] = {}
         self._near: dict[Near, local.Connection] = {}
+        self._encodings: dict[Whose, Encoding] = {}
+        """Of those whose newest message was not in JSON: they are answered as they write."""
         self._readers: dict[int, Callable[[], None]] = {}
         self._numbers = 0
         self._is_over = False
@@ -199,8 +202,8 @@ class Serving:
         self._gate = sockets.Gate(context, {name: robot.public_key for name, robot in team.robots.items()})
         self._team, address = sockets.listen_team(context, self.here)
         self._addresses.append(address)
-        for socket_ in (self._gate.socket, self._team):
-            self._wait_for(socket_.fileno(), self._take_team)
+        self._wait_for(self._gate.socket.fileno(), self._gate.serve)
+        self._wait_for(self._team.fileno(), self._take_team)
 
     def _wait_for(self, descriptor: int, read: Callable[[], None]) -> None:
         self._readers[descriptor] = read
@@ -278,9 +281,12 @@ class Serving:
             self._actor.sample(self._publish, self.now_ns)
 
     def _wait_ns(self) -> int | None:
-        """How long the next wait may take. A descriptor of ZeroMQ tells of news once, so its sockets are looked at before."""
-        if self._team is not None and (self._sockets.has_message(self._team) or self._sockets.has_message(self._gate.socket)):
-            self._take_team()
+        """How long the next wait may take. ZeroMQ's descriptor tells of news once, and an answer that left may have used it."""
+        if self._team is not None and self._sockets.has_message(self._team):
+            for _ in range(TURN_MAX):
+                self._take_team()
+                if not self._sockets.has_message(self._team):
+                    break
             return 0
         return self._actor.wait_ns(self.now_ns())
 
@@ -296,18 +302,11 @@ class Serving:
             self._close(keeping.fileno())
 
     def _take_team(self) -> None:
-        """All messages that have come from other robots, up to `TURN_MAX`."""
+        """One message of another robot, if one has come; `_wait_ns` takes those behind it."""
         assert self._team is not None
-        if self._sockets.has_message(self._gate.socket):
-            self._gate.serve()
-        for _ in range(TURN_MAX):
-            message = self._sockets.receive(self._team)
-            if message is None:
-                return
+        if (message := self._sockets.receive(self._team)) is not None:
             identity, content, robot = message
             self._came(content, Peer(identity), robot)
-            if not self._sockets.has_message(self._team):
-                return
 
     def _accept_near(self, listener: socket.socket) -> None:
         with contextlib.suppress(OSError):
@@ -347,6 +346,7 @@ class Serving:
         except EnvelopeError as error:
             self._publish(whose, Envelope(error=Fault("no_message", str(error))))
             return
+        self._note_encoding(whose, envelopes.encoding_of(content))
         if robot is not None and robot_of(envelope.sender) != robot:
             self._publish(
                 whose,
@@ -365,6 +365,14 @@ class Serving:
                 return
         self._send(self._actor.came(envelope, whose, now_ns, len(content)))
 
+    def _note_encoding(self, whose: Whose, encoding: Encoding) -> None:
+        if encoding != "json":
+            self._encodings[whose] = encoding
+            if len(self._encodings) > SENDERS_MAX:
+                del self._encodings[next(iter(self._encodings))]
+        elif self._encodings:
+            self._encodings.pop(whose, None)
+
     def _send(self, answers: list[Envelope]) -> None:
         for one in answers:
             whose = self._actor.route(one.to)
@@ -373,7 +381,7 @@ class Serving:
 
     def _publish(self, whose: Whose, envelope: Envelope) -> bool:
         """Send to one, if it is there and takes it now: who misses an answer to what matters sends it again."""
-        content = envelopes.encode_answer(envelope)
+        content = envelopes.encode_answer(envelope, self._encodings.get(whose, "json"))
         if isinstance(whose, Near):
             connection = self._near.get(whose)
             if connection is None:

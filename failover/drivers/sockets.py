@@ -32,7 +32,10 @@ HANDSHAKE_LIMIT_MS: Final = 5_000
 ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
 ZAP_DOMAIN: Final = b"failover"
 
-NOW: Final = zmq.NOBLOCK
+_NOW: Final = int(zmq.NOBLOCK)
+_NOW_AND_MORE: Final = int(zmq.NOBLOCK | zmq.SNDMORE)
+_READABLE: Final = int(zmq.POLLIN)
+"""As plain numbers: zmq's own are objects that each ``&`` and ``|`` makes anew, for some microseconds."""
 
 Context = zmq.Context[zmq.Socket[bytes]]
 Socket = zmq.Socket[bytes]
@@ -94,7 +97,7 @@ def connect(context: Context, address: str, here: Here, robot: str, *, queued: i
 
 def has_message(socket: Socket) -> bool:
     """Whether a listening socket has one more."""
-    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+    return bool(int(socket.getsockopt(zmq.EVENTS)) & _READABLE)
 
 
 def receive(socket: Socket) -> tuple[bytes, bytes, str] | None:
@@ -104,11 +107,14 @@ def receive(socket: Socket) -> tuple[bytes, bytes, str] | None:
     """
     while True:
         try:
-            frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)  # only frames say whose key it was
+            whose = socket.recv(_NOW)
         except zmq.Again:
             return None
-        if len(frames) == 2:
-            return frames[0].bytes, frames[1].bytes, _user(frames[1])
+        frame = socket.recv(copy=False)  # only a frame says whose key it was; all parts of a message are there
+        if not frame.more:
+            return whose, frame.bytes, _user(frame)
+        while socket.getsockopt(zmq.RCVMORE):
+            socket.recv()
 
 
 def _user(frame: zmq.Frame) -> str:
@@ -121,7 +127,8 @@ def _user(frame: zmq.Frame) -> str:
 def answer(socket: Socket, whose: bytes, content: bytes) -> bool:
     """Send to one who has sent; False: it is gone, or takes nothing."""
     try:
-        socket.send_multipart((whose, content), zmq.NOBLOCK)
+        socket.send(whose, _NOW_AND_MORE)
+        socket.send(content, _NOW)
     except zmq.ZMQError:
         return False
     return True
@@ -130,7 +137,7 @@ def answer(socket: Socket, whose: bytes, content: bytes) -> bool:
 def send(socket: Socket, content: bytes) -> bool:
     """Send by a way made with `connect`; False: there is no connection, or its queue is full."""
     try:
-        socket.send(content, zmq.NOBLOCK)
+        socket.send(content, _NOW)
     except zmq.Again:
         return False
     return True
@@ -145,6 +152,7 @@ class TeamWay:
             DriverError: the team's keys are not here.
         """
         self._context = context()
+        self._limit_ms = -1
         try:
             self._socket = connect(self._context, address, here, robot)
         except DriverError:
@@ -184,7 +192,10 @@ class TeamWay:
         """What comes; None: nothing within the time, or `wake` can be read."""
         if wake >= 0:
             return self._socket.recv(zmq.NOBLOCK) if self._ready(zmq.POLLIN, timeout_ns, wake) else None
-        self._socket.setsockopt(zmq.RCVTIMEO, max(-(-timeout_ns // 1_000_000), 0))
+        limit_ms = max(-(-timeout_ns // 1_000_000), 0)
+        if limit_ms != self._limit_ms:
+            self._socket.setsockopt(zmq.RCVTIMEO, limit_ms)
+            self._limit_ms = limit_ms
         try:
             return self._socket.recv()
         except zmq.Again:

@@ -12,6 +12,8 @@ from checkpoint.program import epoch_variable
 TASK_MODULE: Final = "failover.kept_state.api"
 """Asked only where the program has loaded it: it brings numpy, whose threads an unprepared program must not have."""
 
+_VARIABLE: Final = epoch_variable.VARIABLE.encode()
+
 
 def epoch() -> int:
     """Number of the primacy under which this copy of the program runs now: the fencing token. It only grows; 0 without an agent.
@@ -26,13 +28,13 @@ def epoch() -> int:
 
 def _own_epoch() -> int:
     """The epoch in the environment of the C library, where the agent renews it: `os.environ` is a copy from the beginning."""
-    told = _libc().getenv(epoch_variable.VARIABLE.encode())
+    told = _getenv()(_VARIABLE)
     return int(told) if told is not None and told.isdigit() else 0
 
 
 @lru_cache(maxsize=1)
-def _libc() -> Any:
-    libc = ctypes.CDLL(None)
-    libc.getenv.restype = ctypes.c_char_p
-    libc.getenv.argtypes = (ctypes.c_char_p,)
-    return libc
+def _getenv() -> Any:
+    getenv = ctypes.CDLL(None).getenv
+    getenv.restype = ctypes.c_char_p
+    getenv.argtypes = (ctypes.c_char_p,)
+    return getenv

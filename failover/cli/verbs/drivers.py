@@ -22,7 +22,7 @@ from failover.core.naming.tree import Place, Reach, Tree, robot_of
 from failover.drivers.here import Here, here
 from failover.drivers.lookup import lookup, whole_tree
 from failover.drivers.proxy import Proxy
-from failover.drivers.sending import address_of, way_to
+from failover.drivers.route import address_of, way_to
 from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError, RequestError
 
 EXCHANGES: Final = 8

@@ -57,6 +57,10 @@ RESEND_FIRST_NS: Final = 500 * MS
 RESEND_MOST_NS: Final = 8_000 * MS
 """Until an unanswered message is sent again; doubled each time, and from the beginning after an answer or a cut."""
 
+LOOK_FIRST_NS: Final = 500 * MS
+LOOK_MOST_NS: Final = 2_000 * MS
+"""Until a receiver that says nothing is looked up: its robot may be lost without a word. Doubled each time."""
+
 MOVED: Final = ("moved", "wrong_driver")
 """Kinds of errors of one who is not, or is no more, the receiver: it took nothing; look the name up anew."""
 
@@ -108,6 +112,9 @@ class Outbox:
         self._is_connected = True
         self._again_ns: int | None = 0 if self._sent else None
         self._pause_ns = RESEND_FIRST_NS
+        self._quiet_ns = 0
+        """Since when nothing was heard while messages wait for their answers, or since the receiver was looked up."""
+        self._look_pause_ns = LOOK_FIRST_NS
 
     def __len__(self) -> int:
         return len(self._sent) + len(self._unsent)
@@ -165,6 +172,19 @@ class Outbox:
         if self._is_connected and self._sent and self._again_ns is not None:
             times.append(self._again_ns)
         return min(times, default=None)
+
+    def heard(self, now_ns: int) -> None:
+        """The receiver has said something, or nothing is to be heard of it."""
+        self._quiet_ns, self._look_pause_ns = now_ns, LOOK_FIRST_NS
+
+    def must_look(self, now_ns: int) -> bool:
+        """Whether the receiver is to be looked up now: it has been silent for so long that it may be elsewhere."""
+        if not self._sent:
+            self.heard(now_ns)
+        if now_ns < self._quiet_ns + self._look_pause_ns:
+            return False
+        self._quiet_ns, self._look_pause_ns = now_ns, min(2 * self._look_pause_ns, LOOK_MOST_NS)
+        return True
 
     def due(self, now_ns: int) -> list[Envelope]:
         """What is to be sent now, in order; `returned` takes back what does not leave."""
@@ -497,8 +517,8 @@ class Mailbox:
             stream.last = envelope.seq
             if envelope.reliable:
                 stream.reliable = envelope.seq
-                for had in [seq for seq in stream.answers if seq <= envelope.had]:
-                    del stream.answers[had]
+                while stream.answers and (oldest := next(iter(stream.answers))) <= envelope.had:
+                    del stream.answers[oldest]
                 stream.answers[envelope.seq] = answer
                 if len(stream.answers) > WINDOW:
                     del stream.answers[next(iter(stream.answers))]

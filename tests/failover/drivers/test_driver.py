@@ -16,16 +16,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 
 import failover
+from failover.core.messaging import avro
+from failover.core.messaging import envelope as envelopes
+from failover.core.messaging.envelope import Encoding
 from failover.core.messaging.mailbox import MAILBOX_MAX
 from failover.core.naming.tree import Reach
 from failover.drivers import here as here_module
 from failover.drivers.here import Here, lives, stem
 from failover.drivers.local import LocalWay, Poller
 from failover.drivers.lookup import lookup, whole_tree
+from failover.drivers.proxy import Proxy
 from failover.drivers.server import Serving
-from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError
+from failover.errors import CallRefusedError, DriverError, EnvelopeError, NameUnknownError, NoAnswerError
 from tests.failover.drivers.devices import DEVICE_HZ, ENGINE, Arm, Engine, Slow
 from tests.failover.drivers.serving import LIMIT_S, called, serving, until
 
@@ -101,7 +106,7 @@ def test_messages_of_one_sender_are_handled_in_order_while_others_send(engine: S
 
 def test_a_large_message_and_a_large_answer_come_whole(engine: Serving, here: Here) -> None:
     from failover.core.messaging.envelope import Envelope, decode, encode
-    from failover.drivers.sending import way_to
+    from failover.drivers.route import way_to
 
     way = way_to(here, engine.service.record.addresses[0], "robot1")
     asked = Envelope(to="engine", verb="read", id="1", sender="test", rest={"note": "x" * 900_000})
@@ -116,6 +121,56 @@ def test_a_large_message_and_a_large_answer_come_whole(engine: Serving, here: He
         assert raw.recv(1) == b""  # and the driver goes on
     assert way.await_sent(encode(asked), 10**9) and way.await_message(LIMIT_S * 10**9) is not None
     way.close()
+
+
+@pytest.mark.parametrize("encoding", ["json", "msgpack", "avro"])
+def test_a_message_is_answered_in_its_encoding(engine: Serving, here: Here, encoding: Encoding) -> None:
+    if encoding == "avro":
+        pytest.importorskip("fastavro", reason="needs fastavro: the extra avro")
+    with Proxy(here, lookup(here, "engine"), encoding=encoding) as proxy:
+        came = noted_answers(proxy)
+        assert proxy.call("set", duty=0.5) is None and proxy.call("read") == {"duty": 0.5}
+        with pytest.raises(CallRefusedError, match="<= 1"):
+            proxy.call("set", duty=2)
+        assert [envelopes.encoding_of(one) for one in came] == [encoding] * 3
+        assert next(proxy.stream("current")) == 1.0
+
+
+def noted_answers(proxy: Proxy) -> list[bytes]:
+    """What comes to a proxy, as bytes."""
+    way, came = proxy._sending.route.way, []
+    await_message = way.await_message
+
+    def noted(*arguments: Any) -> bytes | None:
+        found = await_message(*arguments)
+        came.extend([found] if found is not None else [])
+        return found
+
+    way.await_message = noted  # type: ignore[method-assign]
+    return came
+
+
+def test_a_driver_that_cannot_read_an_encoding_gets_json(engine: Serving, here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fastavro", reason="needs fastavro: the extra avro")
+
+    def missing(_: bytes) -> Any:
+        raise EnvelopeError("the message is Avro, and the library fastavro is not installed here")
+
+    monkeypatch.setattr(envelopes, "_from_avro", missing)
+    with Proxy(here, lookup(here, "engine"), encoding="avro") as proxy:
+        came = noted_answers(proxy)
+        assert proxy.call("read", timeout=LIMIT_S) == {"duty": 0.0} and proxy.post("read").result(LIMIT_S) == {"duty": 0.0}
+    assert [envelopes.decode(one).error is not UNSET for one in came] == [True, False, False]
+
+
+@pytest.mark.parametrize(("encoding", "words"), [("xml", "write one of json, msgpack, avro"), ("avro", "failover\\[avro\\]")])
+def test_an_encoding_that_cannot_be_sent_is_refused(
+    engine: Serving, here: Here, encoding: Any, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "fastavro", None)
+    avro._library.cache_clear()
+    with pytest.raises(DriverError, match=words):
+        Proxy(here, lookup(here, "engine"), encoding=encoding)
 
 
 def test_a_driver_that_hangs_holds_no_caller_longer_than_its_timeout(here: Here) -> None:

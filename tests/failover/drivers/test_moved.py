@@ -26,11 +26,16 @@ TERMS = Terms(scan_ns=SECOND)
 class Arm:
     def __init__(self) -> None:
         self.heard: list[int] = []
+        self.robot = ""
 
     @failover.command
     def move(self, number: int) -> int:
         self.heard.append(number)
         return number
+
+    @failover.stream(rate_hz=100)
+    def where(self) -> str:
+        return self.robot
 
 
 @pytest.fixture
@@ -52,6 +57,7 @@ class Primacy:
 def arm(here: Here, epoch: int) -> Iterator[tuple[Serving, Primacy]]:
     primacy = Primacy(epoch)
     with taking_messages(Serving(Arm, here, TERMS, primacy)) as one:
+        one.instance.robot = here.robot
         yield one, primacy
 
 
@@ -70,6 +76,22 @@ def test_after_a_split_callers_of_the_old_copy_go_to_the_one_of_the_later_epoch(
             assert old.instance.heard == [1, 2] and new.instance.heard == list(range(3, 100))
             assert proxy.place.robot == "robot2" and not is_fenced(new)
             assert lookup(lab.here("robot1"), "arm").robot == "robot2", "the higher epoch, not the lesser name"
+
+
+@pytest.mark.parametrize("caller", ["robot1", "robot2"])
+@pytest.mark.parametrize("is_split", [True, False], ids=["replaced", "ended"])
+def test_a_stream_goes_on_at_the_copy_of_the_later_epoch(lab: Lab, caller: str, is_split: bool) -> None:
+    with contextlib.ExitStack() as first:
+        first.enter_context(arm(lab.here("robot1"), 1))
+        with Proxy(lab.here(caller), lookup(lab.here(caller), "arm")) as proxy:
+            values = proxy.stream("where")
+            until(lambda: next(values) == "robot1")
+            if not is_split:
+                first.close()
+            with arm(lab.here("robot2"), 2):
+                until(lambda: next(values) == "robot2")
+                assert [next(values) for _ in range(20)] == ["robot2"] * 20, "the old copy sends no more"
+                values.close()  # type: ignore[attr-defined]
 
 
 def test_a_message_that_names_a_later_epoch_is_refused_before_the_names_tell_of_it(lab: Lab) -> None:

@@ -16,7 +16,7 @@ import zmq
 
 from failover.core.messaging.mailbox import FLIGHT_MAX, MAILBOX_MAX
 from failover.core.naming.tree import Place
-from failover.drivers import sending
+from failover.drivers import route
 from failover.drivers.here import Here
 from failover.drivers.lookup import lookup
 from failover.drivers.name_service import new_boot
@@ -233,7 +233,7 @@ def test_a_thread_that_sends_goes_on_when_the_names_cannot_be_asked(here: Here, 
     with serving(Engine, here):
         place = lookup(here, "engine")
     with Proxy(here, place) as proxy:
-        monkeypatch.setattr(sending, "lookup", fails)
+        monkeypatch.setattr(route, "lookup", fails)
         done = proxy.post("set", duty=0.1)
         until(lambda: len(asked) >= len(errors) or done.done())
         assert not done.done()

@@ -46,6 +46,20 @@ def test_a_driver_is_found_and_called_from_another_robot(lab: Lab) -> None:
             assert proxy.call("read") == 7
 
 
+def test_an_answer_is_not_waited_for_before_its_message_has_left(lab: Lab) -> None:
+    with serving(Engine, lab.here("robot1")), called(lab.here("robot2"), "engine") as proxy:
+        way, waited = proxy._sending.route.way, []
+        await_message = way.await_message
+
+        def noted(*arguments: Any) -> bytes | None:
+            waited.append(proxy._sending._outbox.is_connected)
+            return await_message(*arguments)
+
+        way.await_message = noted  # type: ignore[method-assign]
+        assert proxy.call("read") == {"duty": 0.0}
+        assert waited and all(waited)
+
+
 def test_a_robot_without_a_driver_asks_the_others(lab: Lab) -> None:
     with serving(Engine, lab.here("robot1")), called(lab.here("robot2"), "engine") as proxy:
         assert proxy.call("read") == {"duty": 0.0}

@@ -24,7 +24,7 @@ from failover.core.messaging.envelope import Envelope, decode, encode
 from failover.core.messaging.mailbox import SENDERS_MAX
 from failover.core.programs import states
 from failover.core.programs.states import State
-from failover.drivers.sending import way_to
+from failover.drivers.route import way_to
 from failover.drivers.server import Near, Peer
 from failover.errors import BundleRefusedError, CallRefusedError, DriverError, NoAnswerError, ProgramError
 from failover.programs.carried import Carried
@@ -514,7 +514,7 @@ def test_what_expires_while_no_version_runs_is_answered_at_once(lab: Lab) -> Non
         (lab.team / "programs.toml").write_text("")
         host.actor._running._process.kill()  # type: ignore[union-attr]
         until(proxy, lambda found: "cannot be started anew" in str(found["said"]))
-        way = way_to(lab.here, proxy._sending.address, "robot1")
+        way = way_to(lab.here, proxy._sending.route.address, "robot1")
         late = Envelope(verb="step", body=1, sender="robot1/s", boot=1, seq=1, reliable=True, deadline_ms=0)
         assert way.await_sent(encode(late), 60 * 10**9)
         said = decode(way.await_message(10 * 10**9) or b"")

@@ -296,6 +296,23 @@ def test_one_that_left_and_is_never_answered_is_given_up_and_the_next_does_not_w
     assert [(one.seq, one.after) for one in outbox.due(10_000 * MS)] == [(2, 0)]
 
 
+def test_a_receiver_that_says_nothing_is_looked_up_more_and_more_seldom_and_after_a_word_as_in_the_beginning() -> None:
+    outbox = Outbox("s", 1)
+    assert not outbox.must_look(5_000 * MS), "nothing is on its way"
+    posted = outbox.post(Envelope("arm", "move", 1, reliable=True), 6_000 * MS)
+    outbox.committed()
+    assert not outbox.must_look(6_000 * MS)
+    outbox.due(6_000 * MS)
+
+    def looks(begin_ms: int, end_ms: int) -> list[int]:
+        return [at for at in range(begin_ms, end_ms, 100) if outbox.must_look(at * MS)]
+
+    assert looks(6_000, 13_000) == [6_500, 7_500, 9_500, 11_500]
+    outbox.heard(13_000 * MS)
+    assert looks(13_000, 15_000) == [13_500, 14_500]
+    assert outbox.answered(answer(posted, None), 20_000 * MS) and not outbox.must_look(30_000 * MS)
+
+
 def test_a_sender_has_no_more_on_its_way_than_the_receiver_holds() -> None:
     outbox, box = Outbox("s", 1), Mailbox()
     for number in range(WINDOW):
