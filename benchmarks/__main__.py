@@ -126,6 +126,7 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "slack": slack.slack,
     "task_times": task_times.task_times,
     "driver_call": driver_call.driver_call,
+    "messages": driver_call.messages,
 }
 
 BY_ITSELF: Final = ("load", "soak")
