@@ -1,6 +1,7 @@
-"""The driver of an Arduino that runs arduino.ino: a motor behind a pulse width modulator, at a serial port.
+"""The driver of an Arduino that runs arduino.ino: a motor behind a pulse width modulator, at a serial port or in the network.
 
     python3 pwm.py /dev/ttyACM0                    the driver, until Ctrl-C
+    python3 pwm.py tcp://192.168.0.7:7000          the same for a device in the network
     failover call arduino set '{"duty": 0.4}'      {"duty": 0.4, "pwm": 102, "moves": 1}
 
 A line of JSON goes to the device, a line comes back; no further line goes before that. A line that is not answered is sent again:
@@ -14,6 +15,7 @@ import json
 import os
 import secrets
 import select
+import socket
 import sys
 import termios
 import time
@@ -27,6 +29,8 @@ import failover
 
 LINE_SIZE_MAX: Final = 256
 """Bytes of a line to the device, without its end."""
+
+TCP: Final = "tcp://"
 
 HEARD_SIZE_MAX: Final = 4_096
 """What a device may say without an end of line before it is forgotten."""
@@ -60,8 +64,8 @@ class Answer(Struct):
     error: str | None = None
 
 
-class SerialPort:
-    """A serial port at 115200 baud that carries lines; opened by the first one, closed when the device is gone."""
+class Port:
+    """What carries lines to a device and back; opened by the first one, closed when the device is gone."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -74,31 +78,11 @@ class SerialPort:
         Raises:
             DeviceError: it cannot be opened, or another program has it.
         """
-        if self._descriptor >= 0:
-            return
-        try:
-            descriptor = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
-        except OSError as error:
-            raise DeviceError(
-                f"cannot open {self.path}: {error.strerror}; plug the device in, or start the driver with the name of its port"
-            ) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._set_up(descriptor)
-        except (OSError, termios.error) as error:
-            os.close(descriptor)
-            why = "another program uses it" if isinstance(error, BlockingIOError) else f"it is no serial port ({error})"
-            raise DeviceError(f"cannot use {self.path}: {why}") from error
-        self._descriptor, self._heard = descriptor, b""
+        if self._descriptor < 0:
+            self._descriptor, self._heard = self._opened(), b""
 
-    def _set_up(self, descriptor: int) -> None:
-        tty.setraw(descriptor, termios.TCSANOW)
-        settings = termios.tcgetattr(descriptor)
-        settings[2] = settings[2] & ~termios.HUPCL | termios.CLOCAL | termios.CREAD  # HUPCL would reset an Arduino at each end
-        settings[4] = settings[5] = termios.B115200
-        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
-        termios.tcflush(descriptor, termios.TCIOFLUSH)
-        os.write(descriptor, b"\n")  # ends a line that the driver before did not
+    def _opened(self) -> int:
+        raise NotImplementedError
 
     def close(self) -> None:
         """Let it go; the next line opens it again."""
@@ -138,11 +122,57 @@ class SerialPort:
         return bool(poll.poll(max(until_s - time.monotonic(), 0) * 1_000))
 
 
+class SerialPort(Port):
+    """A serial port at 115200 baud."""
+
+    def _opened(self) -> int:
+        try:
+            descriptor = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise DeviceError(
+                f"cannot open {self.path}: {error.strerror}; plug the device in, or start the driver with the name of its port"
+            ) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._set_up(descriptor)
+        except (OSError, termios.error) as error:
+            os.close(descriptor)
+            why = "another program uses it" if isinstance(error, BlockingIOError) else f"it is no serial port ({error})"
+            raise DeviceError(f"cannot use {self.path}: {why}") from error
+        return descriptor
+
+    def _set_up(self, descriptor: int) -> None:
+        tty.setraw(descriptor, termios.TCSANOW)
+        settings = termios.tcgetattr(descriptor)
+        settings[2] = settings[2] & ~termios.HUPCL | termios.CLOCAL | termios.CREAD  # HUPCL would reset an Arduino at each end
+        settings[4] = settings[5] = termios.B115200
+        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
+        termios.tcflush(descriptor, termios.TCIOFLUSH)
+        os.write(descriptor, b"\n")  # ends a line that the driver before did not
+
+
+class NetworkPort(Port):
+    """A TCP connection; ``path``: ``tcp://HOST:PORT``."""
+
+    def _opened(self) -> int:
+        host, _, port = self.path.removeprefix(TCP).rpartition(":")
+        try:
+            connection = socket.create_connection((host, int(port)), TRY_S)
+        except (OSError, ValueError, OverflowError) as error:
+            raise DeviceError(
+                f"cannot connect to {self.path}: {error}; switch the device on, or write tcp://HOST:PORT"
+            ) from error
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.send(b"\n")  # ends a line that the driver before did not
+        return connection.detach()
+
+
 class Device:
     """What arduino.ino understands, at one port."""
 
     def __init__(self, path: str) -> None:
-        self._port = SerialPort(path)
+        self._port = NetworkPort(path) if path.startswith(TCP) else SerialPort(path)
         self._id = secrets.randbelow(ID_MAX)  # not one that the driver before has just used
 
     def ask(self, verb: str, **fields: float) -> State:

@@ -23,6 +23,7 @@ import pytest
 
 import failover
 from examples.arduino import pwm
+from failover.cli.demo.robots import free_ports
 from failover.errors import CallRefusedError
 
 ROOT = Path(__file__).parents[2]
@@ -34,6 +35,9 @@ LIMIT_S = 100
 PORT = "ttyACM0"
 LINE_SIZE_MAX, DEPTH_MAX, ID_MAX = 256, 8, 999_999_999
 """Of command.h."""
+
+QUEUE = 500
+"""Commands that may wait for an answer: what comes in two seconds at 200 Hz, and more."""
 
 SEED = 31
 MUTATED = 4_000
@@ -376,17 +380,98 @@ def refused(proxy: failover.Proxy, verb: str, **fields: float) -> str:
     return str(error.value)
 
 
-def test_commands_at_20_hz_arrive_all_and_in_order(plug: Callable[..., Plugged], driver: Path) -> None:
-    device, count = plug(), 60
+DEVICE_S = float(os.environ.get("FAILOVER_DEVICE_S", "3"))
+"""How long commands come to a device; 600 for ten minutes."""
+
+LONG = pytest.mark.timeout(120 + 3 * DEVICE_S)
+RATE_HZ = 20
+OFFERED_HZ = 200
+
+
+class Networked(Plugged):
+    """The sketch behind a TCP port."""
+
+    def __init__(self, program: Path, folder: Path) -> None:
+        (number,) = free_ports(1)
+        self.port = folder / "none"
+        self.address = f"tcp://127.0.0.1:{number}"
+        self.log = folder / "log"
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen([program, f"tcp:{number}"], stderr=log, env=os.environ | {"PWM_MS": "50"})
+
+
+@pytest.fixture(params=["serial", "tcp"])
+def motor(
+    request: pytest.FixtureRequest, build: Build, plug: Callable[..., Plugged], driver: Path, tmp_path: Path
+) -> Iterator[Plugged]:
+    """A device that takes 50 ms a command, with its driver; the one with a TCP port has a driver of its own."""
+    if request.param == "serial":
+        yield plug()
+        return
+    request.getfixturevalue("monkeypatch").setenv("FAILOVER_DRIVERS", str(tmp_path / "m"))
+    device, told = Networked(build(), tmp_path), tmp_path / "told"
+    with told.open("wb") as file, subprocess.Popen([sys.executable, FOLDER / "pwm.py", device.address], stderr=file) as process:
+        try:
+            until(lambda: "takes messages" in told.read_text() or process.poll() is not None)
+            yield device
+        finally:
+            process.kill()
+            device.unplug()
+
+
+@LONG
+def test_commands_at_20_hz_arrive_all_and_in_order(motor: Plugged) -> None:
+    count = round(DEVICE_S * RATE_HZ)
     with failover.proxy("arduino") as arduino:
         due = time.monotonic()
         for number in range(1, count + 1):
-            told = arduino.call("set", duty=number / -100, timeout=LIMIT_S)
-            assert told == {"duty": number / -100, "pwm": (number * 255 + 50) // 100, "moves": number}
-            due += 0.05
+            duty = number % 100 / -100
+            told = arduino.call("set", duty=duty, timeout=LIMIT_S)
+            assert told == {"duty": duty, "pwm": pwm_of(duty), "moves": number}
+            due += 1 / RATE_HZ
             time.sleep(max(due - time.monotonic(), 0))  # it is offered 20 commands a second, not more
         assert arduino.call("read", timeout=LIMIT_S) == told
-    assert device.moved() == [-((number * 255 + 50) // 100) for number in range(1, count + 1)]
+    assert [abs(one) for one in motor.moved()] == [pwm_of(number % 100 / 100) for number in range(1, count + 1)]
+
+
+def pwm_of(duty: float) -> int:
+    """What the motor is told."""
+    return (round(abs(duty) * 100) * 255 + 50) // 100
+
+
+@LONG
+def test_of_commands_at_200_hz_none_is_lost_and_each_sender_is_told_into_which_its_own_was_merged(motor: Plugged) -> None:
+    count = round(DEVICE_S * OFFERED_HZ)
+    told: dict[int, list[dict[str, Any]]] = {}
+    moves: list[dict[str, Any]] = []
+
+    def offer(place: int) -> None:
+        with failover.proxy("arduino", queue=QUEUE) as arduino:
+            done, due = [], time.monotonic()
+            for number in range(count // 2):
+                while len(done) >= QUEUE and not done[-QUEUE].done():
+                    time.sleep(0.001)
+                done.append(arduino.post("set", duty=number % 100 / 100))
+                due += 2 / OFFERED_HZ
+                time.sleep(max(due - time.monotonic(), 0))
+            told[place] = [one.result(LIMIT_S) for one in done]
+            moves.append(arduino.call("read", timeout=LIMIT_S))
+
+    threads = [threading.Thread(target=offer, args=(place,)) for place in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    carried = sorted((one for one in (*told[0], *told[1]) if "moves" in one), key=lambda one: one["moves"])
+    merged = [one for one in (*told[0], *told[1]) if "merged_into" in one]
+    assert len(carried) + len(merged) == 2 * (count // 2) and len(merged) > len(carried)
+    assert [one["moves"] for one in carried] == list(range(1, len(carried) + 1))
+    assert motor.moved() == [one["pwm"] for one in carried], "the device was told what each sender was told"
+    assert max(one["moves"] for one in moves) == len(carried)
+    for place in range(2):
+        own = [number for number, one in enumerate(told[place]) if "moves" in one]
+        values = [told[place][number]["duty"] for number in own]
+        assert values == [number % 100 / 100 for number in own], "each that was carried out has its own value"
 
 
 def typed(hand: Path, sender: str, count: int) -> list[dict[str, Any]]:
