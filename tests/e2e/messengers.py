@@ -1,4 +1,4 @@
-"""A driver that keeps a ledger of what it was told, and who tells it: ``python messengers.py … driver …`` and ``… sender …``."""
+"""A driver that keeps a ledger of what it was told, who tells it, and a lamp: ``python messengers.py … driver …`` and so on."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SENDER_SHIFT: Final = 24
 PAGE: Final = 10_000
 """Entries of one answer."""
 
-QUEUE: Final = 20
+QUEUE: Final = 64
 LIMIT: Final = "limit"
 PAUSE_S: Final = 0.005
 
@@ -71,19 +71,32 @@ def drive(room: str) -> None:
     failover.run(Ledger)
 
 
+def shine(name: str) -> None:
+    """Be a driver of this robot alone, without an agent."""
+
+    @failover.driver(f"Lab/{os.environ[ROBOT]}/{name}")
+    class Lamp:
+        @failover.query
+        def read(self) -> str:
+            return name
+
+    failover.run(Lamp)
+
+
 def send(number: str, count: str, record: str) -> None:
     """Post numbers up to the limit beside the record; note beforehand what is posted, then what came of it."""
     sender = int(number)
     file = os.open(record, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
-    first = 1 + max((one for kind, one, _ in noted(Path(record)) if kind == "posted"), default=0)
+    first = 1 + max((one for kind, one, _ in Record(Path(record)).read().lines if kind == "posted"), default=0)
     while True:
         try:
             proxy = failover.proxy("ledger", sender=f"s{sender}", queue=QUEUE)
             break
         except NameUnknownError:
             time.sleep(PAUSE_S)
+    limit, allowed = Path(record).parent / LIMIT, 0
     for message in range(first, int(count) + 1):
-        while message > int((Path(record).parent / LIMIT).read_text()):
+        while message > allowed and message > (allowed := int(limit.read_text())):
             time.sleep(PAUSE_S)
         os.write(file, f"posted {message} 0\n".encode())
         while True:
@@ -104,18 +117,45 @@ def _note(file: int, message: int, future: Future[Any]) -> None:
         os.write(file, f"{getattr(error, 'kind', 'unanswered')} {message} 0\n".encode())
 
 
-def noted(record: Path) -> list[tuple[str, int, int]]:
-    """What a sender has written: (what, message, place in the ledger)."""
-    with contextlib.suppress(FileNotFoundError):
-        lines = [line.split() for line in record.read_text().splitlines()]
-        return [(kind, int(message), int(place)) for kind, message, place in lines]
-    return []
+class Record:
+    """What a sender has written; only what is new is read.
+
+    Attributes:
+        lines: (what, message, place in the ledger).
+        answered: the newest message that was carried out, as the sender was told.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._at = 0
+        self.lines: list[tuple[str, int, int]] = []
+        self.answered = 0
+        self.is_done = False
+
+    def read(self) -> Record:
+        """Take in the whole lines that have come since the last time."""
+        with contextlib.suppress(FileNotFoundError), self._path.open("rb") as file:
+            file.seek(self._at)
+            content = file.read()
+            content = content[: content.rfind(b"\n") + 1]
+            self._at += len(content)
+            for line in content.decode().splitlines():
+                kind, message, place = line.split()
+                self.lines.append((kind, int(message), int(place)))
+                self.is_done |= kind == "done"  # the last answer may be noted after it
+                if kind == "ok":
+                    self.answered = max(self.answered, int(message))
+        return self
+
+    def oks(self) -> list[tuple[int, int]]:
+        """(message, place) of the messages that were carried out, as the sender was told."""
+        return [(message, place) for kind, message, place in self.lines if kind == "ok"]
 
 
 def main(stage: str, directories: str, address: str, role: str, *arguments: str) -> None:
-    """As a driver or a sender, on whichever robot this is."""
+    """As a driver, a sender or a lamp, on whichever robot this is."""
     be_on(Path(stage), Path(directories), address)
-    {"driver": drive, "sender": send}[role](*arguments)
+    {"driver": drive, "sender": send, "lamp": shine}[role](*arguments)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Ten senders on two robots tell a driver that keeps its state, over cut cables, deaths of both ends and a takeover.
+"""Ten senders on two robots tell a driver that keeps its state, over cut cables, deaths of both ends, a takeover, and a split.
 
 Then the driver's own ledger and the senders' records are compared: order of each sender, none twice, none lost that was answered.
 FAILOVER_MESSAGES says how many messages there are, 1000 unless it is set.
@@ -6,6 +6,7 @@ FAILOVER_MESSAGES says how many messages there are, 1000 unless it is set.
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -13,13 +14,14 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from failover.cli.demo.robots import Pace, RobotMachine
 from failover.drivers.here import DIRECTORY, ROBOT, TEAM
 from tests.e2e import robots
-from tests.e2e.messengers import LIMIT, SENDER_SHIFT, noted
+from tests.e2e.messengers import LIMIT, PATH, SENDER_SHIFT, Record
 from tests.e2e.test_links import TWO, links
 
 AHEAD = 0.05
@@ -53,6 +55,7 @@ class Field:
         self.dice = random.Random(SEED)
         self.place_of = {number: pair[number % 2] for number in range(SENDERS)}
         self.kills: Counter[str] = Counter()
+        self._records = {number: Record(self.record(number)) for number in range(SENDERS)}
         self.allow(0)
         for robot in pair:
             (directory / robot.name).mkdir(mode=0o700)
@@ -67,6 +70,10 @@ class Field:
         command = self.command("driver", str(ROOM))
         robots.run(self.first, "ledger", *command, engine="cooperative", env=environment)
 
+    def shine(self, robot: RobotMachine, name: str) -> None:
+        """Start a driver on a robot, without its agent."""
+        robots.start_inside(robot, "env", f"PYTHONPATH={ROOT}", *self.command("lamp", name, at=robot.name))
+
     def record(self, number: int) -> Path:
         return self.directory / f"s{number}"
 
@@ -75,8 +82,12 @@ class Field:
         command = self.command("sender", str(number), str(count), str(self.record(number)), at=self.place_of[number].name)
         robots.start_inside(self.place_of[number], "env", f"PYTHONPATH={ROOT}", *command)
 
+    def noted(self, number: int) -> Record:
+        """What a sender has noted until now."""
+        return self._records[number].read()
+
     def is_done(self, number: int) -> bool:
-        return ("done", 0, 0) in noted(self.record(number))  # the last answer may be noted after it
+        return self.noted(number).is_done
 
     def replace(self, number: int) -> None:
         """Kill a sender, and start it again; if it has ended, it stays."""
@@ -84,6 +95,10 @@ class Field:
         if robots.until(lambda: [*_processes(robot, what)] or self.is_done(number), f"{what} to run") is not True:
             self._kill(robot, what)
             self.begin(number)
+
+    def end_sender(self, number: int) -> None:
+        """Kill a sender for good."""
+        self._kill(self.place_of[number], f"sender {number} ")
 
     def kill_driver(self) -> None:
         """Kill it on the first robot, whose agent starts it again."""
@@ -96,14 +111,10 @@ class Field:
             robots.until(lambda pid=pid: robots.has_ended(pid), f"{what} to end")  # type: ignore[misc]
             self.kills[what.split()[0]] += 1
 
-    def oks(self, number: int) -> list[tuple[int, int]]:
-        """(message, place) of a sender's messages that were carried out, as it was told."""
-        return [(message, place) for kind, message, place in noted(self.record(number)) if kind == "ok"]
-
     @property
     def progress(self) -> float:
         """The part of all messages that the newest answer of each sender has reached."""
-        return sum(max((message for message, _ in self.oks(number)), default=0) for number in range(SENDERS)) / MESSAGES
+        return sum(self.noted(number).answered for number in range(SENDERS)) / MESSAGES
 
     def allow(self, message: int) -> None:
         """Let each sender post up to this message."""
@@ -127,18 +138,36 @@ class Field:
     def ledger(self, robot: RobotMachine) -> list[tuple[int, int]]:
         """What the driver has in its state: (sender, message), in order."""
         script = (
-            "import sys, json; sys.path.insert(0, sys.argv.pop(1)); from pathlib import Path; from tests.e2e import messengers\n"
-            "messengers.be_on(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]); import failover; found = []\n"
+            "import failover; found = []\n"
             "with failover.proxy('ledger') as proxy:\n"
             "    while page := proxy.call('read', begin=len(found), timeout=60): found += page\n"
-            "Path(sys.argv[4]).write_text(json.dumps(found)); Path(sys.argv[4]).rename(sys.argv[5])\n"
         )
-        command = [sys.executable, "-c", script, str(ROOT), *self.command(at=robot.name)[2:]]
-        written, found = self.directory / "written", self.directory / "found"
-        robots.start_inside(robot, *command, str(written), str(found))
-        robots.until(found.exists, "the ledger to be read", PATIENCE_S)
-        entries = [int(one) for one in found.read_text().strip("[]").split(",")]
+        entries = self.said(robot, script)
         return [(one >> SENDER_SHIFT, one & (1 << SENDER_SHIFT) - 1) for one in entries]
+
+    def said(self, robot: RobotMachine, script: str) -> Any:
+        """What a program on that robot leaves in ``found``."""
+        begun = (
+            "import sys, json; sys.path.insert(0, sys.argv.pop(1)); from pathlib import Path; from tests.e2e import messengers\n"
+            "messengers.be_on(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3])\n"
+        )
+        ended = "Path(sys.argv[4]).write_text(json.dumps(found)); Path(sys.argv[4]).rename(sys.argv[5])\n"
+        command = [sys.executable, "-c", begun + script + ended, str(ROOT), *self.command(at=robot.name)[2:]]
+        written, found = self.directory / "written", self.directory / "found"
+        found.unlink(missing_ok=True)
+        robots.start_inside(robot, *command, str(written), str(found))
+        robots.until(found.exists, "a program to say what it found", PATIENCE_S)
+        return json.loads(found.read_text())
+
+    def names(self, robot: RobotMachine) -> dict[str, tuple[str, str, int]]:
+        """What each path leads to as that robot knows it: the robot, whether it is live, its epoch."""
+        script = (
+            "from failover.drivers.here import here; from failover.drivers.lookup import whole_tree; tree = whole_tree(here())\n"
+            "found = [(one.record.path, one.robot, str(one.reach), one.record.epoch)\n"
+            "         for one in (tree.claimants(place.record.path)[0] for place in tree.under())]\n"
+        )
+        told = cast("list[tuple[str, str, str, int]]", self.said(robot, script))
+        return {path: (at, reach, epoch) for path, at, reach, epoch in told}
 
 
 def _processes(robot: RobotMachine, what: str) -> Iterator[int]:
@@ -193,7 +222,7 @@ def check(field: Field, ledger: list[tuple[int, int]]) -> None:
     for number in range(SENDERS):
         told = [message for sender, message in ledger if sender == number]
         assert told == sorted(told), f"messages of sender {number} are not in order"
-        lives = noted(field.record(number))
+        lives = field.noted(number).lines
         assert {message for kind, message, _ in lives if kind == "posted"} == set(range(1, MESSAGES // SENDERS + 1))
         for kind, message, place in lives:
             assert kind in ("posted", "ok", "done"), f"sender {number}, message {message}: {kind}"
@@ -212,6 +241,83 @@ def test_of_all_messages_none_is_lost_or_doubled_or_overtakes(tmp_path: Path, tm
         play(field)
         ledger = field.ledger(field.second)
         check(field, ledger)
-        answered = sum(len(field.oks(number)) for number in range(SENDERS))
+        answered = sum(len(field.noted(number).oks()) for number in range(SENDERS))
         print(f"{len(ledger)} messages carried out, {answered} answered; kills: {dict(field.kills)}")
     assert answered > MESSAGES / 2 and field.kills["driver"] == 2 and field.kills["sender"] > SENDERS / 2
+
+
+LAMPS = (("robot1", "Lamp"), ("robot2", "Lamp"), ("robot2", "New"))
+MORE = 20
+"""Messages that show that a copy of the driver goes on."""
+
+
+class Split:
+    """Two senders, one on each side, of a driver whose robots do not hear each other for a while."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.allowed = 0
+        for number in range(2):
+            field.begin(number, ROOM)
+
+    def answered(self) -> list[int]:
+        return [len(self.field.noted(number).oks()) for number in range(2)]
+
+    def until_more(self, what: str) -> None:
+        """Until each sender has answers to messages that it may post only now."""
+        begun, self.allowed = self.allowed, self.allowed + 2 * MORE
+        self.field.allow(self.allowed)
+        robots.until(lambda: all(self.field.noted(number).answered > begun + MORE for number in range(2)), what)
+
+    def cables(self, state: str) -> None:
+        for name, _ in TWO:
+            robots.cable(self.field.first, state, name)
+
+    def end(self) -> None:
+        for number in range(2):
+            self.field.end_sender(number)
+
+
+def test_after_a_split_each_name_is_right_and_no_message_is_doubled(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    with robots.two_robots(tmp_path, cables=TWO, pace=PACE) as pair:
+        field = Field(pair, tmp_path_factory.mktemp("m"))
+        first, second = pair
+        field.drive()
+        field.shine(first, "Lamp")
+        field.shine(second, "Lamp")
+        split = Split(field)
+        split.until_more("answers")
+        robots.until_protected(first, "ledger")
+        before = split.answered()
+        split.cables("down")
+        robots.until_taken_over(second, "ledger")
+        split.until_more("answers of each copy to its own side")
+        field.shine(second, "New")
+        robots.until(lambda: "Lab/robot2/New" in field.names(second), "a driver that begins in the split to be known on its side")
+        epoch = field.names(second)[PATH][2]
+        split.cables("up")
+        robots.until(lambda: robots.component(second, "ledger").get("role") == "standby", "one copy to stay")
+        after = split.allowed
+        split.until_more("answers of the copy that stays to both")
+        for robot in pair:
+            robots.until(lambda at=robot: _are_right(field.names(at), epoch), f"{robot.name} to know each name")  # type: ignore[misc]
+        split.end()
+        ledger = field.ledger(first)
+    assert len(set(ledger)) == len(ledger), "a message was carried out twice"
+    for number in range(2):
+        told = [message for sender, message in ledger if sender == number]
+        assert told == sorted(told), f"messages of sender {number} are not in order"
+        oks = field.noted(number).oks()
+        stays = oks if number == 0 else [one for place, one in enumerate(oks) if place < before[1] or one[0] > after]
+        assert len(stays) > MORE
+        for message, place in stays:
+            assert ledger[place - 1] == (number, message), f"answered, and not in the ledger: {number}, {message}"
+
+
+def _are_right(names: dict[str, tuple[str, str, int]], epoch: int) -> bool:
+    """Each name leads to a living driver, and the ledger's to the copy that never stopped, whose epoch is later again."""
+    ledger = names.pop(PATH, ("", "", 0))
+    lamps = {f"Lab/{robot}/{name}": (robot, "live", 0) for robot, name in LAMPS}
+    return ledger[:2] == ("robot1", "live") and ledger[2] > epoch and names == lamps
