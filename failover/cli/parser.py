@@ -31,7 +31,8 @@ Files and environment:
   $FAILOVER_SOCKET                 the agent's control socket; without it $XDG_RUNTIME_DIR/failover/control.sock if that is
                                    there, else /run/failover/control.sock
   /etc/failover/agent.toml         the agent's configuration, every key with its default
-  /etc/failover/team               who belongs (team.toml, the same on every robot) and this robot's secret key
+  /etc/failover/team               who belongs (team.toml, the same on every robot) and this robot's secret key;
+                                   $FAILOVER_TEAM names another place
   /var/lib/failover                snapshots and streams
   $NO_COLOR                        no colours
 """

@@ -48,6 +48,9 @@ TURN_MAX: Final = 256
 UNSENT_MAX: Final = 4 << 20
 """Bytes of answers that wait for one who does not read; then the connection is closed."""
 
+BY_HAND_NUMBERS: Final = 1_000_000_000
+"""Of messages of other robots that name no sender."""
+
 HANDS_MAX: Final = 64
 """Connections of people at once."""
 
@@ -347,6 +350,8 @@ class Serving:
             self._publish(whose, Envelope(error=Fault("no_message", str(error))))
             return
         self._note_encoding(whose, envelopes.encoding_of(content))
+        if robot is not None and not envelope.sender:
+            envelope = msgspec.structs.replace(envelope, sender=f"{robot}/by-hand-{hash(whose) % BY_HAND_NUMBERS}")
         if robot is not None and robot_of(envelope.sender) != robot:
             self._publish(
                 whose,

@@ -227,8 +227,9 @@ class Store:
         """
         found = self.find(name)
         if found is None:
-            known = ", ".join(one.name for one in self.shelves()) or "none"
-            raise ProgramError(f"no program {name!r} is here, but {known}; failover program send brings one")
+            known = ", ".join(one.name for one in self.shelves())
+            there = f"here are {known}" if known else "none is here"
+            raise ProgramError(f"no program {name!r} is here ({there}); failover program send brings one")
         return found
 
     def shelves(self) -> list[Shelf]:

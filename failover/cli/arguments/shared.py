@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from textwrap import dedent
 from typing import Any, Final
 
@@ -70,7 +71,10 @@ def add_pid(room: argparse._ActionsContainer, optional: bool = False) -> None:
 def add_team_directory(room: argparse.ArgumentParser) -> None:
     """--directory: where the team file is."""
     room.add_argument(
-        "--directory", metavar="DIR", default="/etc/failover/team", help="the team directory (default: %(default)s)"
+        "--directory",
+        metavar="DIR",
+        default=os.environ.get("FAILOVER_TEAM") or "/etc/failover/team",
+        help="the team directory (default: $FAILOVER_TEAM, else /etc/failover/team)",
     )
 
 

@@ -18,7 +18,7 @@ from failover.cli.output import render
 from failover.core.naming.tree import Place as NamedPlace
 from failover.core.programs import bundle, states
 from failover.core.programs.states import Shelf, Standing
-from failover.drivers.here import here
+from failover.drivers.here import here, lives
 from failover.drivers.lookup import lookup
 from failover.drivers.proxy import Proxy
 from failover.errors import CallRefusedError, DriverError, NameUnknownError, NoAnswerError, ProgramError
@@ -102,11 +102,9 @@ def send(arguments: argparse.Namespace) -> int:
     found = store.take(packing.read_file(Path(arguments.file)), Path(arguments.directory))
     said = found.program.manifest
     told = {"name": said.name, "version": said.version, "digest": found.program.digest, "owner": found.owner}
-    return _told(
-        arguments,
-        told,
-        f"{said.name} {said.version} is staged, signed by {found.owner}; failover program switch {said.name} {said.version}",
-    )
+    is_running = lives(here(), said.path)
+    then = f"failover program switch {said.name} {said.version}" if is_running else f"failover program run {said.name}"
+    return _told(arguments, told, f"{said.name} {said.version} is staged, signed by {found.owner}; {then}")
 
 
 def _sent_to(arguments: argparse.Namespace) -> int:
@@ -168,7 +166,7 @@ def show(arguments: argparse.Namespace) -> int:
         print(
             f"  {render.spoken(one['trouble'] or 'no host runs it')}"
             if host is None
-            else f"  pid {host['pid']}; {_enforcement(host)}"
+            else f"  pid {host['pid']}{one['elsewhere']}; {_enforcement(host)}"
         )
     if not found:
         print(f"no program is in {store.place}; failover program send brings one")
@@ -180,11 +178,16 @@ def _enforcement(host: dict[str, Any]) -> str:
 
 
 def _with_host(shelf: Shelf) -> dict[str, Any]:
-    """A shelf with what its host tells. ``trouble``: why nothing is known of a host that may be there."""
-    told: dict[str, Any] = msgspec.to_builtins(shelf)
+    """A shelf with what its host tells.
+
+    ``trouble``: why nothing is known of a host that may be there; ``elsewhere``: " on ROBOT" of one on another robot.
+    """
+    told: dict[str, Any] = msgspec.to_builtins(shelf) | {"elsewhere": ""}
     try:
         with _host(shelf.path) as proxy:
-            return told | {"host": msgspec.to_builtins(proxy.told("_versions", Standing, timeout=1.0)), "trouble": ""}
+            standing = msgspec.to_builtins(proxy.told("_versions", Standing, timeout=1.0))
+            robot = proxy.place.robot
+            return told | {"host": standing, "trouble": "", "elsewhere": f" on {robot}" if robot != proxy.here.robot else ""}
     except (NameUnknownError, NoAnswerError):
         return told | {"host": None, "trouble": ""}
     except (CallRefusedError, DriverError) as error:

@@ -149,6 +149,13 @@ def test_a_robot_cannot_speak_for_another_one(lab: Lab) -> None:
         assert answer is not None and answer.error.kind == "wrong_sender"  # type: ignore[union-attr]
 
 
+def test_a_message_that_a_person_writes_on_another_robot_needs_no_sender(lab: Lab) -> None:
+    with serving(Engine, lab.here("robot1")) as engine:
+        answer = asked(lab.here("robot2"), address_of(engine), "robot1", Envelope(verb="read"))
+        assert answer is not None and answer.ok == {"duty": 0.0} and answer.to.startswith("robot2/by-hand-")
+        assert [row["from"] for row in engine._actor._graph(Envelope(), engine.now_ns())] == ["robot2/by-hand"]
+
+
 def test_without_a_key_no_port_is_open(here: Here) -> None:
     with serving(Engine, here) as engine:
         assert [address.partition(":")[0] for address in engine.service.record.addresses] == ["local", "unix"]
