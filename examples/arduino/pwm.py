@@ -65,7 +65,13 @@ class Answer(Struct):
 
 
 class Port:
-    """What carries lines to a device and back; opened by the first one, closed when the device is gone."""
+    """What carries lines to a device and back; opened by the first one, closed when the device is gone.
+
+    Attributes:
+        ends_in_silence: a device that does not answer may be gone without a word: its port is opened anew.
+    """
+
+    ends_in_silence = False
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -154,17 +160,19 @@ class SerialPort(Port):
 class NetworkPort(Port):
     """A TCP connection; ``path``: ``tcp://HOST:PORT``."""
 
+    ends_in_silence = True
+
     def _opened(self) -> int:
         host, _, port = self.path.removeprefix(TCP).rpartition(":")
         try:
             connection = socket.create_connection((host, int(port)), TRY_S)
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.send(b"\n")  # ends a line that the driver before did not
         except (OSError, ValueError, OverflowError) as error:
             raise DeviceError(
                 f"cannot connect to {self.path}: {error}; switch the device on, or write tcp://HOST:PORT"
             ) from error
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.send(b"\n")  # ends a line that the driver before did not
         return connection.detach()
 
 
@@ -195,6 +203,8 @@ class Device:
                 return answer.ok
             if answer is not None:
                 raise DeviceError(f"the device at {self._port.path} refused {line.decode()}: {answer.error}")
+            if self._port.ends_in_silence:
+                self._port.close()
         raise DeviceError(
             f"the device at {self._port.path} did not answer {line.decode()}, sent {TRIES} times: "
             "is arduino.ino on it, and the cable whole?"

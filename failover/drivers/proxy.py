@@ -95,7 +95,8 @@ class Proxy:
             raise DriverError(f"sender={sender[:64]!r} cannot name a program: write visible characters without /, 200 at most")
         program = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python").stem
         self.sender = f"{here.robot}/{sender or f'{program}-{os.getpid()}-{next(_NUMBERS)}'}"
-        self._by = accounts.name_of(os.geteuid()) if place.robot != here.robot else ""
+        self._by = accounts.name_of(os.geteuid())
+        """For a driver at another robot, now or after it has moved; one at this robot believes the kernel."""
         self._sending = sending(here, place, self.sender, queue, encoding)
         self._posting: Posting | None = None
         self._lock = threading.RLock()
@@ -211,7 +212,7 @@ class Proxy:
         deadline_ms = None if deadline_s is None else deadline_s * 1_000
         hops = (Hop(self.sender, self.now_ns()),)
         found = Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
-        envelopes.check_size(found, NUMBERS_SIZE)
+        envelopes.check_size(found, NUMBERS_SIZE, self._sending.encoding)
         return found
 
     def told(self, verb: str, kind: type[T], body: Any = None, /, *, timeout: float = TIMEOUT_S) -> T:
@@ -282,7 +283,7 @@ class Proxy:
             raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
         number = f"{self.sender}-{next(_NUMBERS)}"
         asked = Envelope(to=self.path, verb="_subscribe", body={"stream": name}, sender=number, by=self._by, id=number)
-        with Streaming(Route(self.here, self.place), asked, name) as streaming:
+        with Streaming(Route(self.here, self.place), asked, name, self._sending.encoding) as streaming:
             yield from streaming.values()
 
 

@@ -51,7 +51,7 @@ class Sending:
         Raises:
             DriverError: the driver is on another robot that cannot be reached.
         """
-        self._encoding: Encoding = encoding
+        self.encoding: Encoding = encoding
         self.route = Route(here, place)
         self.path = self.route.path
         self.now_ns = self.route.now_ns
@@ -102,7 +102,7 @@ class Sending:
             return over
         if not self._is_open(until_ns, wake):
             return []
-        self._send_due()
+        self._send_due(until_ns)
         if not self._outbox.is_connected:
             return []
         now_ns = self.now_ns()
@@ -121,8 +121,8 @@ class Sending:
         with self._lock:
             self._outbox.heard(self._heard_ns)
         kind = "" if answer.error is UNSET else answer.error.kind
-        if kind == "no_message" and self._encoding != "json":
-            self._encoding = "json"
+        if kind == "no_message" and self.encoding != "json":
+            self.encoding = "json"
             with self._lock:
                 self._outbox.connected(self._heard_ns)  # all that has no answer is sent again
             return []
@@ -172,11 +172,11 @@ class Sending:
             self._outbox.returned(unsent)
         self._look_ns = self.now_ns() + self._pause_ns
 
-    def _send_due(self) -> None:
+    def _send_due(self, until_ns: int) -> None:
         now_ns = self.now_ns()
         with self._lock:
             is_silent = self._outbox.must_look(now_ns)
-        if is_silent and self._look_again(now_ns + LOOK_NS):
+        if is_silent and self._look_again(min(until_ns, now_ns + LOOK_NS)):
             self._disconnected()
             return
         with self._lock:
@@ -192,7 +192,7 @@ class Sending:
         """As it leaves now. Of one that is sent again the first stamp stays."""
         if self._epoch:
             one = msgspec.structs.replace(one, epoch=self._epoch)
-        return envelopes.encode(envelopes.left(one, self.now_ns()), self._encoding)
+        return envelopes.encode(envelopes.left(one, self.now_ns()), self.encoding)
 
     def _look_again(self, until_ns: int) -> bool:
         """It does not answer: whether it was found at another address."""

@@ -330,6 +330,7 @@ class Serving:
         found = connection.receive()
         if found is None:
             del self._near[near]
+            self._encodings.pop(near, None)
             self._close(near.descriptor)
             connection.close()
             return
@@ -372,6 +373,7 @@ class Serving:
 
     def _note_encoding(self, whose: Whose, encoding: Encoding) -> None:
         if encoding != "json":
+            self._encodings.pop(whose, None)  # the one that wrote last is forgotten last
             self._encodings[whose] = encoding
             if len(self._encodings) > SENDERS_MAX:
                 del self._encodings[next(iter(self._encodings))]

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import UNSET
 
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.envelope import Encoding, Envelope
 from failover.core.messaging.mailbox import MOVED, MS
 from failover.drivers.actor import LEASE_NS
 from failover.drivers.route import Route
@@ -31,15 +31,17 @@ LINGER_MS: Final = 100
 class Streaming:
     """One stream of one driver; a context manager, whose end tells the driver to send no more."""
 
-    def __init__(self, route: Route, asked: Envelope, name: str) -> None:
+    def __init__(self, route: Route, asked: Envelope, name: str, encoding: Encoding) -> None:
         """
         Args:
             route: for this stream alone; closed with it.
             asked: the ``_subscribe`` that asks for it.
+            encoding: of what is asked, and so of the values.
         """
         self._route = route
         self._asked = asked
         self._name = name
+        self._encoding = encoding
         self._again_ns = 0
         self._heard_ns = 0
         self._look_ns = 0
@@ -50,7 +52,8 @@ class Streaming:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(EnvelopeError):
-            self._route.way.send(envelopes.encode(msgspec.structs.replace(self._asked, verb="_unsubscribe", id="")))
+            farewell = msgspec.structs.replace(self._asked, verb="_unsubscribe", id="")
+            self._route.way.send(envelopes.encode(farewell, self._encoding))
         self._route.close(LINGER_MS)
 
     def values(self) -> Iterator[Any]:
@@ -80,7 +83,7 @@ class Streaming:
 
     def _ask(self, now_ns: int) -> None:
         epoch = self._route.place.record.epoch
-        content = envelopes.encode(msgspec.structs.replace(self._asked, epoch=epoch))
+        content = envelopes.encode(msgspec.structs.replace(self._asked, epoch=epoch), self._encoding)
         self._heard_ns = now_ns
         if self._route.way.await_sent(content, SECOND_NS):
             self._again_ns = now_ns + ASK_NS
@@ -103,7 +106,9 @@ class Streaming:
                 raise refused(value)
             return True
         if value.error is not UNSET:
-            if value.error.kind in MOVED:
+            if value.error.kind == "no_message" and self._encoding != "json":
+                self._encoding, self._again_ns = "json", 0
+            elif value.error.kind in MOVED:
                 self._look(self._route.now_ns())
             elif value.error.kind == "denied":
                 raise refused(value)

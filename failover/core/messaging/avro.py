@@ -66,12 +66,17 @@ _MISREAD: Final = (EOFError, ValueError, LookupError, TypeError, OverflowError, 
 """What the library raises at bytes that are none of its own."""
 
 
+READS_MAX: Final = 1 << 15
+"""Reads of one message: the library reads a number byte by byte. All known fields, the most hops, and 2,000 further fields."""
+
+
 class _Read:
-    """Bytes as the library reads a file; it is never given more than there are."""
+    """Bytes as the library reads a file; it is never given more than there are, nor for ever in small pieces."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
         self._at = 0
+        self._reads = 0
 
     @property
     def left(self) -> int:
@@ -80,6 +85,9 @@ class _Read:
     def read(self, size: int) -> bytes:
         if not 0 <= size <= self.left:
             raise EOFError(f"{size} bytes are announced, and {self.left} are left")
+        self._reads += 1
+        if self._reads > READS_MAX:
+            raise EOFError(f"it holds too many fields: send what has more than {READS_MAX // 16:,} as JSON")
         self._at += size
         return self._content[self._at - size : self._at]
 

@@ -26,6 +26,7 @@ ELEMENTS_MAX: Final = 1 << 16
 """Values of one message: it is decoded within milliseconds."""
 
 INTEGER_MAX: Final = 1 << 53
+STAMP_MAX: Final = (1 << 63) - 1
 """Larger integers are not the same in every language; who needs them writes them as text. Source: RFC 8259, section 6."""
 
 TEXT_MAX: Final = 512
@@ -405,30 +406,39 @@ def check_hops(hops: tuple[Hop, ...]) -> None:
             if isinstance(stamp, int):
                 if not -INTEGER_MAX <= stamp <= INTEGER_MAX:
                     raise EnvelopeError(f"the message holds the integer {stamp}: above 2^53 it must be written as text")
-            elif isinstance(stamp, str) and not (stamp.isascii() and stamp.isdigit() and len(stamp) < 20):
+            elif isinstance(stamp, str) and not (
+                stamp.isascii() and stamp.isdigit() and len(stamp) < 20 and int(stamp) <= STAMP_MAX
+            ):
                 raise EnvelopeError(f"the message has the stamp {stamp[:40]!r}: write nanoseconds, from 2^53 on as text")
 
 
 # --- Answers and hops -------------------------------------------------------------------------------------------------
 
 
-def check_size(envelope: Envelope, room: int) -> None:
+def check_size(envelope: Envelope, room: int, encoding: Encoding = "json") -> None:
     """Refuse what every receiver refuses unread, before it is sent again and again.
 
     Args:
         room: bytes that the message still needs, for what its sender writes into it.
+        encoding: in which it leaves; in JSON, too, where its receiver cannot read that.
 
     Raises:
         EnvelopeError: it is too large, or a name in it is.
     """
     _check_head(envelope)
-    if (size := len(encode(envelope)) + room) > MESSAGE_SIZE_MAX:
+    if (size := max(len(encode(envelope, one)) for one in {"json", encoding}) + room) > MESSAGE_SIZE_MAX:
         raise EnvelopeError(f"the message has {size} bytes, {MESSAGE_SIZE_MAX} are the most; send the name of a file instead")
 
 
 def encode_answer(said: Envelope, encoding: Encoding = "json") -> bytes:
-    """An answer's bytes; where these are more than a message has: those of a refusal of the kind ``bad_result``."""
-    content = encode(said, encoding)
+    """An answer's bytes, in JSON where the encoding cannot hold it.
+
+    Where these are more than a message has: those of a refusal of the kind ``bad_result``.
+    """
+    try:
+        content = encode(said, encoding)
+    except EnvelopeError:  # a number that Avro has no room for
+        encoding, content = "json", encode(said)
     if len(content) <= MESSAGE_SIZE_MAX:
         return content
     why = f"its answer has {len(content)} bytes, and a message has {MESSAGE_SIZE_MAX} at most: have it return the name of a file"

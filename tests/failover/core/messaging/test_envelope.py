@@ -128,6 +128,7 @@ def test_no_bytes_raise_anything_but_a_sentence(content: bytes) -> None:
         (b'{"\\u0000rest":{"to":"x"}}', "visible characters"),
         (b'{"\\u007frest":{"to":"x"}}', "visible characters"),
         (b'{"hops":[["a","x",null]]}', "the stamp"),
+        (b'{"hops":[["a","9223372036854775808",null]]}', "the stamp"),
         (b'{"from":"' + b"-1" * 257 + b'"}', "of 514 characters; 512 are the most"),
         (b'{"verb":"set","id":"' + b"x" * 513 + b'"}', "of 513 characters"),
         (b'{"hops":[["' + b"x" * 513 + b'",1,2]]}', "a hop whose name has 513 characters"),
@@ -271,6 +272,7 @@ def bad_avro() -> list[tuple[bytes, str]]:
         (avro.write({**empty, "body": "9007199254740993"}), "above 2\\^53"),
         (avro.write({**empty, "seq": -1}), "negative"),
         (avro.write({**empty, "deadline_ms": float("inf")}), "not finite"),
+        (avro.write({**empty, "hops": [{"who": "", "came": 1, "left": None}] * 20_000}), "too many fields"),
     ]
 
 
@@ -295,6 +297,25 @@ def test_no_avro_raises_anything_but_a_sentence(content: bytes, rolled: random.R
         except EnvelopeError as error:
             sentence = str(error)
         assert sentence.startswith("the message")
+
+
+@needs_avro
+def test_an_answer_that_avro_has_no_room_for_leaves_as_json() -> None:
+    said = Envelope("a", re="1", ok=None, hops=(Hop("r", str(1 << 63), None),))
+    assert decode_fields(module.encode_answer(said, "avro"))["hops"] == [["r", str(1 << 63), None]]
+
+
+def decode_fields(content: bytes) -> dict[str, Any]:
+    found = json.loads(content)
+    assert isinstance(found, dict)
+    return found
+
+
+def test_a_message_is_measured_in_each_encoding_in_which_it_may_leave() -> None:
+    asked = Envelope("a", body={"floats": [0.5] * 65_000, "text": "x" * 500_000})
+    module.check_size(asked, 0)
+    with pytest.raises(EnvelopeError, match="are the most"):
+        module.check_size(asked, 0, "msgpack")
 
 
 # --- The document ---------------------------------------------------------------------------------------------------------
