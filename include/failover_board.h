@@ -1535,6 +1535,8 @@ static inline void fb_woken_(fb_place_ *place, uint64_t stamp)
 {
     unsigned char *waiters = place->record + FB_WAITERS_;
     const unsigned char for_item = __atomic_exchange_n(waiters, 0, __ATOMIC_SEQ_CST), for_any = __atomic_exchange_n(waiters + 1, 0, __ATOMIC_SEQ_CST);
+    if (for_any != 0 && (place->declared.flags & FB_URGENT) != 0)
+        futimens(place->area->file, NULL); /* tells the agent; what the kernel refuses goes with the round */
     if (for_item != 0 || place->area->always_wakes)
         fb_wake_(place->newest);
     if (for_any != 0) {

@@ -66,7 +66,7 @@ class BoardLink:
 
     Attributes:
         dropped: by reason.
-        wakes: readable when an urgent item was put.
+        wakes: readable when a program told that it put an urgent item.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class BoardLink:
             if self._own.look(now_ns):
                 self._hold(*self._turns.values())
                 self._announcements.hold(self._own.records.values())
-                self.wakes.look_again()
+                self.wakes.ask()
             told = self._announcements.due(round_, medium)
             due = self._turns_of(medium).due(round_, since)
             if not due:
@@ -157,18 +157,32 @@ class BoardLink:
         may = [one for one in put if self._buckets.setdefault((medium, one[0].id), Bucket()).take(now_ns)]
         return self._portions(may, now_ns)
 
-    def seen_to(self) -> None:
-        """What `urgent` gave is on its way: the thread that waits for puts may go on."""
-        self.wakes.seen_to(self._looked)
+    def seen_to(self) -> bool:
+        """What `urgent` gave is on its way: programs are to tell of their next put. Whether there was one since it looked."""
+        try:
+            self.wakes.ask()
+        except OSError:
+            self.dropped[UNREADABLE] += 1
+        return self.has_urgent()
+
+    def has_urgent(self) -> bool:
+        """Whether an urgent item was put since `urgent` looked for the links without slots."""
+        urgent = self._own.urgent
+        if not urgent:
+            return False
+        try:
+            return self._own.numbers(urgent) != self._looked
+        except OSError:
+            self.dropped[UNREADABLE] += 1
+            return False
 
     def leave_for_slot(self, now_ns: int) -> None:
-        """Urgent items that were put wait for this robot's slot; the thread that waits for puts may go on."""
+        """Urgent items that were put wait for this robot's slot."""
         self._urgent_ns = now_ns
         try:
             self._looked = self._own.numbers(self._own.urgent)
         except OSError:
             self.dropped[UNREADABLE] += 1
-        self.seen_to()
 
     def placed(self, portions: Sequence[Portion], count: int, medium: int = 0) -> None:
         """The first ``count`` of what was due found room in the frame."""

@@ -226,11 +226,13 @@ class MainLoop:
         except (FailoverError, OSError) as error:
             log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
-        self._attend(self._board.wakes.fileno(), self._note_urgent)
+        if self._board.wakes.fileno() >= 0:
+            self._attend(self._board.wakes.fileno(), self._note_urgent)
 
     def _close_board(self) -> None:
         if self._board is not None:
-            self._neglect(self._board.wakes.fileno())
+            if self._board.wakes.fileno() >= 0:
+                self._neglect(self._board.wakes.fileno())
             self._board.close()
         self._board = None
 
@@ -411,9 +413,10 @@ class MainLoop:
             self._obey(self._outbox.kept(number, durable, clock.now_ns()))
 
     def _note_urgent(self) -> None:
-        """An urgent item was put."""
+        """An urgent item was put. Until that is seen to, programs may tell so as often as they like: it is not listened to."""
         if self._board is not None:
             self._board.wakes.heed()
+            self._poll.modify(self._board.wakes.fileno(), 0)
             self._urgent_ns = self._board.urgent_due_ns(self._sent_ns)
 
     def _listen_to_worker(self) -> None:
@@ -503,6 +506,8 @@ class MainLoop:
         if not self._media.at_once:
             items += self._urgent_besides(self._board, items, now_ns)
         self._board.placed(items, self._send_frame(beat, items, now_ns))
+        if self._urgent_ns is None and self._media.at_once and self._board.has_urgent():  # its wake-up was lost
+            self._urgent_ns = self._board.urgent_due_ns(self._sent_ns)
 
     def _begin_round(self, board: BoardLink, now_ns: int) -> None:
         self._round, self._round_ns = self._round + 1, now_ns
@@ -512,17 +517,20 @@ class MainLoop:
 
     def _send_urgent(self) -> None:
         """Items that cannot wait for their round, without a beat. Where robots take turns they wait for this robot's slot."""
-        self._urgent_ns = None
-        if self._board is None:
-            return
-        if not self._media.at_once:
-            self._board.leave_for_slot(clock.now_ns())
+        self._urgent_ns, board = None, self._board
+        if board is None:
             return
         now_ns = clock.now_ns()
-        items = self._board.urgent(now_ns)
-        if items:
-            self._board.went(items[: self._send_frame(None, items, now_ns)])
-        self._board.seen_to()
+        if self._media.at_once:
+            items = board.urgent(now_ns)
+            if items:
+                board.went(items[: self._send_frame(None, items, now_ns)])
+        else:
+            board.leave_for_slot(now_ns)
+        if board.seen_to():
+            self._urgent_ns = board.urgent_due_ns(self._sent_ns)
+        if board.wakes.fileno() >= 0:
+            self._poll.modify(board.wakes.fileno(), select.EPOLLIN)
 
     def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:
         """One frame, to everybody over every link where none waits for a slot; how many of the items are in it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from typing import ClassVar, Final
@@ -144,6 +145,11 @@ class MappedFile(SharedFile):
         """Pid, uid and name of each user; ``own``: this opening's index, of which the kernel does not tell."""
         taken = (i for i in range(USERS_MAX) if i == own or locks.is_taken(self.descriptor, USER_LOCKS + i))
         return [layout.read_user(self.view, index) for index in taken]
+
+    def touch(self) -> None:
+        """Set the file's times: that tells an agent of an urgent put. If the kernel refuses, the put waits for the round."""
+        with contextlib.suppress(OSError):
+            os.utime(self.descriptor)
 
     def take_writer(self, record: Record, pid: int) -> bool:
         """Become the writer of an item; False if another process is."""

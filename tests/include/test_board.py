@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import select
 import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 import xxhash
 
+from agent.system.inotify import Touches
 from failover.boards import boottime, directory
 from failover.boards.board import Board, board
 from failover.core.board import layout
@@ -132,6 +135,21 @@ def test_c_waits_for_a_put_of_python_and_python_for_one_of_c(place: Path) -> Non
         assert c.process.stdout.readline() == "ok\n"
         c.ok("put", "plan", "go")
         assert python.item("plan").wait(after=0, timeout=60).value == b"go"
+
+
+def test_c_tells_an_agent_of_a_put_of_an_urgent_item_when_it_is_asked(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        python.add(Declaration("alarm", size=8, urgent=True))
+        c.ok("find", "alarm", 8)
+        file, record = python.found("alarm", python.robot)
+        with closing(Touches(file.descriptor)) as touches, closing(select.epoll()) as loop:
+            loop.register(touches.fileno(), select.EPOLLIN)
+            c.ok("put", "alarm", "1")
+            assert not loop.poll(0), "no agent has asked"
+            file.area[record.at + layout.WAITERS_FIELD + 1] = 1
+            c.ok("put", "alarm", "2")
+            assert loop.poll(60)
+            assert file.area[record.at + layout.WAITERS_FIELD + 1] == 0
 
 
 # --- Writers and users -----------------------------------------------------------------------------------------------

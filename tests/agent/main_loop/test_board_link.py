@@ -8,8 +8,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -21,9 +19,10 @@ from agent.main_loop import board_link, urgent_items
 from agent.main_loop.board_link import UNREADABLE, BoardLink
 from agent.main_loop.own_items import LOOK_NS
 from agent.system import clock
-from failover.boards import directory, futex
+from failover.boards import directory
 from failover.boards.board import Board
 from failover.boards.directory import OWN_NAME, PEER_PREFIX, PRIVATE_NAME, make_file
+from failover.boards.mapping import MappedFile
 from failover.boards.received import MISFIT, UNKNOWN
 from failover.core.board import layout
 from failover.core.board.ages import UNBOUNDED_NS
@@ -398,33 +397,6 @@ def test_an_urgent_item_that_left_over_one_medium_goes_over_each_other_one_too(p
     assert len(first.link.urgent(now_ns, 0)) == 1, "the radio's limit is not the cable's"
 
 
-def test_a_thread_that_is_about_to_sleep_ends_without_sleeping(
-    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, _ = pair
-    at_the_door, woken = threading.Event(), threading.Event()
-    was_woken: list[bool] = []
-    wait, wake = futex.wait, futex.wake
-
-    def waits(address: int, value: int, timeout_s: float) -> bool:
-        at_the_door.set()
-        woken.wait(60)
-        was_woken.append(wait(address, value, timeout_s))
-        return was_woken[-1]
-
-    def wakes(address: int) -> None:
-        wake(address)
-        woken.set()
-
-    monkeypatch.setattr(urgent_items, "IDLE_LOOK_S", 5.0)
-    monkeypatch.setattr(urgent_items.futex, "wait", waits)
-    first.link.wakes.look_again()
-    assert at_the_door.wait(60)
-    monkeypatch.setattr(urgent_items.futex, "wake", wakes)
-    first.link.wakes.close()
-    assert was_woken == [True]
-
-
 def test_what_was_seen_to_already_is_no_error(pair: tuple[Robot, Robot]) -> None:
     first, _ = pair
     first.link.wakes.heed()
@@ -448,41 +420,72 @@ def test_a_program_that_puts_an_urgent_item_all_the_time_does_not_keep_the_loop_
     assert first.link.urgent_due_ns(sent_ns) == now_ns + URGENT_GAP_NS
 
 
-def test_a_put_wakes_the_loop_once_and_one_that_came_while_it_sent_wakes_it_again(
-    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+def told(link: BoardLink, patience_s: float = 0) -> bool:
+    """Whether the loop would wake."""
+    with closing(select.epoll()) as loop:
+        loop.register(link.wakes.fileno(), select.EPOLLIN)
+        return bool(loop.poll(patience_s))
+
+
+def test_puts_wake_the_loop_once_until_it_has_looked_and_none_is_lost_between_its_look_and_its_question(
+    pair: tuple[Robot, Robot],
 ) -> None:
-    sleeps: list[int] = []
-    wait = futex.wait
-
-    def waited(address: int, value: int, timeout_s: float) -> bool:
-        sleeps.append(value)
-        return wait(address, value, timeout_s)
-
-    monkeypatch.setattr(urgent_items, "LOOK_S", 60)  # nothing is told because time has passed
-    monkeypatch.setattr(urgent_items.futex, "wait", waited)
     first, _ = pair
     item = first.program.item("alarm", bytes)
     first.link.due(0, clock.now_ns())  # the table is read
-    with closing(select.epoll()) as loop:
-        loop.register(first.link.wakes.fileno(), select.EPOLLIN)
-
-        def tells() -> bool:
-            if not loop.poll(60):
-                return False
-            first.link.wakes.heed()
+    for number in range(20):
+        item.put(b"%d" % number)
+        assert told(first.link, 60)
+        first.link.wakes.heed()
+        item.put(b"untold")
+        assert not told(first.link)
+        first.link.urgent(clock.now_ns())
+        if number % 2:
+            item.put(b"again")
+            assert first.link.seen_to(), "no wake-up tells of this put"
             first.link.urgent(clock.now_ns())
-            return True
+        assert not first.link.seen_to()
+        assert not told(first.link)
 
-        for number in range(20):
-            item.put(b"%d" % number)
-            assert tells()
-            if number % 2:
-                item.put(b"again")
-                first.link.seen_to()
-                assert tells(), "no other look would find this put"
-            before = len(sleeps)
-            first.link.seen_to()
-            end = time.monotonic() + 60
-            while len(sleeps) == before and not loop.poll(0.001):
-                assert time.monotonic() < end
-            assert not loop.poll(0), "the loop has looked at this put already"
+
+def test_a_put_whose_wake_up_is_lost_is_found_in_the_next_round(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, _ = pair
+    first.link.due(0, clock.now_ns())  # the table is read
+    monkeypatch.setattr(MappedFile, "touch", lambda _: None)
+    first.program.item("alarm", bytes).put(b"!")
+    assert not told(first.link)
+    assert first.link.has_urgent()
+    (urgent,) = first.link.urgent(clock.now_ns())
+    first.link.went([urgent])
+    assert not first.link.has_urgent()
+
+
+def test_a_program_that_wakes_the_loop_all_the_time_leaves_one_event(pair: tuple[Robot, Robot]) -> None:
+    first, _ = pair
+    file = first.program.own_source("alarm").file
+    for _ in range(10_000):
+        file.touch()
+    assert told(first.link)
+    first.link.wakes.heed()
+    assert not told(first.link)
+
+
+def test_without_a_descriptor_for_wake_ups_urgent_items_go_with_the_rounds(
+    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, _ = pair
+
+    def refused(_file: int) -> None:
+        raise OSError(24, "inotify_init1: Too many open files")
+
+    monkeypatch.setattr(urgent_items, "Touches", refused)
+    with closing(BoardLink.open(place_of("robot1"), ROUND_NS)) as link:
+        assert "urgent items go with the rounds only" in caplog.text
+        assert link.wakes.fileno() < 0
+        link.wakes.heed()
+        link.due(0, clock.now_ns())
+        first.program.item("alarm", bytes).put(b"!")
+        assert link.has_urgent()
+        assert len(link.urgent(clock.now_ns())) == 1
