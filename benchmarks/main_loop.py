@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import shutil
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks import urgent
 from benchmarks.figures import Figure, Findings
 from benchmarks.running import PATIENCE_S, POLL_S, BenchmarkError
 from failover.boards.board import board as open_board
@@ -47,45 +42,9 @@ START_PATIENCE_S: Final = 300.0
 
 URGENT_PUTS: Final = 600
 QUICK_URGENT_PUTS: Final = 150
-URGENT_GAP_S: Final = (0.11, 0.17)
-"""Between two urgent puts: an item may have ten frames a second, and no put meets the rounds always in the same place."""
-
-PRIORITY: Final = 40
-"""SCHED_FIFO of those who put and see, below the main loop's: what else runs on the machine is not to be measured."""
 
 UDP: Final = "bare UDP"
 ITEM: Final = '[board.items.item{}]\ntype = {{ x = "f8", y = "f8" }}\n'
-URGENT: Final = '[board.items.alarm]\ntype = "u8"\nperiod = 60000\nurgent = true\n'
-
-WATCHER: Final = """
-import os, sys, time, contextlib
-from failover.boards.board import board
-with contextlib.suppress(OSError):
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({priority}))
-with board(sys.argv[1]) as here:
-    item, last = here.item("alarm"), 0
-    print("ready", flush=True)
-    while True:
-        try:
-            reading = item.wait("robot1", after=last, timeout=60)
-        except Exception:
-            continue
-        now_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-        last = reading.number
-        print(reading.value, now_ns - reading.value, flush=True)
-"""
-
-RECEIVER: Final = """
-import os, socket, sys, time, contextlib
-with contextlib.suppress(OSError):
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({priority}))
-link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-link.bind(("127.0.0.1", int(sys.argv[1])))
-print("ready", flush=True)
-while True:
-    sent_ns = int.from_bytes(link.recv(64), "little")
-    print(sent_ns, time.clock_gettime_ns(time.CLOCK_BOOTTIME) - sent_ns, flush=True)
-"""
 
 
 class TeamStage(Stage):
@@ -130,14 +89,14 @@ class TeamStage(Stage):
 def main_loop(quick: bool, directory: Path) -> Findings:
     """Processor time in a team of eight, then urgent puts in a team of two."""
     shares = _shares(QUICK_SPAN_S if quick else SPAN_S, directory / "eight")
-    urgent = _urgent(QUICK_URGENT_PUTS if quick else URGENT_PUTS, directory / "two")
+    puts = _urgent(QUICK_URGENT_PUTS if quick else URGENT_PUTS, directory / "two")
     return Findings(
         "The main loop of a team with a board",
         f"{ROBOTS} agents on this machine, {ITEMS} items of 16 bytes each, new values in each round of {BEAT_MS} ms: processor "
         "time of one main loop, by the kernel's account (schedstat). Then two agents: from an urgent put at robot1 until a "
         "program that waits at robot2 has it; beside it a datagram from program to program. Those who put and wait have "
-        f"real-time priority {PRIORITY}, the main loops theirs, where this user may.",
-        (*shares, *urgent),
+        f"real-time priority {urgent.PRIORITY}, the main loops theirs, where this user may.",
+        (*shares, *puts),
     )
 
 
@@ -184,60 +143,16 @@ def _processor_ns(pid: int) -> int:
 
 
 def _urgent(count: int, directory: Path) -> list[Figure]:
-    port = free_ports(1)[0]
-    with TeamStage(directory, 2, URGENT) as stage:
+    with TeamStage(directory, 2, urgent.ITEM) as stage:
         directory.mkdir()
         stage.start()
-        there = [str(agents_place(TEAM, "robot2"))]
-        with (
-            open_board(agents_place(TEAM, "robot1")) as board,
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link,
-            _listening(WATCHER, there, directory / "seen") as seen,
-            _listening(RECEIVER, [str(port)], directory / "received") as received,
-            _real_time(),
-        ):
-            item = board.item("alarm")
-            for _ in range(count):
-                time.sleep(random.uniform(*URGENT_GAP_S) / 2)
-                item.put(time.clock_gettime_ns(time.CLOCK_BOOTTIME))
-                time.sleep(random.uniform(*URGENT_GAP_S) / 2)
-                link.sendto(time.clock_gettime_ns(time.CLOCK_BOOTTIME).to_bytes(8, "little"), ("127.0.0.1", port))
-            _until(lambda: len(_rows(received)) >= count, "the last datagram")
-            _until(lambda: len(_rows(seen)) >= 0.9 * count, "the last urgent put")
-            case = "from robot1 to robot2"
-            return [
-                Figure("urgent put until seen", case, "µs", tuple(row[1] / 1000 for row in _rows(seen))),
-                Figure("urgent put until seen", case, "µs", tuple(row[1] / 1000 for row in _rows(received)), UDP),
-            ]
-
-
-@contextmanager
-def _real_time() -> Iterator[None]:
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, policy, parameters)
-
-
-@contextmanager
-def _listening(program: str, arguments: list[str], output: Path) -> Iterator[Path]:
-    with output.open("wb") as file:
-        command = [sys.executable, "-c", program.format(priority=PRIORITY), *arguments]
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, start_new_session=True)
-    try:
-        _until(lambda: output.stat().st_size > 0 or process.poll() is not None, "a program that watches")
-        yield output
-    finally:
-        process.kill()
-        process.wait()
-
-
-def _rows(output: Path) -> list[tuple[int, int]]:
-    whole, _, _ = output.read_text().rpartition("\n")
-    return [(int(first), int(second)) for first, second in (line.split() for line in whole.splitlines()[1:])]
+        ends = [urgent.End(agents_place(TEAM, name), "127.0.0.1") for name in stage.names]
+        seen, received = urgent.measured(ends[0], ends[1], ("127.0.0.1", free_ports(1)[0]), count, directory)
+        case = f"from robot1 to robot2, {urgent.SIZE} bytes"
+        return [
+            Figure("urgent put until seen", case, "µs", tuple(seen)),
+            Figure("urgent put until seen", case, "µs", tuple(received), UDP),
+        ]
 
 
 def _hears_all(robot: RobotMachine) -> bool:

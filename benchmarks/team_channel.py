@@ -1,9 +1,11 @@
 """The team's frames among real agents on one switch: how evenly they follow each other, and what main loops cost.
 
 Run as root: python -m benchmarks.team_channel [--robots 4] [--items 20] [--for 60s] [WAY …]
+or: python -m benchmarks.team_channel --urgent 600
 
 Ways: unicast, multicast (each 20 ms), timers (multicast each 50 ms, without slots), slots (50 ms). Each robot's items are put at
-20 Hz. All ways in one run, one after the other: only rows of one run can be compared.
+20 Hz. All ways in one run, one after the other: only rows of one run can be compared. With --urgent: how soon an urgent item of
+379 bytes is seen at another robot, beside a bare multicast between the same network namespaces.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from msgspec import Struct
 
 import failover
 from agent.main_loop import starvation
+from benchmarks import urgent
 from failover.cli.demo.robots import Pace
 from failover.client.control import SOCKET_VARIABLE
 from failover.config.quantities import span_ms
@@ -37,6 +40,10 @@ PUT_S: Final = 0.05
 SETTLE_S: Final = 2.0
 SHORT_MS: Final = 4.7
 """A gap in which a frame of 379 bytes does not fit between two others, on a radio's lowest rate."""
+
+GROUP: Final = "239.77.255.1"
+GROUP_PORT: Final = 7499
+"""Of the bare multicast: not the team's."""
 
 ITEM: Final = '[board.items.item{}]\ntype = {{ x = "f8", y = "f8", angle = "f8", at = "u8" }}\n'
 
@@ -138,6 +145,26 @@ def _measure(name: str, robot_count: int, items: int, span_s: float) -> None:
             print(f"    {one.name}: K {slots['count']}, place {slots['place']}, late at most {slots['late_us_max'] / 1e3:.1f} ms")
 
 
+def _measure_urgent(count: int) -> None:
+    with (
+        tempfile.TemporaryDirectory(prefix="failover-team-") as directory,
+        bridged.on_one_switch(Path(directory), 2, "", urgent.ITEM, Pace(50, 400)) as stage,
+    ):
+        ends = [
+            urgent.End(
+                (robot.socket.parent / "board").resolve(),
+                bridged.ADDRESS.format(number),
+                ("nsenter", "--net", f"--target={robot.process.pid}"),
+            )
+            for number, robot in enumerate(stage.robots, 1)
+        ]
+        time.sleep(SETTLE_S)
+        values = urgent.measured(ends[0], ends[1], (GROUP, GROUP_PORT), count, Path(directory))
+    for name, found in zip(("an urgent put until it is seen", "a bare multicast until it is received"), values, strict=True):
+        cuts = statistics.quantiles(found, n=100)
+        print(f"{name}: p50 {cuts[49]:.0f} µs, p90 {cuts[89]:.0f}, p99 {cuts[98]:.0f}, least {min(found):.0f}, of {len(found)}")
+
+
 def main() -> None:
     """Measure the ways that are named, or all."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.team_channel", description=__doc__)
@@ -145,7 +172,11 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--items", type=int, default=20)
     parser.add_argument("--for", dest="span_ms", type=span_ms, default=60_000, metavar="SPAN")
+    parser.add_argument("--urgent", type=int, metavar="PUTS")
     arguments = parser.parse_args()
+    if arguments.urgent:
+        _measure_urgent(arguments.urgent)
+        return
     load = os.getloadavg()[0]
     print(f"{arguments.robots} robots, {arguments.items} items each, {os.cpu_count()} cores, load before {load:.1f}")
     for name in arguments.ways or WAYS:

@@ -72,7 +72,8 @@ GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
 
 REST_SHARE: Final = 3
-"""While the main loop rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
+"""While the main loop rests it reads frames so often in a lease: its echoes are fresh enough for one to be granted at once. With
+items to give out it reads each frame when it comes, and the core takes in the beats of a period together, after its own."""
 
 WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the worker may say nothing; then another one takes its place. Meanwhile the guards' leases are not renewed."""
@@ -130,6 +131,7 @@ class MainLoop:
         self._board: BoardLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
         self._urgent_ns: int | None = None
+        self._is_told = False
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
         self._worker = WorkerProcess(settings)
         self._node: Node | None = None
@@ -143,8 +145,10 @@ class MainLoop:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = self._rests = False
+        self._ending = self._rests = self._reads_late = False
+        self._stepped = True
         self._listens = True
+        self._held: list[tuple[Beat, str, int]] = []
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
         self._worker_deaths = 0
@@ -234,7 +238,7 @@ class MainLoop:
             if self._board.wakes.fileno() >= 0:
                 self._neglect(self._board.wakes.fileno())
             self._board.close()
-        self._board = None
+        self._board, self._is_told = None, False
 
     def _start_worker(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
@@ -252,7 +256,7 @@ class MainLoop:
         self._rest()
         self._alarm.set(self._wakes_ns())
         came = self._poll.poll(SLEEP_LIMIT_S)
-        if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
+        if self._reads_late and clock.now_ns() >= self._read_ns + self._rest_ns:
             self._hear()
         for descriptor, _ in came:
             if descriptor in self._inputs:  # not the alarm, nor what was closed in this turn
@@ -263,20 +267,29 @@ class MainLoop:
             self._take_slots()
         self._watch_worker()
         if self._node is not None:
-            late_ns = clock.now_ns() - self._node.next_deadline_ns()
+            now_ns = clock.now_ns()
+            late_ns = now_ns - self._node.next_deadline_ns()
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
+                if self._held and not self._node.rests(now_ns):
+                    self._take_held()
                 self._step(Tick())
+                self._take_held()
 
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
 
+        Programs wait for items, and slots for frames: where there are such, all is read, and only the core waits.
         In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
-        has_leisure = self._node is not None and self._board is None and not self._media.is_slotted
-        self._rests = has_leisure and self._node is not None and self._node.rests(now_ns)
-        listens = not self._rests and now_ns >= self._deaf_until_ns
+        if self._stepped:  # else nothing has changed: a step is due each period
+            self._stepped = False
+            self._rests = self._node is not None and self._node.rests(now_ns)
+            if self._held and not self._rests:
+                self._take_held()
+        self._reads_late = self._rests and self._board is None and not self._media.is_slotted
+        listens = not self._reads_late and now_ns >= self._deaf_until_ns
         if listens != self._listens:
             self._listens = listens
             self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
@@ -315,13 +328,14 @@ class MainLoop:
         slot_ns = self._media.wakes_ns()
         if slot_ns is not None and self._beat is not None:
             deadline_ns = min(deadline_ns, slot_ns)
-        return deadline_ns if self._listens or self._rests else min(deadline_ns, self._deaf_until_ns)
+        return deadline_ns if self._listens or self._reads_late else min(deadline_ns, self._deaf_until_ns)
 
     # --- events in ---
 
     def _step(self, event: Event) -> None:
         if self._node is not None:
             now_ns = clock.now_ns()
+            self._stepped = True
             ready = self._node.step(event, now_ns)
             due = self._outbox.take(ready, now_ns)
             if due is not NOTHING:
@@ -371,6 +385,14 @@ class MainLoop:
         beat = part.beat
         if beat is not None:
             self._count_beat(beat, came_ns or now_ns)
+            self._held.append((beat, link, came_ns))
+            if not came_ns or self._reads_late or len(self._held) >= TURN_LIMIT:
+                self._take_held()
+
+    def _take_held(self) -> None:
+        """The core takes in the beats that came."""
+        held, self._held = self._held, []
+        for beat, link, came_ns in held:
             self._mind_earlier_lives(beat)
             self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 
@@ -391,7 +413,8 @@ class MainLoop:
         peer, lane = part.sender, (part.sender, part.medium)
         boot, counter = self._newest_part.get(lane, (part.boot, part.counter - 1))
         missing = part.counter - counter - 1 if part.boot == boot else 0
-        self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
+        if missing:
+            self._lost[peer] += max(missing, -1)  # one that comes late was counted as lost
         if part.boot != boot or missing >= 0:
             self._newest_part[lane] = (part.boot, part.counter)
         if not part.alike:
@@ -413,11 +436,15 @@ class MainLoop:
             self._obey(self._outbox.kept(number, durable, clock.now_ns()))
 
     def _note_urgent(self) -> None:
-        """An urgent item was put. Until that is seen to, programs may tell so as often as they like: it is not listened to."""
-        if self._board is not None:
-            self._board.wakes.heed()
-            self._poll.modify(self._board.wakes.fileno(), 0)
-            self._urgent_ns = self._board.urgent_due_ns(self._sent_ns)
+        """A program told of an urgent put. Until that is seen to, it may tell as often as it likes: the loop does not listen."""
+        board = self._board
+        if board is None:
+            return
+        board.wakes.heed()
+        self._urgent_ns = board.urgent_due_ns(self._sent_ns)
+        if clock.now_ns() < self._urgent_ns:
+            self._poll.modify(board.wakes.fileno(), 0)
+            self._is_told = True
 
     def _listen_to_worker(self) -> None:
         try:
@@ -529,7 +556,8 @@ class MainLoop:
             board.leave_for_slot(now_ns)
         if board.seen_to():
             self._urgent_ns = board.urgent_due_ns(self._sent_ns)
-        if board.wakes.fileno() >= 0:
+        if self._is_told:
+            self._is_told = False
             self._poll.modify(board.wakes.fileno(), select.EPOLLIN)
 
     def _send_frame(self, beat: Beat | None, items: Sequence[Portion], now_ns: int) -> int:

@@ -229,10 +229,10 @@ def _is_inside(writer: Writer) -> bool:
 def _wake(file: MappedFile, record: Record, stamp_ns: int) -> None:
     """Wake those that wait for an item, or for any of several (BOARD.md, *Waiting*)."""
     item, any_ = file.area[record.at + layout.WAITERS_FIELD : record.at + layout.WAITERS_FIELD + 2]
-    base = file.address(0)
     file.set_word16(record.at + layout.WAITERS_FIELD, 0)
     if any_ and record.flags & layout.URGENT:
         file.touch()
+    base = file.address(0)
     if item or not any_:
         futex.wake(base + record.at + layout.NEWEST_FIELD)
     if any_:

@@ -2,9 +2,8 @@
 
 One thread of one process uses it. Nothing here waits, and no frame can do harm: what does not fit is counted and dropped.
 
-Puts have numbers of this file's own, one after the other, beginning with the writer's epoch. The writer's numbers tell a new put
-from a repeated one. They skip puts that no frame carried; one that is greater by a multiple of the banks would go into the bank
-that readers read.
+The writer's numbers tell a new put from a repeated one. Puts here have numbers of this file's own (`receiving`): the writer's
+skip puts that no frame carried, and one that is greater by a multiple of the banks would go into the bank that readers read.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from failover.boards import futex
 from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
-from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US, UNBOUNDED_NS
-from failover.core.board.banks import EPOCH_SHIFT, first_of_epoch, storing
+from failover.core.board.ages import UNBOUNDED_NS
+from failover.core.board.banks import Take, receiving
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import ADDED, Record, Wanted
 from failover.core.frames.frame import Portion
@@ -34,9 +33,6 @@ GROWTH: Final = 64 << 10
 
 _GENERATION: Final = layout.GENERATION_AT // 8
 _CHANGED: Final = layout.CHANGED_AT // 8
-
-Take = Callable[[Portion, int, int, int, int], bool | None]
-"""``(item, came_ns, error_us, round, missing)`` → whether it was put; None: it does not fit."""
 
 
 class ReceivedItems:
@@ -95,13 +91,13 @@ class ReceivedItems:
         """
         if self.file.words[_GENERATION] != self._generation:
             self._look()
-        known, puts = self._items.get, 0
+        known, puts, transit = self._items.get, 0, (round_ & 0xFFFF_FFFF) << 32 | error_us
         for item in items:
             take = known(item.number)
             if take is None:
                 self.dropped[UNKNOWN] += 1
                 continue
-            is_put = take(item, came_ns, error_us, round_, missing)
+            is_put = take(item, came_ns, error_us, transit, round_, missing)
             if is_put:
                 puts += 1
             elif is_put is None:
@@ -189,33 +185,4 @@ def _is(record: Record | None, wanted: Wanted) -> bool:
 
 
 def _taker(file: MappedFile, record: Record) -> Take:
-    place = file.place(record)
-    words, least, limit, base, put = place.words, place.least, place.limit, record.at // 8, storing(place, FENCE)
-    frames, transit = base + layout.FRAMES_FIELD // 8, base + layout.TRANSIT_FIELD // 8
-    lost, refused = base + layout.LOST_FIELD // 8, base + layout.REFUSED_FIELD // 8
-    period, banks, last_number, last_round = record.period, record.banks, 0, -1
-    following, count = words[place.newest] + 1, words[frames]
-
-    def take(item: Portion, came_ns: int, error_us: int, round_: int, missing: int) -> bool | None:
-        nonlocal following, last_number, last_round, count
-        words[frames] = count = count + 1
-        age_us, number, value = item.age_us, item.put, item.value
-        error = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
-        words[transit] = (round_ & 0xFFFF_FFFF) << 32 | error
-        if missing and 0 <= last_round < round_ - period:
-            words[lost] += min((round_ - last_round) // period - 1, missing)
-        last_round = round_
-        if not least <= len(value) <= limit:
-            words[refused] += 1
-            return None
-        if number <= last_number:
-            return False
-        last_number = number
-        if number >> EPOCH_SHIFT > following >> EPOCH_SHIFT:
-            following = first_of_epoch(following - 1, number >> EPOCH_SHIFT, banks)
-        stamp_ns = came_ns - age_us * NS_PER_US
-        put(following, value, stamp_ns if stamp_ns > 0 else 0, error)
-        following += 1
-        return True
-
-    return take
+    return receiving(file.place(record), record.at // 8, record.period, FENCE)

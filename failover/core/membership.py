@@ -269,7 +269,10 @@ class Membership:
     def steady(self, now_ns: int) -> bool:
         """Whether each living peer was heard in the last two thirds of a loyalty: none is about to be taken for dead."""
         missing_ns = now_ns - 2 * self._loyalty_ns // 3
-        return all(peer.heard_ns > missing_ns or peer.loyal_until_ns <= now_ns or not peer.boot for peer in self.peers.values())
+        for peer in self.peers.values():
+            if peer.heard_ns <= missing_ns and peer.loyal_until_ns > now_ns and peer.boot:
+                return False
+        return True
 
     def gone(self, robot: str, now_ns: int) -> bool:
         """Dead, or so deaf to us that nothing we ever told it lets it act any more."""

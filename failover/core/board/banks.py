@@ -15,23 +15,26 @@ Nothing here knows where the words are: ``words[i]`` is the file's i-th word of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Final, Protocol
 
 import xxhash
 from msgspec import Struct
 
-from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US
+from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
 from failover.core.board.layout import (
     BANK_HEAD,
     FORMULA_FIELD,
+    FRAMES_FIELD,
     GENERATION_AT,
+    LOST_FIELD,
     NEWEST_FIELD,
     NUMBER_WORD,
+    REFUSED_FIELD,
     SIZE_WORD,
     STAMP_WORD,
     STRUCT,
     SUM_WORD,
+    TRANSIT_FIELD,
     WAITERS_FIELD,
     Record,
 )
@@ -171,30 +174,78 @@ def put_carefully(place: Place, number: int, value: bytes, stamp_ns: int, error_
     words[place.newest] = number
 
 
-def storing(place: Place, fence: Fence | None = None) -> Callable[[int, bytes, int, int], None]:
-    """`put_carefully` into one place, ``(number, value, stamp_ns, error_us)``: without a fence, with every constant at hand."""
-    if fence is not None:
-        return partial(_put_with, fence, place)
-    words, area, banks, newest = place.words, place.area, _bank_words(place), place.newest
-    count = len(banks)
-    for head, *_ in banks:
+class Brought(Protocol):
+    """An item's whole value, as a frame brings it (`failover.core.frames.frame.Portion`)."""
+
+    age_us: int
+    put: int
+    value: bytes
+
+
+Take = Callable[[Any, int, int, int, int, int], bool | None]
+"""``(brought, came_ns, error_us, transit, round, missing)`` → whether it was put; None: it does not fit."""
+
+
+def receiving(place: Place, record: int, period: int, fence: Fence | None = None) -> Take:
+    """Puts into one item what frames of another robot bring, by the only writer of the file, and keeps the record's account.
+
+    Without a fence it has `put_carefully` in it, with every constant at hand. Puts have numbers of this file's own, one after
+    the other, beginning with the writer's epoch: the writer's numbers skip puts that no frame carried.
+
+    Args:
+        record: index of the record's first word.
+        period: of the item, in rounds.
+    """
+    words, area, heads, newest = place.words, place.area, _bank_words(place), place.newest
+    least, limit, banks = place.least, place.limit, len(place.banks)
+    frames, bound = record + FRAMES_FIELD // 8, record + TRANSIT_FIELD // 8
+    lost, refused = record + LOST_FIELD // 8, record + REFUSED_FIELD // 8
+    following, count, last_number, last_round = words[newest] + 1, words[frames], 0, -1
+    after = _end_of_epoch(following)
+    for head, *_ in heads if fence is None else ():
         words[head + SUM_WORD] = 0  # none is needed: once and for all
 
-    def put(number: int, value: bytes, stamp_ns: int, error_us: int) -> None:
-        head, stamped, sized, begin = banks[number % count]
-        size = len(value)
-        words[head] = 0
-        words[stamped] = stamp_ns
-        words[sized] = error_us << 32 | size
-        area[begin : begin + size] = value
-        words[head] = number
-        words[newest] = number
+    def take(item: Brought, came_ns: int, error_us: int, transit: int, round_: int, missing: int) -> bool | None:
+        nonlocal following, last_number, last_round, count, after
+        words[frames] = count = count + 1
+        age_us, value, number = item.age_us, item.value, item.put
+        if age_us >= AGE_MAX_US:
+            error_us, transit = NO_ERROR_BOUND, transit | NO_ERROR_BOUND
+        words[bound] = transit
+        if missing and 0 <= last_round < round_ - period:
+            words[lost] += min((round_ - last_round) // period - 1, missing)
+        last_round, size = round_, len(value)
+        if not least <= size <= limit:
+            words[refused] += 1
+            return None
+        if number <= last_number:
+            return False
+        last_number = number
+        if number >= after:
+            following = first_of_epoch(following - 1, number >> EPOCH_SHIFT, banks)
+            after = _end_of_epoch(following)
+        stamp_ns = came_ns - age_us * NS_PER_US
+        if stamp_ns < 0:
+            stamp_ns = 0
+        if fence is not None:
+            put_carefully(place, following, value, stamp_ns, error_us, fence)
+        else:
+            head, stamped, sized, begin = heads[following % banks]
+            words[head] = 0
+            words[stamped] = stamp_ns
+            words[sized] = error_us << 32 | size
+            area[begin : begin + size] = value
+            words[head] = following
+            words[newest] = following
+        following += 1
+        return True
 
-    return put
+    return take
 
 
-def _put_with(fence: Fence, place: Place, number: int, value: bytes, stamp_ns: int, error_us: int) -> None:
-    put_carefully(place, number, value, stamp_ns, error_us, fence)
+def _end_of_epoch(number: int) -> int:
+    """The first number of the epoch after that of this one."""
+    return ((number >> EPOCH_SHIFT) + 1) << EPOCH_SHIFT
 
 
 def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRIES) -> Found:

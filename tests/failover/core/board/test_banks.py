@@ -15,13 +15,14 @@ from typing import Any
 import pytest
 
 from failover.core.board import banks
-from failover.core.board.banks import Found, Place, Reading, get_carefully, put_carefully, reader, storing, writer
+from failover.core.board.banks import Found, Place, Reading, get_carefully, put_carefully, reader, receiving, writer
+from failover.core.frames.frame import Portion
 from failover.errors import BoardError, NeverWrittenError, OvertakenError
 
 PUTS = 3
 VALUE_WORDS = 3
 VALUE_SIZE = 8 * VALUE_WORDS
-NEWEST, WAKE = 3, 200
+NEWEST, WAKE, RECORD = 3, 200, 1000
 BANK_WORDS = 4 + VALUE_WORDS + 1
 FIRST_BANK = 8
 
@@ -121,11 +122,12 @@ def fast_puts(memory: Memory) -> None:
 
 
 def received_puts(memory: Memory) -> None:
-    made = storing(place_in(memory))
+    made = receiving(place_in(memory), RECORD, 1)
     for bank in range(2):
         assert memory.stores.pop(0) == (FIRST_BANK + bank * BANK_WORDS + banks.SUM_WORD, 0)  # once and for all
     for number in range(1, PUTS + 1):
-        made(number, value_of(number), number * 100, 0)
+        assert made(Portion(0, 0, number, value_of(number)), number * 100, 0, 0, number, 0)
+    memory.stores = [store for store in memory.stores if store[0] < RECORD]
 
 
 def plain_get(memory: Memory) -> tuple[bytes, int, int]:
