@@ -15,7 +15,7 @@ from typing import Final
 from msgspec import Struct
 
 from agent.main_loop.announcements import Announcements
-from agent.main_loop.own_items import OwnItems, number_in
+from agent.main_loop.own_items import OwnItems
 from agent.main_loop.primaries import LEFT_OUT, Primaries
 from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import boottime, directory
@@ -117,8 +117,9 @@ class BoardLink:
             due = self._turns_of(medium).due(round_, since)
             if not due:
                 return told
-            table, records = self._own.newest(), self._own.records
-            return told + self._portions([(records[one], number_in(table, records[one])) for one in due], now_ns)
+            numbers, records = self._own.newest(), self._own.records
+            newest = [(record, numbers[record.index]) for record in map(records.__getitem__, due)]
+            return told + self._portions(newest, now_ns)
         except (BoardError, OSError):
             self.dropped[UNREADABLE] += 1
             return []
@@ -186,12 +187,13 @@ class BoardLink:
 
     def placed(self, portions: Sequence[Portion], count: int, medium: int = 0) -> None:
         """The first ``count`` of what was due found room in the frame."""
-        self._turns_of(medium).left(portion.number for portion in portions[count:] if portion.number < RESERVED)
+        self._turns_of(medium).left([portion.number for portion in portions[count:] if portion.number < RESERVED])
         self.went(portions[:count], medium)
 
     def went(self, portions: Sequence[Portion], medium: int = 0) -> None:
         """These are on their way over this medium: what is urgent of them need not go there again."""
-        self._gone.update(((medium, portion.number), portion.put) for portion in portions)
+        if self._own.urgent:
+            self._gone.update([((medium, portion.number), portion.put) for portion in portions])
 
     def _portions(self, newest: Sequence[tuple[Record, int]], now_ns: int) -> list[Portion]:
         """Of items with the numbers of their newest puts."""

@@ -30,6 +30,9 @@ _BANK: Final = struct.Struct("<QQQII")
 
 _NUMBER: Final = struct.Struct("<Q")
 
+_NEWEST: Final = struct.Struct(f"<{layout.NEWEST_FIELD}xQ{layout.RECORD_SIZE - layout.NEWEST_FIELD - 8}x")
+"""Of a record the number of its newest put."""
+
 
 class OwnItems:
     """The items that this robot sends.
@@ -72,8 +75,8 @@ class OwnItems:
         """Numbers of the newest puts of some items, by the items' numbers; 0: none."""
         return {record.id: self._word(record.at + layout.NEWEST_FIELD) for record in records}
 
-    def newest(self) -> bytes:
-        """The table as it is now: for `number_in`.
+    def newest(self) -> list[int]:
+        """The numbers of the newest puts as they are now, by the indexes of the records; 0: none.
 
         Raises:
             BoardError: the file was made shorter.
@@ -81,7 +84,7 @@ class OwnItems:
         table = os.pread(self._descriptor, self._table_size, layout.RECORDS_AT)
         if len(table) < self._table_size:
             raise BoardError(f"{self._file.path}: the file was made shorter")
-        return table
+        return [number for (number,) in _NEWEST.iter_unpack(table)]
 
     def read_ahead(self, newest: Sequence[tuple[Record, int]]) -> None:
         """Read the newest puts of several items with two calls, not two for each: `get` has those that were whole.
@@ -143,9 +146,3 @@ class OwnItems:
 
     def _word(self, offset: int) -> int:
         return int.from_bytes(os.pread(self._descriptor, 8, offset), "little")
-
-
-def number_in(table: bytes, record: Record) -> int:
-    """Number of the newest put of an item; 0: none."""
-    at = record.index * layout.RECORD_SIZE + layout.NEWEST_FIELD
-    return int.from_bytes(table[at : at + 8], "little")

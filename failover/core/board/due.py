@@ -59,7 +59,8 @@ class Turns:
     def left(self, numbers: Iterable[int]) -> None:
         """These found no room in the frame, in this order; all others that were due did, or had no value."""
         self._waiting = dict.fromkeys(numbers)
-        self.waited.update(self._waiting.keys())
+        if self._waiting:
+            self.waited.update(self._waiting.keys())
 
 
 class Bucket(Struct):
