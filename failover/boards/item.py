@@ -261,7 +261,7 @@ class Item:
         self._sources: dict[str, Source] = {}
         self._gets: dict[str, Get] = {}
         self._taken: dict[str, int] = {}
-        self.get: Get = self._get_slowly
+        self.get: Get = self._slow_own
         self.put: Put = self._put_first
 
     # --- Put ---
@@ -352,7 +352,8 @@ class Item:
             self.get = get
         return source
 
-    def _slow_own(self, of: str | None) -> Reading:
+    def _slow_own(self, of: str | None = None) -> Reading:
+        """The newest value of this robot; of another one that is named by its fast get, once there is one."""
         return self._get_slowly() if of is None else self._elsewhere(of)
 
     def _slow_peer(self, robot: str, _of: str | None) -> Reading:
@@ -364,7 +365,7 @@ class Item:
             source.remember(UNKNOWN)
         self._sources = {}
         self._gets = {}
-        self.get = self._get_slowly
+        self.get = self._slow_own
         self.put = self._put_first
 
     # --- More ---
