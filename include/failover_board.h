@@ -134,6 +134,26 @@ static inline int fb_put_sized(fb_item *item, const void *value, size_t size, in
 /* Wait until the item's newest put is another one than number `after` (0: until there is one): 0. -ETIMEDOUT. `timeout` NULL: no limit. */
 static inline int fb_wait(fb_item *item, const char *robot, uint64_t after, const struct timespec *timeout);
 
+/* An item to wait for among others. */
+typedef struct fb_watched {
+    fb_item *item;
+    const char *robot; /* FB_ROBOT("robot2"), or FB_OWN */
+    uint64_t after;    /* number of the newest put that is known; 0: of none */
+} fb_watched;
+
+/* Wait, in one sleep, until the newest put of any of 1 to 128 items is another one than its `after`: the place of the first such item, from 0.
+ * -ETIMEDOUT. `timeout` NULL: no limit. */
+static inline int fb_wait_any(const fb_watched *watched, size_t count, const struct timespec *timeout);
+
+/* Read the value with the least age, of this robot and all that are running: 0. `robot`, unless NULL, has 65 bytes and gets the name of the
+ * robot. -ENODATA: none of them has put it. */
+static inline int fb_youngest(fb_item *item, void *value, fb_reading *reading, char *robot);
+
+/* Read all items of all robots that were ever put: `told` is called for each, when all are read. Each value is whole; all ages are of one
+ * instant. Returns how many there were. `value` has `reading->size` bytes, and is the caller's during the call only. */
+typedef void fb_told(void *context, const char *robot, const char *item, const void *value, const fb_reading *reading);
+static inline int fb_snapshot(fb_board *board, fb_told *told, void *context);
+
 /* Declare an item while the board is in use: 0, also where it is declared alike already. -EEXIST: declared otherwise. */
 static inline int fb_add(fb_board *board, const fb_declaration *wanted);
 
@@ -190,6 +210,8 @@ enum {
     FB_COUNT_AT_ = 24,
     FB_SIZE_AT_ = 32,
     FB_CHANGED_AT_ = 128,
+    FB_STATE_AT_ = 140,
+    FB_RUN_ = 2,                /* the state of a robot that is there */
     FB_USERS_AT_ = 4096,
     FB_USER_SIZE_ = 64,
     FB_RECORDS_AT_ = 20480,
@@ -202,6 +224,11 @@ enum {
     FB_FORMULA_ = 152,
     FB_BANK_HEAD_ = 32,
     FB_RETRIES_ = 16,
+    FB_WATCHED_MAX_ = 128,      /* words on which the kernel sleeps at once */
+    FB_FUTEX_WAITV_ = 449,      /* on every machine, since Linux 5.16 */
+    FB_FUTEX_32_ = 2,
+    FB_POLL_NS_ = 10000000,     /* where it cannot sleep on several words */
+    FB_ROBOTS_MAX_ = 64,
     FB_TURNS_ = 100,            /* of a call whose board is made anew each time it looks */
     FB_EPOCH_BITS_ = 40,        /* numbers of puts under epoch e begin above e << 40 */
     FB_FOLLOW_NS_ = 20000000,   /* the longest sleep without a look at who is the primary */
@@ -591,6 +618,27 @@ static inline void fb_sleep_(const void *word, uint32_t value, int64_t ns)
     limit.tv_sec = (time_t)(ns / 1000000000);
     limit.tv_nsec = (long)(ns % 1000000000);
     syscall(SYS_futex, word, 0 /* FUTEX_WAIT */, value, &limit, NULL, 0);
+}
+
+/* struct futex_waitv */
+typedef struct fb_sleeper_ {
+    uint64_t value, address;
+    uint32_t flags, unused;
+} fb_sleeper_;
+
+/* The same on several words. A kernel before 5.16 sleeps on the first one, and not for long. */
+static inline void fb_sleep_any_(const fb_sleeper_ *sleepers, unsigned count, int64_t ns)
+{
+    if (count > 1) {
+        const int64_t end = fb_clock_(CLOCK_MONOTONIC) + ns;
+        struct timespec limit;
+        limit.tv_sec = (time_t)(end / 1000000000);
+        limit.tv_nsec = (long)(end % 1000000000);
+        if (syscall(FB_FUTEX_WAITV_, sleepers, count, 0, &limit, CLOCK_MONOTONIC) >= 0 || (errno != ENOSYS && errno != EPERM))
+            return;
+        ns = ns > FB_POLL_NS_ ? FB_POLL_NS_ : ns;
+    }
+    fb_sleep_((const void *)(uintptr_t)sleepers[0].address, (uint32_t)sleepers[0].value, ns);
 }
 
 /* --- Files that become shorter ------------------------------------------------------------------------------------------------------------
@@ -1316,6 +1364,24 @@ static inline fb_area_ *fb_peer_(fb_board *board, const char *robot)
     return board->areas;
 }
 
+/* Where the item of a record lies. */
+static inline void fb_lies_(fb_place_ *place, fb_area_ *area, uint32_t index, const fb_record_ *record, uint64_t skew)
+{
+    place->area = area;
+    place->generation = (const uint64_t *)(const void *)(area->map + FB_GENERATION_AT_);
+    place->record = area->map + FB_RECORDS_AT_ + (uint64_t)index * FB_RECORD_SIZE_;
+    place->newest = (uint64_t *)(void *)(place->record + FB_NEWEST_);
+    place->banks = area->map + record->offset;
+    place->stride = record->stride;
+    place->count = record->banks;
+    place->limit = record->size;
+    place->bound = record->bound;
+    place->skew = skew;
+    place->index = index;
+    place->declared = *record;
+    place->remembered = FB_UNKNOWN_;
+}
+
 /* Find out where an item lies; the guard is held. */
 static inline int fb_bind_(fb_item *item, const char *robot)
 {
@@ -1349,20 +1415,8 @@ static inline int fb_bind_(fb_item *item, const char *robot)
     if (place == NULL)
         return fb_fail_(ENOMEM, "cannot use item %s: no memory", item->name);
     found->is_used = true;
-    place->area = found;
-    place->generation = (const uint64_t *)(const void *)(found->map + FB_GENERATION_AT_);
-    place->record = found->map + FB_RECORDS_AT_ + (uint64_t)index * FB_RECORD_SIZE_;
-    place->newest = (uint64_t *)(void *)(place->record + FB_NEWEST_);
-    place->banks = found->map + record.offset;
-    place->stride = record.stride;
-    place->count = record.banks;
-    place->limit = record.size;
-    place->bound = record.bound;
-    place->skew = (uint64_t)board->skew;
-    place->index = (uint32_t)index;
-    place->declared = record;
+    fb_lies_(place, found, (uint32_t)index, &record, (uint64_t)board->skew);
     place->is_own = is_own;
-    place->remembered = FB_UNKNOWN_;
     if (robot != NULL)
         snprintf(place->robot, sizeof place->robot, "%.64s", robot);
     if (robot == NULL) {
@@ -1465,41 +1519,60 @@ static inline bool fb_is_good_(const fb_place_ *place)
     return place != NULL && fb_load_(place->generation) == __atomic_load_n(&place->remembered, __ATOMIC_RELAXED);
 }
 
-/* The newest value at a place, whole. */
-static inline int fb_read_(const fb_item *item, const fb_place_ *place, void *value, fb_reading *reading)
+/* How old a value is at an instant of the machine's clock; the rest of the reading is there. */
+static inline void fb_age_(const fb_place_ *place, uint64_t stamp, uint32_t error_us, uint64_t now, fb_reading *reading)
+{
+    const int64_t age = (int64_t)(now - stamp);
+    const uint64_t bound = place->bound != 0 ? place->bound : __atomic_load_n((const uint64_t *)(const void *)(place->record + FB_FORMULA_), __ATOMIC_RELAXED);
+    reading->age_ns = age < 0 ? 0 : age;
+    reading->age_max_ns = error_us == UINT32_MAX || reading->age_ns > INT64_MAX - (int64_t)error_us * 1000
+                              ? INT64_MAX
+                              : reading->age_ns + (int64_t)error_us * 1000;
+    reading->stale = bound != 0 && (uint64_t)reading->age_max_ns > bound;
+}
+
+static inline uint64_t fb_now_(uint64_t skew) { return (uint64_t)fb_clock_(CLOCK_BOOTTIME) - skew; }
+
+/* The newest value at a place, whole, with its number and size; `stamp` and `error_us` as the bank has them. */
+static inline int fb_copy_(const char *name, const fb_place_ *place, void *value, fb_reading *reading, uint64_t *stamp, uint32_t *error_us)
 {
     for (int turn = 0; turn < FB_RETRIES_; turn++) {
         const uint64_t number = fb_load_(place->newest);
         if (number == 0)
-            return fb_fail_(ENODATA, "item %s was never written: start its writer, or try again later", item->name);
+            return fb_fail_(ENODATA, "item %s was never written: start its writer, or try again later", name);
         const unsigned char *bank = place->banks + (place->count == 2 ? number & 1 : number % place->count) * place->stride;
-        const uint64_t stamp = __atomic_load_n((const uint64_t *)(const void *)(bank + 8), __ATOMIC_RELAXED);
+        *stamp = __atomic_load_n((const uint64_t *)(const void *)(bank + 8), __ATOMIC_RELAXED);
         const uint64_t sum = __atomic_load_n((const uint64_t *)(const void *)(bank + 16), __ATOMIC_RELAXED);
         const uint64_t said = __atomic_load_n((const uint64_t *)(const void *)(bank + 24), __ATOMIC_RELAXED);
-        const uint32_t size = (uint32_t)said, error_us = (uint32_t)(said >> 32);
+        const uint32_t size = (uint32_t)said;
         if (size <= place->limit)
             memcpy(value, bank + FB_BANK_HEAD_, size);
         __atomic_thread_fence(__ATOMIC_ACQUIRE);
         if (__atomic_load_n((const uint64_t *)(const void *)bank, __ATOMIC_RELAXED) != number)
             continue;
         if (size > place->limit)
-            return fb_fail_(EBADMSG, "damaged: item %s: a value of %u bytes where %llu are the most; its writer must put it anew", item->name,
-                            size, (unsigned long long)place->limit);
-        if (FB_SUMS && sum != 0 && sum != (fb_digest_(value, size) ^ stamp ^ number))
+            return fb_fail_(EBADMSG, "damaged: item %s: a value of %u bytes where %llu are the most; its writer must put it anew", name, size,
+                            (unsigned long long)place->limit);
+        if (FB_SUMS && sum != 0 && sum != (fb_digest_(value, size) ^ *stamp ^ number))
             continue;
-        const int64_t age = (int64_t)((uint64_t)fb_clock_(CLOCK_BOOTTIME) - place->skew - stamp);
-        const uint64_t bound = place->bound != 0 ? place->bound : __atomic_load_n((const uint64_t *)(const void *)(place->record + FB_FORMULA_), __ATOMIC_RELAXED);
-        reading->age_ns = age < 0 ? 0 : age;
-        reading->age_max_ns = error_us == UINT32_MAX || reading->age_ns > INT64_MAX - (int64_t)error_us * 1000
-                                  ? INT64_MAX
-                                  : reading->age_ns + (int64_t)error_us * 1000;
+        *error_us = (uint32_t)(said >> 32);
         reading->number = number;
         reading->size = size;
-        reading->stale = bound != 0 && (uint64_t)reading->age_max_ns > bound;
         return 0;
     }
-    return fb_fail_(EAGAIN, "item %s was written %d times while it was read, or by two at once: give it more banks than %u, or put less often",
-                    item->name, FB_RETRIES_, place->count);
+    return fb_fail_(EAGAIN, "item %s was written %d times while it was read, or by two at once: give it more banks than %u, or put less often", name,
+                    FB_RETRIES_, place->count);
+}
+
+/* The newest value at a place, whole, and its age. */
+static inline int fb_read_(const fb_item *item, const fb_place_ *place, void *value, fb_reading *reading)
+{
+    uint64_t stamp = 0;
+    uint32_t error_us = 0;
+    const int outcome = fb_copy_(item->name, place, value, reading, &stamp, &error_us);
+    if (outcome == 0)
+        fb_age_(place, stamp, error_us, fb_now_(place->skew), reading);
+    return outcome;
 }
 
 static inline int fb_get_reading(fb_item *item, const char *robot, void *value, fb_reading *reading)
@@ -1632,6 +1705,193 @@ static inline int fb_wait(fb_item *item, const char *robot, uint64_t after, cons
         else
             fb_sleep_(place->newest, (uint32_t)newest, left);
     }
+}
+
+static inline int fb_wait_any(const fb_watched *watched, size_t count, const struct timespec *timeout)
+{
+    const int64_t limit = timeout == NULL ? INT64_MAX : (int64_t)timeout->tv_sec * 1000000000 + timeout->tv_nsec;
+    const int64_t begin = fb_clock_(CLOCK_MONOTONIC);
+    fb_sleeper_ sleepers[FB_WATCHED_MAX_];
+    if (count < 1 || count > FB_WATCHED_MAX_)
+        return fb_fail_(EINVAL, "cannot wait for %zu items; give 1 to %d", count, FB_WATCHED_MAX_);
+    for (;;) {
+        int64_t left = limit == INT64_MAX ? INT64_MAX : limit - (fb_clock_(CLOCK_MONOTONIC) - begin);
+        unsigned words = 0;
+        bool is_put = false;
+        for (size_t index = 0; index < count; index++) {
+            const fb_watched *one = &watched[index];
+            fb_place_ *place = fb_known_(one->item, one->robot);
+            unsigned word = 0;
+            if (!fb_is_good_(place)) {
+                int failed = fb_settle_(one->item, one->robot, false, &place);
+                if (failed != 0)
+                    return failed;
+            }
+            const unsigned char *changed = place->area->map + FB_CHANGED_AT_;
+            const uint32_t change = __atomic_load_n((const uint32_t *)(const void *)changed, __ATOMIC_ACQUIRE);
+            const uint64_t newest = fb_load_(place->newest);
+            if (newest != 0 && newest != one->after && !fb_is_lost_(fb_load_(place->generation)))
+                return (int)index;
+            while (word < words && sleepers[word].address != (uint64_t)(uintptr_t)changed)
+                word++;
+            if (word == words) { /* one word for all items of a file, as it was before the first of them was looked at */
+                sleepers[words].value = change;
+                sleepers[words].address = (uint64_t)(uintptr_t)changed;
+                sleepers[words].flags = FB_FUTEX_32_;
+                sleepers[words++].unused = 0;
+            }
+            if (place->area->is_writable) {
+                __atomic_store_n(place->record + FB_WAITERS_ + 1, 1, __ATOMIC_SEQ_CST);
+                is_put = is_put || __atomic_load_n(place->newest, __ATOMIC_SEQ_CST) != newest;
+            }
+        }
+        if (left <= 0)
+            return fb_fail_(ETIMEDOUT, "none of the %zu items was put in time", count);
+        if (!is_put)
+            fb_sleep_any_(sleepers, words, left > (int64_t)FB_SLICE_NS_ ? (int64_t)FB_SLICE_NS_ : left);
+    }
+}
+
+/* --- All robots ------------------------------------------------------------------------------------------------------------------------ */
+
+static inline bool fb_is_there_(const fb_area_ *area)
+{
+    return !fb_is_lost_(fb_load_((const uint64_t *)(const void *)(area->map + FB_GENERATION_AT_)));
+}
+
+/* Open the files of all other robots; the guard is held. Whether all are as they were when they were opened. */
+static inline bool fb_open_peers_(fb_board *board)
+{
+    bool is_good = true;
+    DIR *folder = opendir(board->directory);
+    for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder)) {
+        const fb_area_ *area = strncmp(entry->d_name, "peer-", 5) != 0 ? NULL : fb_peer_(board, entry->d_name + 5);
+        is_good = is_good && (area == NULL || fb_is_there_(area));
+    }
+    if (folder != NULL)
+        closedir(folder);
+    return is_good;
+}
+
+/* Have this robot's files and those of all others open; the guard is held. 0 or -errno. A file that is gone and stays so may be among them. */
+static inline int fb_open_all_(fb_board *board)
+{
+    int outcome = 0;
+    for (int turn = 0; turn < 3; turn++) {
+        outcome = fb_ensure_(board);
+        if (outcome != 0 || fb_open_peers_(board))
+            break;
+        if (turn < 2)
+            fb_give_up_(board); /* one was made anew */
+    }
+    return outcome;
+}
+
+static inline int fb_youngest(fb_item *item, void *value, fb_reading *reading, char *robot)
+{
+    fb_board *board = item->board;
+    char robots[FB_ROBOTS_MAX_][65];
+    fb_reading other;
+    unsigned count = 0;
+    int outcome;
+    memset(reading, 0, sizeof *reading);
+    void *copied = malloc(item->size == 0 ? 1 : (size_t)item->size);
+    if (copied == NULL)
+        return fb_fail_(ENOMEM, "cannot read item %s: no memory", item->name);
+    pthread_mutex_lock(&board->guard);
+    outcome = fb_open_all_(board);
+    if (outcome == 0)
+        snprintf(robots[count++], sizeof robots[0], "%.64s", board->own->robot);
+    for (const fb_area_ *area = board->areas; outcome == 0 && area != NULL && count < FB_ROBOTS_MAX_; area = area->next)
+        if (strncmp(area->name, "peer-", 5) == 0 && fb_is_there_(area) &&
+            __atomic_load_n((const uint32_t *)(const void *)(area->map + FB_STATE_AT_), __ATOMIC_RELAXED) == FB_RUN_)
+            snprintf(robots[count++], sizeof robots[0], "%.64s", area->name + 5);
+    pthread_mutex_unlock(&board->guard);
+    outcome = outcome == 0 ? -ENODATA : outcome;
+    for (unsigned index = 0; index < count && (outcome == 0 || outcome == -ENODATA); index++) {
+        int found = fb_get_reading(item, index == 0 ? FB_OWN : robots[index], copied, &other);
+        if (found == 0 && (outcome != 0 || other.age_ns < reading->age_ns)) {
+            memcpy(value, copied, other.size);
+            *reading = other;
+            if (robot != NULL)
+                memcpy(robot, robots[index], sizeof robots[index]);
+            outcome = 0;
+        } else if (found != 0 && found != -ENODATA && found != -ENOENT && found != -ESTALE) {
+            outcome = found;
+        }
+    }
+    free(copied);
+    return outcome == -ENODATA ? fb_fail_(ENODATA, "item %s: no robot that is running has put it", item->name) : outcome;
+}
+
+/* A value of a snapshot. */
+typedef struct fb_taken_ {
+    struct fb_taken_ *next;
+    fb_place_ place;
+    fb_reading reading;
+    uint64_t stamp;
+    uint32_t error_us;
+    char robot[65], name[FB_NAME_MAX_ + 1];
+} fb_taken_; /* the value follows it */
+
+/* Copy all items of a file that were ever put; the guard is held. Where the list goes on, or NULL: then `outcome` says why. */
+static inline fb_taken_ **fb_taken_of_(fb_board *board, fb_area_ *area, fb_taken_ **end, int *outcome)
+{
+    const uint64_t reach = fb_reach_(area);
+    fb_header_ header;
+    *outcome = fb_examined_(area, reach, &header);
+    for (uint32_t index = 0; *outcome >= 0 && index < header.count; index++) {
+        const unsigned char *name = NULL;
+        uint32_t size = 0;
+        fb_record_ record;
+        *outcome = fb_record_at_(area, reach, &header, index, &record, &name, &size);
+        if (*outcome <= 0)
+            continue;
+        fb_taken_ *taken = (fb_taken_ *)calloc(1, sizeof *taken + record.size);
+        if (taken == NULL) {
+            *outcome = fb_fail_(ENOMEM, "cannot read the board %.300s: no memory", board->directory);
+            break;
+        }
+        memcpy(taken->name, name, size);
+        snprintf(taken->robot, sizeof taken->robot, "%.64s", area->robot);
+        fb_lies_(&taken->place, area, index, &record, (uint64_t)board->skew);
+        *outcome = fb_copy_(taken->name, &taken->place, taken + 1, &taken->reading, &taken->stamp, &taken->error_us);
+        if (*outcome != 0) {
+            free(taken);
+            *outcome = *outcome == -ENODATA ? 0 : *outcome;
+        } else {
+            *end = taken;
+            end = &taken->next;
+        }
+    }
+    return *outcome < 0 ? NULL : end;
+}
+
+static inline int fb_snapshot(fb_board *board, fb_told *told, void *context)
+{
+    fb_taken_ *first = NULL, **end = &first;
+    int outcome, count = 0;
+    pthread_mutex_lock(&board->guard);
+    outcome = fb_open_all_(board);
+    for (fb_area_ *area = board->areas; outcome == 0 && area != NULL && end != NULL; area = area->next) {
+        if (!area->is_peer || (strcmp(area->name, "agent") != 0 && fb_is_there_(area)))
+            end = fb_taken_of_(board, area, end, &outcome);
+        outcome = outcome > 0 ? 0 : outcome;
+    }
+    const uint64_t now = fb_now_((uint64_t)board->skew);
+    for (fb_taken_ *taken = first; taken != NULL; taken = taken->next)
+        fb_age_(&taken->place, taken->stamp, taken->error_us, now, &taken->reading);
+    pthread_mutex_unlock(&board->guard);
+    while (first != NULL) {
+        fb_taken_ *taken = first;
+        first = taken->next;
+        if (outcome == 0) {
+            told(context, taken->robot, taken->name, taken + 1, &taken->reading);
+            count++;
+        }
+        free(taken);
+    }
+    return outcome == 0 ? count : outcome;
 }
 
 /* --- The item of a component ---------------------------------------------------------------------------------------------------------------

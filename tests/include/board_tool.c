@@ -5,7 +5,7 @@
 #include <inttypes.h>
 #include <sys/wait.h>
 
-enum { ITEMS = 16 };
+enum { ITEMS = 16, WORDS = 16 };
 
 static fb_board *board;
 static struct {
@@ -49,6 +49,52 @@ static void wait_for(const char *name, const char *robot, const char *after, con
     long long milliseconds = atoll(ms);
     struct timespec limit = {(time_t)(milliseconds / 1000), (long)(milliseconds % 1000) * 1000000};
     answer(fb_wait(item_of(name), robot_of(robot), strtoull(after, NULL, 10), &limit));
+}
+
+/* "NAME ROBOT AFTER NAME ROBOT AFTER … MS": the place of the first that was put. */
+static void wait_for_any(char **words, int count)
+{
+    fb_watched watched[8];
+    long long milliseconds = atoll(words[count - 1]);
+    struct timespec limit = {(time_t)(milliseconds / 1000), (long)(milliseconds % 1000) * 1000000};
+    for (int index = 0; index < count / 3; index++) {
+        watched[index].item = item_of(words[3 * index]);
+        watched[index].robot = robot_of(words[3 * index + 1]);
+        watched[index].after = strtoull(words[3 * index + 2], NULL, 10);
+    }
+    int outcome = fb_wait_any(watched, (size_t)(count / 3), &limit);
+    if (outcome < 0)
+        answer(outcome);
+    else
+        printf("item %d\n", outcome);
+}
+
+static void youngest(const char *name)
+{
+    static char value[65536];
+    char robot[65] = "";
+    fb_reading reading;
+    int outcome = fb_youngest(item_of(name), value, &reading, robot);
+    if (outcome != 0)
+        answer(outcome);
+    else
+        printf("%s %.*s\n", robot, (int)reading.size, value);
+}
+
+static void tell(void *context, const char *robot, const char *item, const void *value, const fb_reading *reading)
+{
+    printf("%s/%s=%.*s/%" PRIu64 "/%" PRId64 "/%" PRId64 "/%d ", robot, item, (int)reading->size, (const char *)value, reading->number,
+           reading->age_ns, reading->age_max_ns, reading->stale);
+    ++*(int *)context;
+}
+
+static void snapshot(void)
+{
+    int told = 0, outcome = fb_snapshot(board, tell, &told);
+    if (outcome < 0)
+        answer(outcome);
+    else
+        printf("%s\n", told == outcome ? "" : "miscounted");
 }
 
 static fb_component *component_of(const char *name)
@@ -153,15 +199,15 @@ static void digest(const char *size)
 
 int main(void)
 {
-    char line[70000], *words[6], nothing[] = "";
+    char line[70000], *words[WORDS], nothing[] = "";
     setvbuf(stdout, NULL, _IOLBF, 0);
     while (fgets(line, sizeof line, stdin) != NULL) {
         char *kept = NULL;
         int count = 0;
         line[strcspn(line, "\n")] = '\0';
-        for (int index = 0; index < 6; index++)
+        for (int index = 0; index < WORDS; index++)
             words[index] = nothing;
-        for (char *word = strtok_r(line, " ", &kept); word != NULL && count < 6; word = strtok_r(NULL, " ", &kept))
+        for (char *word = strtok_r(line, " ", &kept); word != NULL && count < WORDS; word = strtok_r(NULL, " ", &kept))
             words[count++] = word;
         if (strcmp(words[0], "open") == 0)
             board = fb_open(*words[1] == '\0' ? NULL : words[1]), answer(board == NULL ? -errno : 0);
@@ -183,6 +229,12 @@ int main(void)
             get(words[1], words[2]);
         else if (strcmp(words[0], "wait") == 0)
             wait_for(words[1], words[2], words[3], words[4]);
+        else if (strcmp(words[0], "any") == 0)
+            wait_for_any(words + 1, count - 1);
+        else if (strcmp(words[0], "youngest") == 0)
+            youngest(words[1]);
+        else if (strcmp(words[0], "snapshot") == 0)
+            snapshot();
         else if (strcmp(words[0], "child") == 0)
             put_in_child(words[1], words[2]);
         else if (strcmp(words[0], "db") == 0)

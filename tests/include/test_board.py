@@ -21,7 +21,7 @@ from failover.boards.board import Board, board
 from failover.core.board import layout
 from failover.core.board.banks import put_carefully, sum_of
 from failover.core.board.items import Item as Declaration
-from failover.core.board.layout import RUN, Wanted
+from failover.core.board.layout import NOT, RUN, Wanted
 from failover.errors import WriterTakenError
 from tests.include.board_programs import EMULATOR, Tool, emulated_tool, place_for_board, tool
 from tests.include.programs import STRICT, has
@@ -103,15 +103,64 @@ def test_the_other_robots_items_are_read_with_both_ages_and_their_bound(place: P
         assert "no robot ../own" in c.say("get", "ball", "../own")
 
 
-def with_peer(python: Board, place: Path, robot: str, rank: int) -> None:
+def with_peer(python: Board, place: Path, robot: str, rank: int, state: int = RUN) -> None:
     """Another robot's file with one item, as an agent writes it."""
-    file = directory.make_peer(place, robot, rank=rank, state=RUN)
+    file = directory.make_peer(place, robot, rank=rank, state=state)
     with file.changing():
         file.add(Wanted(0, "ball", 379, bound_ns=NS_PER_MS))
     record = file.record("ball")
     assert record is not None
     put_carefully(file.place(record), 7, b"theirs", boottime.now_ns(0) - 2 * NS_PER_MS, error_us=250)
     file.close()
+
+
+def test_c_reads_the_youngest_value_of_the_robots_that_are_running(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        added(python, c)
+        added(python, c, "plan")
+        assert "no robot that is running has put it" in c.say("youngest", "ball")
+        with_peer(python, place, "robot3", rank=2, state=NOT)
+        assert "no robot that is running has put it" in c.say("youngest", "ball")
+        python.item("ball").put(b"mine", at=time.clock_gettime_ns(time.CLOCK_BOOTTIME) - 5000 * NS_PER_MS)
+        assert c.say("youngest", "ball") == f"{python.robot} mine"
+        with_peer(python, place, "robot2", rank=1)
+        assert c.say("youngest", "ball") == "robot2 theirs"
+        assert "no robot that is running has put it" in c.say("youngest", "plan"), "robot2 has no such item"
+        directory.dismiss(place / "peer-robot2")
+        assert c.say("youngest", "ball") == f"{python.robot} mine"
+        python.item("ball").put(b"new")
+        with_peer(python, place, "robot2", rank=1)
+        reading = python.item("ball").youngest()
+        assert c.say("youngest", "ball") == f"{reading.robot} {bytes(reading.value).decode()}"
+
+
+def test_a_snapshot_by_c_is_that_of_python(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        assert c.say("snapshot") == ""
+        added(python, c, "ball")
+        added(python, c, "plan")
+        python.add(Declaration("secret", size=8, shared=False))
+        python.item("secret").put(b"private")
+        python.item("ball").put(b"mine", at=time.clock_gettime_ns(time.CLOCK_BOOTTIME) - 700 * NS_PER_MS)
+        with_peer(python, place, "robot2", rank=1)
+        before = python.snapshot()
+        found: dict[str, dict[str, list[str]]] = {}
+        for word in c.say("snapshot").split():
+            name, _, rest = word.partition("=")
+            robot, _, item = name.partition("/")
+            found.setdefault(robot, {})[item] = rest.split("/")
+        after = python.snapshot()
+        assert set(found) == {python.robot, "robot2"}
+        for robot, items in found.items():
+            assert set(items) == set(before[robot])
+            for item, (value, number, age, most, stale) in items.items():
+                first, last = before[robot][item], after[robot][item]
+                assert (value.encode(), int(number), bool(int(stale))) == (first.value, first.number, first.stale)
+                assert first.age_ns <= int(age) <= last.age_ns
+                assert first.age_max_ns - first.age_ns == int(most) - int(age)
+        ages = [int(found[python.robot][name][2]) for name in ("ball", "secret")]
+        apart = [before[python.robot][name].age_ns for name in ("ball", "secret")]
+        assert ages[0] - ages[1] == apart[0] - apart[1], "all ages are of one instant"
 
 
 # --- Waiting ---------------------------------------------------------------------------------------------------------
@@ -150,6 +199,31 @@ def test_c_tells_an_agent_of_a_put_of_an_urgent_item_when_it_is_asked(place: Pat
             c.ok("put", "alarm", "2")
             assert loop.poll(60)
             assert file.area[record.at + layout.WAITERS_FIELD + 1] == 0
+
+
+def test_c_waits_for_a_put_of_any_of_several_items_of_several_robots(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        added(python, c, "ball")
+        added(python, c, "plan")
+        with_peer(python, place, "robot2", rank=1)
+        python.item("plan").put(b"1")
+        assert c.say("any", "plan", "-", 0, "ball", "robot2", 0, 60_000) == "item 0"
+        assert c.say("any", "ball", "-", 0, "ball", "robot2", 0, "plan", "-", 1, 60_000) == "item 1"
+        assert "none of the 3 items was put in time" in c.say("any", "ball", "-", 0, "ball", "robot2", 7, "plan", "-", 1, 20)
+        assert "no robot robot3" in c.say("any", "ball", "-", 0, "ball", "robot3", 0, 60_000)
+        assert "give 1 to 128" in c.say("any", 20)
+        for turn, name in enumerate(("ball", "plan", "ball"), 1):
+            file, record = python.found(name, python.robot)
+            file.area[record.at + layout.WAITERS_FIELD + 1] = 0
+            known = [python.item(one).get().number if turn > 1 or one == "plan" else 0 for one in ("ball", "plan")]
+            assert c.process.stdin is not None
+            c.process.stdin.write(f"any ball robot2 7 ball - {known[0]} plan - {known[1]} 60000\n")
+            c.process.stdin.flush()
+            while not file.area[record.at + layout.WAITERS_FIELD + 1]:
+                time.sleep(0.001)
+            python.item(name).put(b"%d" % turn)
+            assert c.process.stdout is not None
+            assert c.process.stdout.readline() == {"ball": "item 1\n", "plan": "item 2\n"}[name]
 
 
 # --- Writers and users -----------------------------------------------------------------------------------------------
