@@ -73,7 +73,7 @@ GAP_BEATS: Final = 3
 
 REST_SHARE: Final = 3
 """While the main loop rests it reads frames so often in a lease: its echoes are fresh enough for one to be granted at once. With
-items to give out it reads each frame when it comes, and the core takes in the beats of a period together, after its own."""
+items to give out it reads each frame when it comes, and the core takes in beats so often, after its own."""
 
 WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the worker may say nothing; then another one takes its place. Meanwhile the guards' leases are not renewed."""
@@ -274,7 +274,8 @@ class MainLoop:
                 if self._held and not self._node.rests(now_ns):
                     self._take_held()
                 self._step(Tick())
-                self._take_held()
+                if self._held and now_ns - self._held[0][2] >= self._rest_ns - self._outbox.beat_ns:
+                    self._take_held()
 
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
@@ -390,9 +391,13 @@ class MainLoop:
                 self._take_held()
 
     def _take_held(self) -> None:
-        """The core takes in the beats that came."""
+        """The core takes in the beats that came. Of several of a robot that say nothing of components the newest is enough."""
         held, self._held = self._held, []
+        newest = {beat.sender: beat for beat, _, _ in held}
         for beat, link, came_ns in held:
+            is_older = newest[beat.sender] is not beat and self._node is not None
+            if is_older and self._node is not None and self._node.pass_over(beat, link, came_ns or clock.now_ns()):
+                continue
             self._mind_earlier_lives(beat)
             self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 

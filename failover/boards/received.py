@@ -2,14 +2,14 @@
 
 One thread of one process uses it. Nothing here waits, and no frame can do harm: what does not fit is counted and dropped.
 
-The writer's numbers tell a new put from a repeated one. Puts here have numbers of this file's own (`receiving`): the writer's
+The writer's numbers tell a new put from a repeated one. Puts here have numbers of this file's own (`Reception`): the writer's
 skip puts that no frame carried, and one that is greater by a multiple of the banks would go into the bank that readers read.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,9 +18,9 @@ from failover.boards.fence import FENCE
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.ages import UNBOUNDED_NS
-from failover.core.board.banks import Take, receiving
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import ADDED, Record, Wanted
+from failover.core.board.reception import Reception, Slot
 from failover.core.frames.frame import Portion
 from failover.errors import BoardError
 
@@ -46,7 +46,7 @@ class ReceivedItems:
     def __init__(self, file: MappedFile) -> None:
         self.file = file
         self.dropped: Counter[str] = Counter()
-        self._items: dict[int, Take] = {}
+        self._reception = Reception({})
         self._records: dict[int, Record] = {}
         self._first_area = file.area  # `_wake` has an address in it
         self._wake = futex.waker(file.address(layout.CHANGED_AT))
@@ -74,8 +74,9 @@ class ReceivedItems:
     def tell_state(self, state: int) -> None:
         """Whether the robot is there: `layout.NOT` … `layout.REMOVE`."""
         self.file.set_word32(layout.STATE_AT, state)
+        self._reception.settle()
 
-    def take(self, items: Iterable[Portion], came_ns: int, error_us: int, round_: int, missing: int = 0) -> int:
+    def take(self, items: Sequence[Portion], came_ns: int, error_us: int, round_: int, missing: int = 0) -> int:
         """Put what a frame brought.
 
         Args:
@@ -91,17 +92,11 @@ class ReceivedItems:
         """
         if self.file.words[_GENERATION] != self._generation:
             self._look()
-        known, puts, transit = self._items.get, 0, (round_ & 0xFFFF_FFFF) << 32 | error_us
-        for item in items:
-            take = known(item.number)
-            if take is None:
-                self.dropped[UNKNOWN] += 1
-                continue
-            is_put = take(item, came_ns, error_us, transit, round_, missing)
-            if is_put:
-                puts += 1
-            elif is_put is None:
-                self.dropped[MISFIT] += 1
+        puts, unknown, misfits = self._reception.take(items, came_ns, error_us, round_, missing)
+        if unknown:
+            self.dropped[UNKNOWN] += unknown
+        if misfits:
+            self.dropped[MISFIT] += misfits
         if puts:
             self.file.words[_CHANGED] += 1
             self._wake()  # once for all of them: programs that read this file cannot say that they wait, nor for what
@@ -110,7 +105,11 @@ class ReceivedItems:
     def _look(self) -> None:
         self._generation = self.file.generation
         self._records = {record.id: record for record in self.file.records()}
-        self._items = {number: _taker(self.file, record) for number, record in self._records.items()}
+        self._reception.settle()
+        self._reception = Reception({number: self._slot(record) for number, record in self._records.items()})
+
+    def _slot(self, record: Record) -> Slot:
+        return Slot(self.file.place(record), record.at // 8, record.period, FENCE)
 
     # --- Items that the robot adds and removes ---
 
@@ -143,7 +142,7 @@ class ReceivedItems:
     def _remove(self, record: Record) -> None:
         self.file.remove(record)
         del self._records[record.id]
-        self._items.pop(record.id, None)
+        self._reception.remove(record.id)
 
     def _add(self, wanted: Wanted) -> None:
         there = next((record for record in self._records.values() if record.name == wanted.name), None)
@@ -162,7 +161,7 @@ class ReceivedItems:
             self.dropped[NO_ROOM] += 1
             return
         self._records[record.id] = record
-        self._items[record.id] = _taker(self.file, record)
+        self._reception.add(record.id, self._slot(record))
 
     def bound(self, compute: Callable[[int], int]) -> None:
         """Tell how old each item may be while all works, used where none is declared.
@@ -182,7 +181,3 @@ class ReceivedItems:
 def _is(record: Record | None, wanted: Wanted) -> bool:
     """Whether a record is exactly as it is wanted."""
     return record is not None and all(getattr(record, name) == getattr(wanted, name) for name in Wanted.__struct_fields__)
-
-
-def _taker(file: MappedFile, record: Record) -> Take:
-    return receiving(file.place(record), record.at // 8, record.period, FENCE)

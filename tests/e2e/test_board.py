@@ -18,6 +18,7 @@ from failover.cli.demo.robots import Stage
 from failover.config import team
 from failover.config.team import Team
 from failover.core.board.ages import UNBOUNDED_NS
+from failover.core.node import URGENT_GAP_NS
 from failover.errors import NeverWrittenError
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
@@ -92,6 +93,31 @@ def test_what_a_program_puts_at_one_robot_a_program_gets_at_the_other(pair: tupl
         robots.until(lambda: here.robots()["robot1"].state == "not", "robot1 to be missed")
 
 
+def test_a_program_that_wakes_the_main_loop_all_the_time_costs_it_two_turns_in_each_gap(
+    pair: tuple[RobotMachine, RobotMachine],
+) -> None:
+    with Board(board_of(pair[0]), "hostile") as there, Board(board_of(pair[1]), "here") as here:
+        alarm = there.item("alarm")
+        alarm.put(0)
+        robots.until(lambda: has(here, "alarm", 0), "the first urgent value")
+        file, pid = there.own_source("alarm").file, robots.host_pid(pair[0], int(pair[0].status()["pid"]))
+        before, begin_s = sleeps_of(pid), time.monotonic()
+        while time.monotonic() < begin_s + FLOOD_S:
+            file.touch()
+        sleeps, passed_s = sleeps_of(pid) - before, time.monotonic() - begin_s
+        usual = 500 * passed_s  # heartbeats and frames of both, and the worker process
+        assert sleeps < 2 * passed_s * 1e9 / URGENT_GAP_NS + usual
+        alarm.put(1)
+        robots.until(lambda: has(here, "alarm", 1), "an urgent value after the flood")
+
+
+def sleeps_of(pid: int) -> int:
+    """How often the first thread of a process has gone to sleep. Source: proc_pid_status(5)."""
+    status = Path(f"/proc/{pid}/task/{pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("voluntary_ctxt_switches")).split()[1])
+
+
+FLOOD_S = 2.0
 SPAN_S = float(os.environ.get("FAILOVER_AGES_S", "5"))
 """How long ages are watched; more of it: FAILOVER_AGES_S=600."""
 

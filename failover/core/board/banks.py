@@ -20,21 +20,17 @@ from typing import Any, Final, Protocol
 import xxhash
 from msgspec import Struct
 
-from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
+from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US
 from failover.core.board.layout import (
     BANK_HEAD,
     FORMULA_FIELD,
-    FRAMES_FIELD,
     GENERATION_AT,
-    LOST_FIELD,
     NEWEST_FIELD,
     NUMBER_WORD,
-    REFUSED_FIELD,
     SIZE_WORD,
     STAMP_WORD,
     STRUCT,
     SUM_WORD,
-    TRANSIT_FIELD,
     WAITERS_FIELD,
     Record,
 )
@@ -174,80 +170,6 @@ def put_carefully(place: Place, number: int, value: bytes, stamp_ns: int, error_
     words[place.newest] = number
 
 
-class Brought(Protocol):
-    """An item's whole value, as a frame brings it (`failover.core.frames.frame.Portion`)."""
-
-    age_us: int
-    put: int
-    value: bytes
-
-
-Take = Callable[[Any, int, int, int, int, int], bool | None]
-"""``(brought, came_ns, error_us, transit, round, missing)`` → whether it was put; None: it does not fit."""
-
-
-def receiving(place: Place, record: int, period: int, fence: Fence | None = None) -> Take:
-    """Puts into one item what frames of another robot bring, by the only writer of the file, and keeps the record's account.
-
-    Without a fence it has `put_carefully` in it, with every constant at hand. Puts have numbers of this file's own, one after
-    the other, beginning with the writer's epoch: the writer's numbers skip puts that no frame carried.
-
-    Args:
-        record: index of the record's first word.
-        period: of the item, in rounds.
-    """
-    words, area, heads, newest = place.words, place.area, _bank_words(place), place.newest
-    least, limit, banks = place.least, place.limit, len(place.banks)
-    frames, bound = record + FRAMES_FIELD // 8, record + TRANSIT_FIELD // 8
-    lost, refused = record + LOST_FIELD // 8, record + REFUSED_FIELD // 8
-    following, count, last_number, last_round = words[newest] + 1, words[frames], 0, -1
-    after = _end_of_epoch(following)
-    for head, *_ in heads if fence is None else ():
-        words[head + SUM_WORD] = 0  # none is needed: once and for all
-
-    def take(item: Brought, came_ns: int, error_us: int, transit: int, round_: int, missing: int) -> bool | None:
-        nonlocal following, last_number, last_round, count, after
-        words[frames] = count = count + 1
-        age_us, value, number = item.age_us, item.value, item.put
-        if age_us >= AGE_MAX_US:
-            error_us, transit = NO_ERROR_BOUND, transit | NO_ERROR_BOUND
-        words[bound] = transit
-        if missing and 0 <= last_round < round_ - period:
-            words[lost] += min((round_ - last_round) // period - 1, missing)
-        last_round, size = round_, len(value)
-        if not least <= size <= limit:
-            words[refused] += 1
-            return None
-        if number <= last_number:
-            return False
-        last_number = number
-        if number >= after:
-            following = first_of_epoch(following - 1, number >> EPOCH_SHIFT, banks)
-            after = _end_of_epoch(following)
-        stamp_ns = came_ns - age_us * NS_PER_US
-        if stamp_ns < 0:
-            stamp_ns = 0
-        if fence is not None:
-            put_carefully(place, following, value, stamp_ns, error_us, fence)
-        else:
-            head, stamped, sized, begin = heads[following % banks]
-            words[head] = 0
-            words[stamped] = stamp_ns
-            words[sized] = error_us << 32 | size
-            area[begin : begin + size] = value
-            words[head] = following
-            words[newest] = following
-        following += 1
-        return True
-
-    return take
-
-
-def _end_of_epoch(number: int) -> int:
-    """The first number of the epoch after that of this one."""
-    return ((number >> EPOCH_SHIFT) + 1) << EPOCH_SHIFT
-
-
 def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRIES) -> Found:
     """The newest put, whole.
 
@@ -288,7 +210,7 @@ def get_carefully(place: Place, fence: Fence | None = None, retries: int = RETRI
 # --- The fast form ---------------------------------------------------------------------------------------------------
 
 
-def _bank_words(place: Place) -> tuple[tuple[int, int, int, int], ...]:
+def bank_words(place: Place) -> tuple[tuple[int, int, int, int], ...]:
     """Of each bank the indexes of the words of its number, its stamp and its size, and the offset of its value."""
     return tuple((at // 8, at // 8 + STAMP_WORD, at // 8 + SIZE_WORD, at + BANK_HEAD) for at in place.banks)
 
@@ -341,7 +263,7 @@ def writer(
         woken: wakes those that wait; is given the stamp.
         always_wake: readers cannot say that they wait.
     """
-    words, area, halves, banks = place.words, place.area, place.halves, _bank_words(place)
+    words, area, halves, banks = place.words, place.area, place.halves, bank_words(place)
     limit, newest, wake, count = place.limit, place.newest, place.wake, len(place.banks)
     generation = UNKNOWN
     busy = False
@@ -412,7 +334,7 @@ def reader(
         slow: is called instead, with the robot that the caller named: when the generation differs, a robot is named, the
             item was never written or is overtaken, its value does not unpack, or no bound of its error is known.
     """
-    words, area, banks = place.words, place.area, _bank_words(place)
+    words, area, banks = place.words, place.area, bank_words(place)
     least, limit, newest, count = place.least, place.limit, place.newest, len(place.banks)
     learned = 0 if bound_ns or not is_received else place.formula
     bounded = bool(bound_ns or learned)

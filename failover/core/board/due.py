@@ -32,11 +32,13 @@ class Turns:
     def __init__(self) -> None:
         self.waited: Counter[int] = Counter()
         self._items: dict[int, Sent] = {}
+        self._always: list[int] = []
         self._waiting: dict[int, None] = {}
 
     def hold(self, items: Iterable[Sent]) -> None:
         """These are the items now, in their order; what waits and is none of them any more is forgotten."""
         self._items = {item.number: item for item in items}
+        self._always = list(self._items) if all(item.period == 1 for item in self._items.values()) else []
         self._waiting = {number: None for number in self._waiting if number in self._items}
 
     def due(self, round_: int, since: int | None = None) -> list[int]:
@@ -46,7 +48,9 @@ class Turns:
             since: round of the frame before, for frames that leave more seldom than rounds pass: a turn after that counts, too.
         """
         waiting = list(self._waiting)
-        if since is None:
+        if self._always and (since is None or round_ > since):
+            turn = self._always
+        elif since is None:
             turn = [item.number for item in self._items.values() if (round_ - item.phase) % item.period == 0]
         else:
             turn = [

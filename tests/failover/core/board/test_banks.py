@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 
 from failover.core.board import banks
-from failover.core.board.banks import Found, Place, Reading, get_carefully, put_carefully, reader, receiving, writer
+from failover.core.board.banks import Found, Place, Reading, get_carefully, put_carefully, reader, writer
+from failover.core.board.reception import Reception, Slot
 from failover.core.frames.frame import Portion
 from failover.errors import BoardError, NeverWrittenError, OvertakenError
 
 PUTS = 3
 VALUE_WORDS = 3
 VALUE_SIZE = 8 * VALUE_WORDS
-NEWEST, WAKE, RECORD = 3, 200, 1000
+NEWEST, WAKE, RECORD, APART = 3, 200, 1000, 10_000
 BANK_WORDS = 4 + VALUE_WORDS + 1
 FIRST_BANK = 8
 
@@ -98,9 +99,9 @@ class Seen(Memory):
         return word
 
 
-def place_in(memory: Memory) -> Place:
-    offsets = tuple(8 * (FIRST_BANK + bank * BANK_WORDS) for bank in range(2))
-    return Place(memory, Bytes(memory), memory, offsets, 0, VALUE_SIZE, NEWEST, 0, WAKE)
+def place_in(memory: Memory, at: int = 0) -> Place:
+    offsets = tuple(8 * (at + FIRST_BANK + bank * BANK_WORDS) for bank in range(2))
+    return Place(memory, Bytes(memory), memory, offsets, 0, VALUE_SIZE, at + NEWEST, 0, at + WAKE)
 
 
 def value_of(number: int) -> bytes:
@@ -122,12 +123,29 @@ def fast_puts(memory: Memory) -> None:
 
 
 def received_puts(memory: Memory) -> None:
-    made = receiving(place_in(memory), RECORD, 1)
-    for bank in range(2):
-        assert memory.stores.pop(0) == (FIRST_BANK + bank * BANK_WORDS + banks.SUM_WORD, 0)  # once and for all
+    slot = Slot(place_in(memory), RECORD, 1)
+    forget_sums(memory)
     for number in range(1, PUTS + 1):
-        assert made(Portion(0, 0, number, value_of(number)), number * 100, 0, 0, number, 0)
+        assert slot.take(Portion(0, 0, number, value_of(number)), number * 100, 0, number, 0)
     memory.stores = [store for store in memory.stores if store[0] < RECORD]
+
+
+def received_puts_together(memory: Memory) -> None:
+    """With those of other items, which lie elsewhere."""
+    reception = Reception({number: Slot(place_in(memory, number * APART), RECORD + number * APART, 1) for number in range(3)})
+    forget_sums(memory)
+    for number in range(1, PUTS + 1):
+        items = [Portion(one, 0, number, value_of(number)) for one in range(3)]
+        assert reception.take(items, number * 100, 0, number, 0) == (3, 0, 0)
+    assert reception._plan is not None and reception._plan.frames == PUTS
+    memory.stores = [store for store in memory.stores if store[0] < APART]
+
+
+def forget_sums(memory: Memory) -> None:
+    """The stores that are made once and for all."""
+    for bank in range(2):
+        assert memory.stores[bank] == (FIRST_BANK + bank * BANK_WORDS + banks.SUM_WORD, 0)
+    memory.stores.clear()
 
 
 def plain_get(memory: Memory) -> tuple[bytes, int, int]:
@@ -183,7 +201,7 @@ def is_whole(outcome: tuple[bytes, int, int] | type[BoardError]) -> bool:
     return value == value_of(number) and stamp_ns == number * 100 and 1 <= number <= PUTS
 
 
-PUT_FORMS = pytest.mark.parametrize("puts", [plain_puts, fast_puts, received_puts])
+PUT_FORMS = pytest.mark.parametrize("puts", [plain_puts, fast_puts, received_puts, received_puts_together])
 GET_FORMS = pytest.mark.parametrize("get", [plain_get, fast_get])
 ORDERS = [list(order) for order in itertools.permutations(range(VALUE_WORDS))]
 

@@ -1,0 +1,275 @@
+"""Puts what frames of another robot bring into its file, by the only writer of that file, and keeps the account of each record.
+
+Puts have numbers of the file's own, one after the other, beginning with the writer's epoch: the writer's numbers skip puts that
+no frame carried. The order of stores is that of `failover.core.board.banks`. Where a frame has the same items as the one before,
+each with a newer value, each of its steps is made for all of them before the next step. Then no line of Python runs for each
+item, which would be most of what a frame costs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import repeat
+from operator import add, gt, setitem
+from typing import Any, Final, Protocol
+
+from msgspec import Struct
+from msgspec.structs import astuple
+
+from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
+from failover.core.board.banks import EPOCH_SHIFT, SUM_WORD, Fence, Place, bank_words, first_of_epoch, put_carefully
+from failover.core.board.layout import FRAMES_FIELD, LOST_FIELD, REFUSED_FIELD, TRANSIT_FIELD
+
+TOGETHER_MIN: Final = 3
+"""Items of a frame from which on it is worth while to take them together."""
+
+TOLD_NS: Final = 1_000_000_000
+"""Frames of items that are taken together are counted in their records so often."""
+
+PLANS_MAX: Final = 64
+"""Different frames of one robot that are remembered: each combination of periods is one."""
+
+SHAPES_MAX: Final = 64
+"""Different sizes of values in one of these."""
+
+
+class Brought(Protocol):
+    """An item's whole value, as a frame brings it (`failover.core.frames.frame.Portion`)."""
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def age_us(self) -> int: ...
+    @property
+    def put(self) -> int: ...
+    @property
+    def value(self) -> bytes: ...
+
+
+class Slot:
+    """One item of the file, and what came for it.
+
+    Args:
+        record: index of the record's first word.
+        period: of the item, in rounds.
+
+    Attributes:
+        following: number of its next put here; ``after``: the first number of the writer's next epoch.
+        last_number, last_round: of the newest put of the writer, and of the newest frame with it.
+    """
+
+    __slots__ = ("after", "count", "fence", "following", "heads", "last_number", "last_round", "period", "place", "record")
+
+    def __init__(self, place: Place, record: int, period: int, fence: Fence | None = None) -> None:
+        self.place, self.record, self.period, self.fence = place, record, period, fence
+        self.heads = bank_words(place)
+        for head, *_ in self.heads if fence is None else ():
+            place.words[head + SUM_WORD] = 0  # none is needed: once and for all
+        self.following = place.words[place.newest] + 1
+        self.count = place.words[record + FRAMES_FIELD // 8]
+        self.after = _end_of_epoch(self.following)
+        self.last_number, self.last_round = 0, -1
+
+    def take(self, item: Brought, came_ns: int, error_us: int, round_: int, missing: int) -> bool | None:
+        """Put one value; whether it was put; None: it does not fit. For the arguments see `Reception.take`."""
+        place, record = self.place, self.record
+        words, size, age_us, number = place.words, len(item.value), item.age_us, item.put
+        error_us = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
+        self.count += 1
+        words[record + FRAMES_FIELD // 8] = self.count
+        words[record + TRANSIT_FIELD // 8] = _transit(round_, error_us)
+        if missing and 0 <= self.last_round < round_ - self.period:
+            words[record + LOST_FIELD // 8] += min((round_ - self.last_round) // self.period - 1, missing)
+        self.last_round = round_
+        if not place.least <= size <= place.limit:
+            words[record + REFUSED_FIELD // 8] += 1
+            return None
+        if number <= self.last_number:
+            return False
+        self.last_number = number
+        if number >= self.after:
+            self.following = first_of_epoch(self.following - 1, number >> EPOCH_SHIFT, len(place.banks))
+            self.after = _end_of_epoch(self.following)
+        following, stamp_ns = self.following, max(came_ns - age_us * NS_PER_US, 0)
+        self.following = following + 1
+        if self.fence is not None:
+            put_carefully(place, following, item.value, stamp_ns, error_us, self.fence)
+            return True
+        head, stamped, sized, begin = self.heads[following % len(self.heads)]
+        words[head] = 0
+        words[stamped] = stamp_ns
+        words[sized] = error_us << 32 | size
+        place.area[begin : begin + size] = item.value
+        words[head] = following
+        words[place.newest] = following
+        return True
+
+
+class _Shape(Struct, frozen=True):
+    """Where the values of a frame go, if they have these sizes and each goes into this one of its banks."""
+
+    heads: tuple[int, ...]
+    stamped: tuple[int, ...]
+    sized: tuple[int, ...]
+    values: tuple[slice, ...]
+
+
+class _Plan:
+    """The items of frames that are alike. While it is the one in use, it has the state of its slots (`enter`, `leave`)."""
+
+    def __init__(self, slots: Sequence[Slot]) -> None:
+        self.slots = slots
+        self.newest = tuple([slot.place.newest for slot in slots])
+        self.cycle = math.lcm(*[len(slot.heads) for slot in slots])
+        self._known: dict[tuple[int, ...], dict[tuple[int, tuple[int, ...]], _Shape | None]] = {}
+
+    def enter(self, now_ns: int) -> None:
+        """Take the state of the slots."""
+        self.since_ns, self.frames, self.transit, self.round = now_ns, 0, 0, -1
+        self.following = tuple([slot.following for slot in self.slots])
+        self.last_numbers = tuple([slot.last_number for slot in self.slots])
+        self.after = min([slot.after for slot in self.slots])
+        banks = tuple([slot.following % len(slot.heads) for slot in self.slots])
+        if len(self._known) >= SHAPES_MAX:
+            self._known.clear()
+        self._shapes = self._known.setdefault(banks, {})
+        self.step = 0
+
+    def leave(self) -> None:
+        """Give it back, and count the frames in the records."""
+        if not self.frames:
+            return
+        for slot, following, last_number in zip(self.slots, self.following, self.last_numbers, strict=True):
+            slot.following, slot.last_number, slot.last_round = following, last_number, self.round
+            slot.count += self.frames
+            slot.place.words[slot.record + FRAMES_FIELD // 8] = slot.count
+            slot.place.words[slot.record + TRANSIT_FIELD // 8] = self.transit
+        self.frames = 0
+
+    def shape(self, sizes: tuple[int, ...]) -> _Shape | None:
+        """For values of these sizes; None where one does not fit."""
+        key = (self.step, sizes)
+        if key not in self._shapes:
+            if len(self._shapes) >= SHAPES_MAX * self.cycle:
+                self._shapes.clear()
+            self._shapes[key] = self._made(sizes)
+        return self._shapes[key]
+
+    def _made(self, sizes: tuple[int, ...]) -> _Shape | None:
+        if not all(slot.place.least <= size <= slot.place.limit for slot, size in zip(self.slots, sizes, strict=True)):
+            return None
+        banks = [slot.heads[number % len(slot.heads)] for slot, number in zip(self.slots, self.following, strict=True)]
+        heads, stamped, sized, begins = zip(*banks, strict=True)
+        values = tuple([slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=True)])
+        return _Shape(heads, stamped, sized, values)
+
+
+class Reception:
+    """The items of one robot's file, by their numbers."""
+
+    def __init__(self, slots: Mapping[int, Slot]) -> None:
+        self._slots = dict(slots)
+        self._plans: dict[tuple[int, ...], _Plan | None] = {}
+        self._plan: _Plan | None = None
+
+    def add(self, number: int, slot: Slot) -> None:
+        """There is one more."""
+        self.remove(number)
+        self._slots[number] = slot
+
+    def remove(self, number: int) -> None:
+        """An item is no more."""
+        self.settle()
+        self._plans = {}
+        self._slots.pop(number, None)
+
+    def settle(self) -> None:
+        """Have all records up to date: frames that were taken together are counted now."""
+        plan, self._plan = self._plan, None
+        if plan is not None:
+            plan.leave()
+
+    def take(self, items: Sequence[Brought], came_ns: int, error_us: int, round_: int, missing: int) -> tuple[int, int, int]:
+        """Put what a frame brought.
+
+        Args:
+            error_us: how much older the values may be than their ages and the instant of arrival say.
+            missing: frames of the sender that did not come since the last one, see `ReceivedItems.take`.
+
+        Returns:
+            How many were put, how many are not known here, and how many have another size than declared.
+        """
+        if len(items) >= TOGETHER_MIN and not missing and self._take_together(items, came_ns, error_us, round_):
+            return len(items), 0, 0
+        self.settle()
+        known = self._slots.get
+        puts = unknown = misfits = 0
+        for item in items:
+            slot = known(item.number)
+            if slot is None:
+                unknown += 1
+                continue
+            is_put = slot.take(item, came_ns, error_us, round_, missing)
+            if is_put:
+                puts += 1
+            elif is_put is None:
+                misfits += 1
+        return puts, unknown, misfits
+
+    def _take_together(self, items: Sequence[Brought], came_ns: int, error_us: int, round_: int) -> bool:
+        """Put all values if each is a newer one that fits; False: nothing was done."""
+        numbers, ages_us, puts, values, *_ = zip(*map(_fields, items), strict=True)
+        plan = self._plan
+        if plan is None or self._plans.get(numbers) is not plan or came_ns - plan.since_ns > TOLD_NS:
+            self.settle()
+            plan = self._plan = self._planned(numbers)
+            if plan is None:
+                return False
+            plan.enter(came_ns)
+        shape = plan.shape(tuple(map(len, values)))
+        oldest_us, newest = max(ages_us), max(puts)
+        is_usual = oldest_us < AGE_MAX_US and oldest_us * NS_PER_US < came_ns and newest < plan.after
+        if shape is None or not is_usual or not all(map(gt, puts, plan.last_numbers)):
+            return False
+        place = plan.slots[0].place
+        words, following = place.words, plan.following
+        _store(words, shape.heads, repeat(0))
+        _store(words, shape.stamped, [came_ns - age_us * NS_PER_US for age_us in ages_us])
+        _store(words, shape.sized, map(add, map(len, values), repeat(error_us << 32)))
+        _store(place.area, shape.values, values)
+        _store(words, shape.heads, following)
+        _store(words, plan.newest, following)
+        plan.following, plan.last_numbers = tuple(map(add, following, repeat(1))), puts
+        plan.step = (plan.step + 1) % plan.cycle
+        plan.frames, plan.round, plan.transit = plan.frames + 1, round_, _transit(round_, error_us)
+        return True
+
+    def _planned(self, numbers: tuple[int, ...]) -> _Plan | None:
+        """How frames with these items are taken; None: one by one."""
+        if numbers not in self._plans:
+            if len(self._plans) >= PLANS_MAX:
+                self._plans = {}
+            slots = [self._slots[number] for number in numbers if number in self._slots]
+            is_apt = len(slots) == len(set(numbers)) == len(numbers) and all(
+                slot.fence is None and slot.place.words is slots[0].place.words for slot in slots
+            )
+            self._plans[numbers] = _Plan(slots) if is_apt else None
+        return self._plans[numbers]
+
+
+_fields: Final[Callable[[Any], tuple[Any, ...]]] = astuple
+
+
+def _store(target: Any, places: Iterable[Any], values: Iterable[Any]) -> None:
+    """One store into each of the places, in their order: a loop that is not of Python's lines."""
+    any(map(setitem, repeat(target), places, values))
+
+
+def _transit(round_: int, error_us: int) -> int:
+    return (round_ & 0xFFFF_FFFF) << 32 | error_us
+
+
+def _end_of_epoch(number: int) -> int:
+    """The first number of the epoch after that of this one."""
+    return ((number >> EPOCH_SHIFT) + 1) << EPOCH_SHIFT
