@@ -18,8 +18,8 @@ from msgspec import Struct
 from msgspec.structs import astuple
 
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
-from failover.core.board.banks import EPOCH_SHIFT, SUM_WORD, Fence, Place, bank_words, first_of_epoch, put_carefully
-from failover.core.board.layout import FRAMES_FIELD, LOST_FIELD, REFUSED_FIELD, TRANSIT_FIELD
+from failover.core.board.banks import EPOCH_SHIFT, Fence, Place, bank_words, first_of_epoch, put_carefully
+from failover.core.board.layout import FRAMES_FIELD, LOST_FIELD, REFUSED_FIELD, SUM_WORD, TRANSIT_FIELD
 
 TOGETHER_MIN: Final = 3
 """Items of a frame from which on it is worth while to take them together."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from pathlib import Path
@@ -11,7 +12,8 @@ import pytest
 import failover
 from failover.boards import directory
 from failover.boards.received import ReceivedItems
-from failover.core.board import layout
+from failover.core.board import layout, reception
+from failover.core.board.ages import AGE_MAX_US
 from failover.core.board.items import Item
 from failover.core.frames.frame import Portion
 from failover.errors import NeverWrittenError
@@ -167,3 +169,53 @@ def test_a_frame_wakes_who_waits_for_it(place: Path, monkeypatch: pytest.MonkeyP
             put(received, 7, number, ONE)
             thread.join(0.5)
         assert got == [{"x": 1.0}]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_put_together_is_as_what_is_put_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Frames of all items, or of some; repeated, older, missing, too long, too old ones, and another epoch among them."""
+    dice = random.Random(seed)
+    items = {number: Item(f"item{number}", size=8 * (1 + number % 3), banks=2 + number % 2) for number in range(6)}
+    together, single = (received_in(tmp_path / name, items) for name in ("together", "single"))
+    frames, puts, planned = 300, dict.fromkeys(items, 0), 0
+    for round_ in range(frames):
+        chosen = list(items) if dice.random() < 0.8 else dice.sample(list(items), dice.randint(1, 6))
+        for number in chosen:
+            puts[number] += dice.random() < 0.97
+        if dice.random() < 0.02:
+            puts = {number: put + (1 << 40) for number, put in puts.items()}
+        age_us = AGE_MAX_US if dice.random() < 0.02 else dice.randrange(1000)
+        too_long = dice.random() < 0.02
+        portions = [
+            Portion(number, age_us, puts[number] or 1, bytes([round_ % 256]) * (items[number].size + (too_long and number == 2)))
+            for number in chosen
+        ]
+        came_ns, error_us, missing = now(), dice.randrange(500), int(dice.random() < 0.03)
+        taken = together.take(portions, came_ns, error_us, round_, missing)
+        plan = together._reception._plan
+        planned += plan is not None and plan.frames > 0
+        monkeypatch.setattr(reception, "TOGETHER_MIN", 1000)
+        assert single.take(portions, came_ns, error_us, round_, missing) == taken
+        monkeypatch.undo()
+    assert planned > frames // 2
+    together.tell_state(layout.RUN)
+    single.tell_state(layout.RUN)
+    assert bytes(together.file.area) == bytes(single.file.area)
+    assert together.dropped == single.dropped
+
+
+def received_in(directory_: Path, items: dict[int, Item]) -> ReceivedItems:
+    directory_.mkdir(parents=True)
+    return ReceivedItems(directory.make_peer(directory_, "robot2", items=items))
+
+
+def test_frames_of_items_that_are_put_together_are_counted_within_a_second(tmp_path: Path) -> None:
+    items = {number: Item(f"item{number}", size=8) for number in range(4)}
+    received = received_in(tmp_path / "board", items)
+    came_ns = now()
+    for round_, later_ns in enumerate((0, reception.TOLD_NS, reception.TOLD_NS + 1), 1):
+        portions = [Portion(number, 0, round_, b"12345678") for number in items]
+        assert received.take(portions, came_ns + later_ns, 5, round_) == 4
+    told = [received.file.words[(record.at + layout.FRAMES_FIELD) // 8] for record in received.file.records()]
+    assert told == [2] * 4
+    assert [received.file.word32(record.at + layout.TRANSIT_FIELD) for record in received.file.records()] == [5] * 4
