@@ -145,7 +145,7 @@ class MainLoop:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = self._rests = self._reads_late = False
+        self._ending = self._is_idle = self._rests = self._reads_late = False
         self._stepped = True
         self._listens = True
         self._held: list[tuple[Beat, str, int]] = []
@@ -280,16 +280,17 @@ class MainLoop:
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
 
-        Programs wait for items, and slots for frames: where there are such, all is read, and only the core waits.
+        Programs wait for items: where there are such, all is read, and only the core waits. With slots it never rests.
         In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
         if self._stepped:  # else nothing has changed: a step is due each period
             self._stepped = False
-            self._rests = self._node is not None and self._node.rests(now_ns)
-            if self._held and not self._rests:
-                self._take_held()
-        self._reads_late = self._rests and self._board is None and not self._media.is_slotted
+            self._is_idle = self._node is not None and self._node.rests(now_ns)
+        self._rests = self._is_idle and not self._media.is_slotted
+        if self._held and not self._rests:
+            self._take_held()
+        self._reads_late = self._rests and self._board is None
         listens = not self._reads_late and now_ns >= self._deaf_until_ns
         if listens != self._listens:
             self._listens = listens
