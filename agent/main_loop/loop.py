@@ -72,8 +72,7 @@ GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
 
 REST_SHARE: Final = 3
-"""While the main loop rests it reads frames so often in a lease: its echoes are fresh enough for one to be granted at once. With
-items to give out it reads each frame when it comes, and the core takes in beats so often, after its own."""
+"""While the main loop rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
 
 WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the worker may say nothing; then another one takes its place. Meanwhile the guards' leases are not renewed."""
@@ -145,10 +144,8 @@ class MainLoop:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = self._is_idle = self._rests = self._reads_late = False
-        self._stepped = True
+        self._ending = self._rests = False
         self._listens = True
-        self._held: list[tuple[Beat, str, int]] = []
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
         self._worker_deaths = 0
@@ -256,7 +253,7 @@ class MainLoop:
         self._rest()
         self._alarm.set(self._wakes_ns())
         came = self._poll.poll(SLEEP_LIMIT_S)
-        if self._reads_late and clock.now_ns() >= self._read_ns + self._rest_ns:
+        if self._rests and clock.now_ns() >= self._read_ns + self._rest_ns:
             self._hear()
         for descriptor, _ in came:
             if descriptor in self._inputs:  # not the alarm, nor what was closed in this turn
@@ -267,31 +264,20 @@ class MainLoop:
             self._take_slots()
         self._watch_worker()
         if self._node is not None:
-            now_ns = clock.now_ns()
-            late_ns = now_ns - self._node.next_deadline_ns()
+            late_ns = clock.now_ns() - self._node.next_deadline_ns()
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
-                if self._held and not self._node.rests(now_ns):
-                    self._take_held()
                 self._step(Tick())
-                if self._held and now_ns - self._held[0][2] >= self._rest_ns - self._outbox.beat_ns:
-                    self._take_held()
 
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
 
-        Programs wait for items: where there are such, all is read, and only the core waits. With slots it never rests.
         In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
         now_ns = clock.now_ns()
-        if self._stepped:  # else nothing has changed: a step is due each period
-            self._stepped = False
-            self._is_idle = self._node is not None and self._node.rests(now_ns)
-        self._rests = self._is_idle and not self._media.is_slotted
-        if self._held and not self._rests:
-            self._take_held()
-        self._reads_late = self._rests and self._board is None
-        listens = not self._reads_late and now_ns >= self._deaf_until_ns
+        has_leisure = self._node is not None and self._board is None and not self._media.is_slotted
+        self._rests = has_leisure and self._node is not None and self._node.rests(now_ns)
+        listens = not self._rests and now_ns >= self._deaf_until_ns
         if listens != self._listens:
             self._listens = listens
             self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
@@ -330,14 +316,13 @@ class MainLoop:
         slot_ns = self._media.wakes_ns()
         if slot_ns is not None and self._beat is not None:
             deadline_ns = min(deadline_ns, slot_ns)
-        return deadline_ns if self._listens or self._reads_late else min(deadline_ns, self._deaf_until_ns)
+        return deadline_ns if self._listens or self._rests else min(deadline_ns, self._deaf_until_ns)
 
     # --- events in ---
 
     def _step(self, event: Event) -> None:
         if self._node is not None:
             now_ns = clock.now_ns()
-            self._stepped = True
             ready = self._node.step(event, now_ns)
             due = self._outbox.take(ready, now_ns)
             if due is not NOTHING:
@@ -387,18 +372,6 @@ class MainLoop:
         beat = part.beat
         if beat is not None:
             self._count_beat(beat, came_ns or now_ns)
-            self._held.append((beat, link, came_ns))
-            if not came_ns or self._reads_late or len(self._held) >= TURN_LIMIT:
-                self._take_held()
-
-    def _take_held(self) -> None:
-        """The core takes in the beats that came. Of several of a robot that say nothing of components the newest is enough."""
-        held, self._held = self._held, []
-        newest = {beat.sender: beat for beat, _, _ in held}
-        for beat, link, came_ns in held:
-            is_older = newest[beat.sender] is not beat and self._node is not None
-            if is_older and self._node is not None and self._node.pass_over(beat, link, came_ns or clock.now_ns()):
-                continue
             self._mind_earlier_lives(beat)
             self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
 

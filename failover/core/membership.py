@@ -182,21 +182,6 @@ class Membership:
             peer.heard_us_ns = peer.asked_ns if peer.heard_us == peer.echoed else self._left_ns(peer.heard_us)
         return news
 
-    def pass_over(self, beat: Beat, link: str, came_ns: int) -> bool:
-        """Note that a beat came of which a later one is to be heard at once; False: it says what that one may not, so hear it.
-
-        All that it says is state, which the later one says anew; only when it came counts.
-        """
-        peer = self.peers.get(beat.sender)
-        if peer is None or beat.boot != peer.boot or beat.counter <= peer.counter or beat.entries:
-            return False
-        if came_ns >= peer.loyal_until_ns:
-            return False
-        self._time(peer, beat, came_ns)
-        peer.counter, peer.heard_ns = beat.counter, max(peer.heard_ns, came_ns)
-        peer.links[link] = came_ns
-        return True
-
     def _time(self, peer: Peer, beat: Beat, now_ns: int) -> None:
         """Learn how late its beats come, as far as that widens the margin: more of it would only be forgotten later.
 
@@ -284,10 +269,7 @@ class Membership:
     def steady(self, now_ns: int) -> bool:
         """Whether each living peer was heard in the last two thirds of a loyalty: none is about to be taken for dead."""
         missing_ns = now_ns - 2 * self._loyalty_ns // 3
-        for peer in self.peers.values():
-            if peer.heard_ns <= missing_ns and peer.loyal_until_ns > now_ns and peer.boot:
-                return False
-        return True
+        return all(peer.heard_ns > missing_ns or peer.loyal_until_ns <= now_ns or not peer.boot for peer in self.peers.values())
 
     def gone(self, robot: str, now_ns: int) -> bool:
         """Dead, or so deaf to us that nothing we ever told it lets it act any more."""

@@ -168,10 +168,6 @@ class Node:
                 return echo.boot
         return 0
 
-    def pass_over(self, beat: Beat, link: str, came_ns: int) -> bool:
-        """Take in a beat of which a later one follows in the next event; False: it must be an event of its own."""
-        return self._team.pass_over(beat, link, came_ns)
-
     def waits(self, beat: Beat | None) -> None:
         """The newest beat waits for a slot on each link; None: it is on its way. One that waits when the next is made is lost."""
         self._waiting = beat

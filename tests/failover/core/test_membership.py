@@ -149,30 +149,6 @@ def test_a_robot_that_hears_of_a_component_rests_no_more_until_it_has_ended() ->
     assert rests_at(node, 22) == [True]
 
 
-def test_of_beats_that_are_taken_in_together_the_newest_is_enough() -> None:
-    def after(*, passes_over: bool) -> tuple[object, ...]:
-        node = Node(PAIR, 1, VoteRecord(), 0)
-        beating(node, 1, 5)
-        for at in range(60, 110, 10):
-            node.step(Tick(), at * MS)
-        for number in range(6, 10):
-            came_ns = number * 10 * MS + number * MS // 5
-            if not (passes_over and number < 9 and node.pass_over(beat(number), "eth0", came_ns)):
-                node.step(Received(beat(number), "eth0", came_ns=came_ns), 101 * MS)
-        peer = node._team.peers["robot2"]
-        return peer.counter, peer.heard_ns, peer.unsteady_ns, peer.loyal_until_ns, peer.links
-
-    assert after(passes_over=True) == after(passes_over=False)
-    node = Node(PAIR, 1, VoteRecord(), 0)
-    assert not node.pass_over(beat(1), "eth0", MS), "it was never heard"
-    beating(node, 1, 5)
-    assert not node.pass_over(beat(5), "eth0", 51 * MS), "it is no newer one"
-    assert not node.pass_over(Beat("robot2", 2, 6), "eth0", 51 * MS), "it is of another life"
-    runs = Entry("/lab/x", STATES.index(State.PRIMARY), 1, "robot2")
-    assert not node.pass_over(Beat("robot2", 1, 6, 1, 1, 1, (), (runs,)), "eth0", 51 * MS), "it tells of a component"
-    assert not node.pass_over(beat(6), "eth0", 50 * MS + PAIR.loyalty_ns), "it is dead, and is heard again"
-
-
 def test_a_beat_that_waited_while_its_hearer_rested_was_not_late() -> None:
     def patience_ms_after(*came_ms: int) -> int:
         node = Node(PAIR, 1, VoteRecord(), 0)
