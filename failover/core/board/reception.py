@@ -30,8 +30,8 @@ TOLD_NS: Final = 1_000_000_000
 PLANS_MAX: Final = 64
 """Different frames of one robot that are remembered: each combination of periods is one."""
 
-SHAPES_MAX: Final = 64
-"""Different sizes of values in one of these."""
+PLACES_MAX: Final = 1 << 14
+"""Of values, in all that is remembered of one robot: some 2 MB, however its frames vary. Beyond it all is found out anew."""
 
 
 class Brought(Protocol):
@@ -115,11 +115,20 @@ class _Shape(Struct, frozen=True):
     values: tuple[slice, ...]
 
 
+class _Memory:
+    """How many places of values all plans of one robot remember."""
+
+    __slots__ = ("places",)
+
+    def __init__(self) -> None:
+        self.places = 0
+
+
 class _Plan:
     """The items of frames that are alike. While it is the one in use, it has the state of its slots (`enter`, `leave`)."""
 
-    def __init__(self, slots: Sequence[Slot]) -> None:
-        self.slots = slots
+    def __init__(self, slots: Sequence[Slot], memory: _Memory) -> None:
+        self.slots, self._memory = slots, memory
         self.newest = tuple([slot.place.newest for slot in slots])
         self.cycle = math.lcm(*[len(slot.heads) for slot in slots])
         self._known: dict[tuple[int, ...], dict[tuple[int, tuple[int, ...]], _Shape | None]] = {}
@@ -131,8 +140,6 @@ class _Plan:
         self.last_numbers = tuple([slot.last_number for slot in self.slots])
         self.after = min([slot.after for slot in self.slots])
         banks = tuple([slot.following % len(slot.heads) for slot in self.slots])
-        if len(self._known) >= SHAPES_MAX:
-            self._known.clear()
         self._shapes = self._known.setdefault(banks, {})
         self.step = 0
 
@@ -151,8 +158,7 @@ class _Plan:
         """For values of these sizes; None where one does not fit."""
         key = (self.step, sizes)
         if key not in self._shapes:
-            if len(self._shapes) >= SHAPES_MAX * self.cycle:
-                self._shapes.clear()
+            self._memory.places += len(sizes)
             self._shapes[key] = self._made(sizes)
         return self._shapes[key]
 
@@ -172,6 +178,7 @@ class Reception:
         self._slots = dict(slots)
         self._plans: dict[tuple[int, ...], _Plan | None] = {}
         self._plan: _Plan | None = None
+        self._memory = _Memory()
 
     def add(self, number: int, slot: Slot) -> None:
         """There is one more."""
@@ -180,8 +187,7 @@ class Reception:
 
     def remove(self, number: int) -> None:
         """An item is no more."""
-        self.settle()
-        self._plans = {}
+        self._forget()
         self._slots.pop(number, None)
 
     def settle(self) -> None:
@@ -189,6 +195,11 @@ class Reception:
         plan, self._plan = self._plan, None
         if plan is not None:
             plan.leave()
+
+    def _forget(self) -> None:
+        """Find out anew where values go."""
+        self.settle()
+        self._plans, self._memory = {}, _Memory()
 
     def take(self, items: Sequence[Brought], came_ns: int, error_us: int, round_: int, missing: int) -> tuple[int, int, int]:
         """Put what a frame brought.
@@ -220,6 +231,8 @@ class Reception:
     def _take_together(self, items: Sequence[Brought], came_ns: int, error_us: int, round_: int) -> bool:
         """Put all values if each is a newer one that fits; False: nothing was done."""
         numbers, ages_us, puts, values, *_ = zip(*map(_fields, items), strict=True)
+        if self._memory.places > PLACES_MAX:
+            self._forget()
         plan = self._plan
         if plan is None or self._plans.get(numbers) is not plan or came_ns - plan.since_ns > TOLD_NS:
             self.settle()
@@ -249,12 +262,12 @@ class Reception:
         """How frames with these items are taken; None: one by one."""
         if numbers not in self._plans:
             if len(self._plans) >= PLANS_MAX:
-                self._plans = {}
+                self._forget()
             slots = [self._slots[number] for number in numbers if number in self._slots]
             is_apt = len(slots) == len(set(numbers)) == len(numbers) and all(
                 slot.fence is None and slot.place.words is slots[0].place.words for slot in slots
             )
-            self._plans[numbers] = _Plan(slots) if is_apt else None
+            self._plans[numbers] = _Plan(slots, self._memory) if is_apt else None
         return self._plans[numbers]
 
 

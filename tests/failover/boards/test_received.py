@@ -219,3 +219,20 @@ def test_frames_of_items_that_are_put_together_are_counted_within_a_second(tmp_p
     told = [received.file.words[(record.at + layout.FRAMES_FIELD) // 8] for record in received.file.records()]
     assert told == [2] * 4
     assert [received.file.word32(record.at + layout.TRANSIT_FIELD) for record in received.file.records()] == [5] * 4
+
+
+def test_what_is_remembered_of_frames_that_vary_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However a robot varies the items of its frames, the sizes of their values, and the banks that each begins with."""
+    monkeypatch.setattr(reception, "PLACES_MAX", 200)
+    dice = random.Random(1)
+    items = {number: Item(f"item{number}", size=64, banks=2 + number % 3) for number in range(6)}
+    received = received_in(tmp_path / "board", items)
+    came_ns = now()
+    for put_ in range(1, 2_000):
+        numbers = dice.sample(list(items), dice.randint(3, 6)) if dice.random() < 0.5 else list(items)
+        portions = [Portion(number, 0, put_, bytes(dice.randint(1, 64))) for number in numbers]
+        assert received.take(portions, came_ns, 5, put_) == len(numbers)
+        plans = [plan for plan in received._reception._plans.values() if plan is not None]
+        shapes = [(plan, shape) for plan in plans for known in plan._known.values() for shape in known]
+        assert sum(len(plan.slots) for plan, _ in shapes) <= 200 + len(items)
+        assert len(plans) <= reception.PLANS_MAX
