@@ -195,9 +195,8 @@ class ItemWriter:
         if not file.take_writer(record, os.getpid()):
             raise WriterTakenError(self._board.whose(file, record))
         number = first_of_epoch(place.words[place.newest], epoch(), record.banks) - 1
-        always = file.path.name.startswith("own+")
         woken = partial(_wake, file, record)
-        return writer_of(place, number, boottime.CLOCK, self._board.skew_ns, self.put_slowly, woken, always, FENCE)
+        return writer_of(place, number, boottime.CLOCK, self._board.skew_ns, self.put_slowly, woken, file.always_wakes, FENCE)
 
     def _examined(self, source: Source, value: Any) -> bytes:
         """The value's bytes, for an item of bytes; those of a typed one are packed already."""
@@ -228,12 +227,16 @@ def _is_inside(writer: Writer) -> bool:
 
 def _wake(file: MappedFile, record: Record, stamp_ns: int) -> None:
     """Wake those that wait for an item, or for any of several (BOARD.md, *Waiting*)."""
-    item, any_ = file.area[record.at + layout.WAITERS_FIELD : record.at + layout.WAITERS_FIELD + 2]
-    file.set_word16(record.at + layout.WAITERS_FIELD, 0)
+    at = record.at + layout.WAITERS_FIELD
+    item, any_ = file.area[at : at + 2]
+    if item:  # what is not set stays as it is: the agent may ask in this moment
+        file.area[at] = 0
+    if any_:
+        file.area[at + 1] = 0
     if any_ and record.flags & layout.URGENT:
         file.touch()
     base = file.address(0)
-    if item or not any_:
+    if item or file.always_wakes:
         futex.wake(base + record.at + layout.NEWEST_FIELD)
     if any_:
         file.words[layout.CHANGED_AT // 8] = stamp_ns

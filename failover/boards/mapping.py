@@ -15,6 +15,9 @@ from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import USER_LOCKS, USERS_MAX, WRITER_LOCKS, Header, Record, Wanted
 from failover.errors import BoardError, BoardGoneError
 
+USER_PREFIX: Final = "own+"
+"""Of the name of a file that one user writes and all read."""
+
 _U32: Final = struct.Struct("<I")
 
 
@@ -27,6 +30,11 @@ class MappedFile(SharedFile):
     header: Header
 
     # --- What the file says ---
+
+    @property
+    def always_wakes(self) -> bool:
+        """Whether a put wakes all that sleep on its number: other users read the file, and cannot say that they wait."""
+        return self.path.name.startswith(USER_PREFIX)
 
     def read_header(self) -> Header:
         """As it is now.
@@ -79,10 +87,6 @@ class MappedFile(SharedFile):
     def set_word32(self, offset: int, word: int) -> None:
         """Four bytes."""
         _U32.pack_into(self.area, offset, word)
-
-    def set_word16(self, offset: int, word: int) -> None:
-        """Two bytes."""
-        self.halves[offset // 2] = word
 
     def add(self, wanted: Wanted) -> Record:
         """Append an item, inside of `changing`.

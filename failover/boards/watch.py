@@ -61,12 +61,18 @@ class Watch:
         return found
 
     def _places(self) -> list[tuple[int, int]]:
-        """The word of each file that changes with a put, and its value before the items are looked at."""
+        """The words that change with a put, and their values before the items are looked at: one of each file.
+
+        Of a file of another user that of each item: its writer does not learn that this program waits.
+        """
         places = {}
         for item, robot in self._items:
             source = item.source(robot)
-            file = source.file
+            file, newest = source.file, source.record.at + layout.NEWEST_FIELD
+            if file.always_wakes and not file.is_writable:
+                places[id(file), newest] = (file.address(newest), file.word32(newest))
+                continue
             if file.is_writable and not file.header.flags & layout.PEER:
                 file.area[source.record.at + layout.WAITERS_FIELD + 1] = 1
-            places[id(file)] = (file.address(layout.CHANGED_AT), file.word32(layout.CHANGED_AT))
+            places[id(file), layout.CHANGED_AT] = (file.address(layout.CHANGED_AT), file.word32(layout.CHANGED_AT))
         return list(places.values())

@@ -79,9 +79,9 @@ def test_a_table_that_is_damaged_before_the_item_is_removed_is_told(place: Path)
             asks.start()
             while Path(f"/proc/{c.pid}/syscall").read_text().split()[0] not in SLEEPS:
                 assert not answers, "it waits for the table, in which it has found the item"
-            file.set_word16(at, 99)
+            file.halves[at // 2] = 99
         asks.join()
-        file.set_word16(at, 2)
+        file.halves[at // 2] = 2
         assert len(answers) == 1 and "is damaged: record 0" in answers[0]
         assert python.names() == ["goal"]
 

@@ -546,6 +546,64 @@ def test_a_put_wakes_a_sleeper_before_it_looks_by_itself(board: Board, monkeypat
         assert got == [b"b"]
 
 
+class Asked:
+    """The bytes of a file, in which the agent asks to be told as soon as they were looked at."""
+
+    def __init__(self, area: memoryview, at: int) -> None:
+        self._area, self._at = area, at
+
+    def __getitem__(self, which: slice) -> bytes:
+        found = bytes(self._area[which])
+        self._area[self._at] = 1
+        return found
+
+    def __setitem__(self, at: int, byte: int) -> None:
+        self._area[at] = byte
+
+
+def test_a_question_of_the_agent_that_comes_while_a_put_wakes_others_is_kept(
+    board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with board:
+        item = board.add(Item("x", size=8, urgent=True))
+        item.put(b"a")
+        file, at = item.source().file, item.source().record.at + layout.WAITERS_FIELD
+        area, base = file.area, file.address(0)
+        monkeypatch.setattr(MappedFile, "address", lambda _file, offset: base + offset)
+        area[at] = 1  # a program waits for this item
+        file.area = Asked(area, at + 1)
+        item.put(b"b")
+        file.area = area
+        assert tuple(area[at : at + 2]) == (0, 1)
+
+
+@pytest.mark.parametrize("asked", [0, 1])
+def test_a_put_into_a_file_of_another_user_wakes_a_watch_that_cannot_say_that_it_waits(
+    board: Board, monkeypatch: pytest.MonkeyPatch, asked: int
+) -> None:
+    """With a slice of an hour only the wake-up can end the wait."""
+    monkeypatch.setattr("failover.boards.watch.SLICE_S", 3600.0)
+    with board as writing:
+        items = {0: Item("theirs", size=8)}
+        directory.make_file(writing.directory / f"own+{os.geteuid()}", layout.OWN, writing.robot, items=items)
+        with Board(writing.directory, "reads") as reading, Board(writing.directory, "puts") as putting:
+            mine, theirs = reading.add(Item("mine", size=8)), reading.item("theirs")
+            theirs.source().file.is_writable = False
+            at = theirs.source().record.at + layout.WAITERS_FIELD
+            watch = reading.watch(mine, theirs)
+            got: list[str] = []
+            thread = threading.Thread(target=lambda: got.extend(item.name for item, _ in watch.wait()))
+            thread.start()
+            asleep = Path(f"/proc/self/task/{thread.native_id}/wchan")
+            while "futex" not in asleep.read_text():
+                time.sleep(0)
+            file = putting.item("theirs").source().file
+            file.area[at + 1] = asked  # by a program of its user, for any of several
+            putting.item("theirs").put(b"b")
+            thread.join(60)
+            assert got == ["theirs"]
+
+
 def test_each_put_of_a_peer_wakes_too(board: Board) -> None:
     with board:
         declaration = Item("x", size=8)

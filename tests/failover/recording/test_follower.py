@@ -100,7 +100,7 @@ def test_a_file_whose_table_is_damaged_is_told_once_and_the_others_go_on(board: 
     good = received.file.halves[(layout.RECORDS_AT + layout.BANKS_FIELD) // 2]
     for number, banks in enumerate((99, good, 99)):
         with received.file.changing():
-            received.file.set_word16(layout.RECORDS_AT + layout.BANKS_FIELD, banks)
+            received.file.halves[(layout.RECORDS_AT + layout.BANKS_FIELD) // 2] = banks
         for value in (b"1", b"2"):
             ball.put(value)
             assert seen(follower_)[0][:3] == (board.robot, "ball", value)
