@@ -141,8 +141,9 @@ typedef struct fb_watched {
     uint64_t after;    /* number of the newest put that is known; 0: of none */
 } fb_watched;
 
-/* Wait, in one sleep, until the newest put of any of 1 to 128 items is another one than its `after`: the place of the first such item, from 0.
- * -ETIMEDOUT. `timeout` NULL: no limit. */
+/* Wait, in one sleep, until the newest put of any of 1 to 128 items is another one than its `after`: the place of such an item, from 0. The
+ * look begins behind the one that this thread got last: of items that are put all the time each has its turn. -ETIMEDOUT. `timeout` NULL: no
+ * limit. */
 static inline int fb_wait_any(const fb_watched *watched, size_t count, const struct timespec *timeout);
 
 /* Read the value with the least age, of this robot and all that are running: 0. `robot`, unless NULL, has 65 bytes and gets the name of the
@@ -277,7 +278,8 @@ typedef char fb_record_has_64_bytes_[sizeof(fb_record_) == 64 ? 1 : -1];
 typedef struct fb_area_ {
     struct fb_area_ *next;
     unsigned char *map;
-    int file; /* for locks and sizes; -1: closed */
+    int file;    /* for locks and sizes; -1: closed; atomic */
+    int telling; /* threads that use `file` without the guard; atomic */
     bool is_writable, is_peer, always_wakes, is_used;
     uint32_t flags, rank;
     char robot[65], name[NAME_MAX + 1];
@@ -348,6 +350,7 @@ __attribute__((weak)) bool fb_is_registered_;
 __attribute__((weak)) uintptr_t fb_maps_[FB_MAPS_]; /* atomic */
 __attribute__((weak)) struct sigaction fb_before_;
 __attribute__((weak)) __thread char fb_sentence_[768];
+__attribute__((weak)) __thread size_t fb_turn_; /* of fb_wait_any: where its look begins */
 
 static inline const char *fb_error(void) { return fb_sentence_; }
 
@@ -838,11 +841,51 @@ static inline fb_area_ *fb_mapped_(fb_board *board, const char *name, int file)
     return area;
 }
 
+/* Tell the agent of an urgent put; what the kernel refuses goes with the round. The guard need not be held. */
+static inline void fb_tell_(fb_area_ *area)
+{
+    __atomic_fetch_add(&area->telling, 1, __ATOMIC_SEQ_CST);
+    const int file = __atomic_load_n(&area->file, __ATOMIC_SEQ_CST);
+    if (file >= 0)
+        futimens(file, NULL);
+    __atomic_fetch_sub(&area->telling, 1, __ATOMIC_SEQ_CST);
+}
+
+/* Close a file and give its locks back; no thread uses its number afterwards, which may soon be another file's. */
+static inline void fb_shut_(fb_area_ *area)
+{
+    const struct timespec pause = {0, 100000};
+    const int file = __atomic_exchange_n(&area->file, -1, __ATOMIC_SEQ_CST);
+    while (__atomic_load_n(&area->telling, __ATOMIC_SEQ_CST) > 0)
+        nanosleep(&pause, NULL);
+    if (file >= 0)
+        close(file);
+}
+
 static inline void fb_unmap_(fb_area_ *area)
 {
     fb_noted_(area->map, false);
     munmap(area->map, FB_FILE_SIZE_MAX_);
     free(area);
+}
+
+static inline bool fb_is_there_(const fb_area_ *area)
+{
+    return !fb_is_lost_(fb_load_((const uint64_t *)(const void *)(area->map + FB_GENERATION_AT_)));
+}
+
+/* Take a file out of those in use. */
+static inline void fb_leave_(fb_board *board, fb_area_ **link)
+{
+    fb_area_ *area = *link;
+    *link = area->next;
+    fb_shut_(area);
+    if (area->is_used) {
+        area->next = board->left;
+        board->left = area;
+    } else {
+        fb_unmap_(area);
+    }
 }
 
 /* Give a board's files up, and all places in them; their locks are given back. */
@@ -860,20 +903,37 @@ static inline void fb_give_up_(fb_board *board)
             board->given_up = places;
         }
     }
-    while (board->areas != NULL) {
-        fb_area_ *area = board->areas;
-        board->areas = area->next;
-        if (area->file >= 0)
-            close(area->file);
-        area->file = -1;
-        if (area->is_used) {
-            area->next = board->left;
-            board->left = area;
-        } else {
-            fb_unmap_(area);
-        }
-    }
+    while (board->areas != NULL)
+        fb_leave_(board, &board->areas);
     board->own = NULL;
+}
+
+/* Forget the files of other robots that were removed or made anew, and all places in them; this robot's stay as they are. Whether there
+ * was one. The guard is held. */
+static inline bool fb_forget_peers_(fb_board *board)
+{
+    bool is_one = false;
+    for (fb_area_ **link = &board->areas; *link != NULL;) {
+        fb_area_ *area = *link;
+        if (!area->is_peer || fb_is_there_(area)) {
+            link = &area->next;
+            continue;
+        }
+        for (fb_item *item = board->items; item != NULL; item = item->next)
+            for (fb_place_ **at = &item->peers; *at != NULL;) {
+                fb_place_ *place = *at;
+                if (place->area != area) {
+                    at = &place->next;
+                    continue;
+                }
+                __atomic_store_n(at, place->next, __ATOMIC_RELEASE); /* its own `next` stays: a thread may stand there */
+                place->older = board->given_up;
+                board->given_up = place;
+            }
+        fb_leave_(board, link);
+        is_one = true;
+    }
+    return is_one;
 }
 
 /* What lies beside the agent's socket under a name; `path` has PATH_MAX bytes. */
@@ -1481,7 +1541,8 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
             place = fb_known_(item, robot);
         }
         if (failed == -ESTALE && ++lost < 3) { /* made anew since it was opened; or that file alone is gone, and stays so */
-            fb_give_up_(board);
+            if (!fb_forget_peers_(board))
+                fb_give_up_(board);
             continue;
         }
         if (failed != 0) {
@@ -1490,7 +1551,8 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
         }
         const uint64_t generation = fb_load_(place->generation);
         if (fb_is_lost_(generation)) {
-            fb_give_up_(board);
+            if (!fb_forget_peers_(board))
+                fb_give_up_(board);
             continue;
         }
         if (generation != place->remembered) {
@@ -1609,7 +1671,7 @@ static inline void fb_woken_(fb_place_ *place, uint64_t stamp)
     unsigned char *waiters = place->record + FB_WAITERS_;
     const unsigned char for_item = __atomic_exchange_n(waiters, 0, __ATOMIC_SEQ_CST), for_any = __atomic_exchange_n(waiters + 1, 0, __ATOMIC_SEQ_CST);
     if (for_any != 0 && (place->declared.flags & FB_URGENT) != 0)
-        futimens(place->area->file, NULL); /* tells the agent; what the kernel refuses goes with the round */
+        fb_tell_(place->area);
     if (for_item != 0 || place->area->always_wakes)
         fb_wake_(place->newest);
     if (for_any != 0) {
@@ -1718,7 +1780,8 @@ static inline int fb_wait_any(const fb_watched *watched, size_t count, const str
         int64_t left = limit == INT64_MAX ? INT64_MAX : limit - (fb_clock_(CLOCK_MONOTONIC) - begin);
         unsigned words = 0;
         bool is_put = false;
-        for (size_t index = 0; index < count; index++) {
+        for (size_t step = 0; step < count; step++) {
+            const size_t index = (fb_turn_ + step) % count;
             const fb_watched *one = &watched[index];
             fb_place_ *place = fb_known_(one->item, one->robot);
             unsigned word = 0;
@@ -1730,13 +1793,17 @@ static inline int fb_wait_any(const fb_watched *watched, size_t count, const str
             const unsigned char *changed = place->area->map + FB_CHANGED_AT_;
             const uint32_t change = __atomic_load_n((const uint32_t *)(const void *)changed, __ATOMIC_ACQUIRE);
             const uint64_t newest = fb_load_(place->newest);
-            if (newest != 0 && newest != one->after && !fb_is_lost_(fb_load_(place->generation)))
+            if (newest != 0 && newest != one->after && !fb_is_lost_(fb_load_(place->generation))) {
+                fb_turn_ = index + 1;
                 return (int)index;
-            while (word < words && sleepers[word].address != (uint64_t)(uintptr_t)changed)
+            }
+            const bool is_alone = place->area->always_wakes && !place->area->is_writable; /* its writer wakes for this item only */
+            const uint64_t address = is_alone ? (uint64_t)(uintptr_t)place->newest : (uint64_t)(uintptr_t)changed;
+            while (word < words && sleepers[word].address != address)
                 word++;
             if (word == words) { /* one word for all items of a file, as it was before the first of them was looked at */
-                sleepers[words].value = change;
-                sleepers[words].address = (uint64_t)(uintptr_t)changed;
+                sleepers[words].value = is_alone ? (uint32_t)newest : change;
+                sleepers[words].address = address;
                 sleepers[words].flags = FB_FUTEX_32_;
                 sleepers[words++].unused = 0;
             }
@@ -1754,37 +1821,21 @@ static inline int fb_wait_any(const fb_watched *watched, size_t count, const str
 
 /* --- All robots ------------------------------------------------------------------------------------------------------------------------ */
 
-static inline bool fb_is_there_(const fb_area_ *area)
-{
-    return !fb_is_lost_(fb_load_((const uint64_t *)(const void *)(area->map + FB_GENERATION_AT_)));
-}
-
-/* Open the files of all other robots; the guard is held. Whether all are as they were when they were opened. */
-static inline bool fb_open_peers_(fb_board *board)
-{
-    bool is_good = true;
-    DIR *folder = opendir(board->directory);
-    for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder)) {
-        const fb_area_ *area = strncmp(entry->d_name, "peer-", 5) != 0 ? NULL : fb_peer_(board, entry->d_name + 5);
-        is_good = is_good && (area == NULL || fb_is_there_(area));
-    }
-    if (folder != NULL)
-        closedir(folder);
-    return is_good;
-}
-
-/* Have this robot's files and those of all others open; the guard is held. 0 or -errno. A file that is gone and stays so may be among them. */
+/* Have this robot's files and those of all others open; the guard is held. 0 or -errno. */
 static inline int fb_open_all_(fb_board *board)
 {
-    int outcome = 0;
-    for (int turn = 0; turn < 3; turn++) {
-        outcome = fb_ensure_(board);
-        if (outcome != 0 || fb_open_peers_(board))
-            break;
-        if (turn < 2)
-            fb_give_up_(board); /* one was made anew */
-    }
-    return outcome;
+    const int outcome = fb_ensure_(board);
+    DIR *folder;
+    if (outcome != 0)
+        return outcome;
+    fb_forget_peers_(board); /* those that were made anew are opened again */
+    folder = opendir(board->directory);
+    for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder))
+        if (strncmp(entry->d_name, "peer-", 5) == 0)
+            fb_peer_(board, entry->d_name + 5); /* one that is gone meanwhile is none */
+    if (folder != NULL)
+        closedir(folder);
+    return 0;
 }
 
 static inline int fb_youngest(fb_item *item, void *value, fb_reading *reading, char *robot)
@@ -1867,16 +1918,46 @@ static inline fb_taken_ **fb_taken_of_(fb_board *board, fb_area_ *area, fb_taken
     return *outcome < 0 ? NULL : end;
 }
 
+static inline void fb_free_taken_(fb_taken_ **first)
+{
+    while (*first != NULL) {
+        fb_taken_ *taken = *first;
+        *first = taken->next;
+        free(taken);
+    }
+}
+
+/* Copy all items of all files that were ever put; the guard is held. 0 or -errno. */
+static inline int fb_take_all_(fb_board *board, fb_taken_ **first)
+{
+    fb_taken_ **end = first;
+    int outcome = fb_open_all_(board);
+    for (fb_area_ *area = board->areas; outcome == 0 && area != NULL; area = area->next) {
+        if (area->is_peer && (strcmp(area->name, "agent") == 0 || !fb_is_there_(area)))
+            continue;
+        fb_taken_ **begin = end;
+        end = fb_taken_of_(board, area, begin, &outcome);
+        outcome = outcome > 0 ? 0 : outcome;
+        if (area->is_peer && outcome != 0 && !fb_is_there_(area)) { /* the robot has left meanwhile */
+            fb_free_taken_(begin);
+            end = begin;
+            outcome = 0;
+        }
+    }
+    return outcome;
+}
+
 static inline int fb_snapshot(fb_board *board, fb_told *told, void *context)
 {
-    fb_taken_ *first = NULL, **end = &first;
-    int outcome, count = 0;
+    fb_taken_ *first = NULL;
+    int outcome = -ESTALE, count = 0;
     pthread_mutex_lock(&board->guard);
-    outcome = fb_open_all_(board);
-    for (fb_area_ *area = board->areas; outcome == 0 && area != NULL && end != NULL; area = area->next) {
-        if (!area->is_peer || (strcmp(area->name, "agent") != 0 && fb_is_there_(area)))
-            end = fb_taken_of_(board, area, end, &outcome);
-        outcome = outcome > 0 ? 0 : outcome;
+    for (int turn = 0; outcome == -ESTALE && turn < FB_TURNS_; turn++) {
+        outcome = fb_take_all_(board, &first);
+        if (outcome == -ESTALE) { /* this robot's board was made anew meanwhile */
+            fb_free_taken_(&first);
+            fb_give_up_(board);
+        }
     }
     const uint64_t now = fb_now_((uint64_t)board->skew);
     for (fb_taken_ *taken = first; taken != NULL; taken = taken->next)
@@ -2140,9 +2221,8 @@ static inline void fb_forked_(void)
                 place->remembered = FB_UNKNOWN_;
         }
         for (fb_area_ *area = board->areas; area != NULL; area = area->next) {
-            if (area->file >= 0)
-                close(area->file);
-            area->file = -1;
+            area->telling = 0; /* by threads of the parent */
+            fb_shut_(area);
         }
         board->is_forked = true;
     }

@@ -233,6 +233,8 @@ int main(void)
             wait_for_any(words + 1, count - 1);
         else if (strcmp(words[0], "youngest") == 0)
             youngest(words[1]);
+        else if (strcmp(words[0], "user") == 0)
+            answer(setresuid((uid_t)atoi(words[1]), (uid_t)atoi(words[1]), (uid_t)atoi(words[1])) == 0 ? 0 : -errno);
         else if (strcmp(words[0], "snapshot") == 0)
             snapshot();
         else if (strcmp(words[0], "child") == 0)

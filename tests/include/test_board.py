@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import select
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,7 +18,7 @@ import pytest
 import xxhash
 
 from agent.system.inotify import Touches
-from failover.boards import boottime, directory
+from failover.boards import boottime, directory, futex
 from failover.boards.board import Board, board
 from failover.core.board import layout
 from failover.core.board.banks import put_carefully, sum_of
@@ -163,6 +165,50 @@ def test_a_snapshot_by_c_is_that_of_python(place: Path) -> None:
         assert ages[0] - ages[1] == apart[0] - apart[1], "all ages are of one instant"
 
 
+def test_a_program_that_reads_all_robots_stays_the_writer_of_its_items(place: Path) -> None:
+    """Also when another robot has left and come back, or is away."""
+    with board(place) as python, tool(place) as c:
+        added(python, c)
+        with_peer(python, place, "robot2", rank=1)
+        c.ok("put", "ball", "mine")
+        for look in (("youngest", "ball"), ("get", "ball", "robot2"), ("snapshot",)):
+            assert "theirs" in c.say("get", "ball", "robot2")
+            directory.dismiss(place / "peer-robot2")
+            with_peer(python, place, "robot2", rank=1)
+            c.ok("put", "ball", "mine")
+            assert ("mine" if look[0] == "youngest" else "theirs") in c.say(*look)
+            with pytest.raises(WriterTakenError):
+                python.item("ball").put(b"ours")
+        directory.dismiss(place / "peer-robot2")
+        assert "no robot robot2" in c.say("get", "ball", "robot2")
+        assert "theirs" not in c.say("snapshot")
+        with pytest.raises(WriterTakenError):
+            python.item("ball").put(b"ours")
+        assert python.item("ball").get().value == b"mine"
+
+
+def test_snapshots_by_c_go_on_while_a_robot_comes_and_leaves(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        added(python, c)
+        python.item("ball").put(b"mine")
+        ends = threading.Event()
+
+        def come_and_go() -> None:
+            while not ends.is_set():
+                with_peer(python, place, "robot2", rank=1)
+                directory.dismiss(place / "peer-robot2")
+
+        comes = threading.Thread(target=come_and_go)
+        comes.start()
+        try:
+            for _ in range(200):
+                words = {word.partition("=")[0] for word in c.say("snapshot").split(" ") if word}
+                assert words in ({f"{python.robot}/ball"}, {f"{python.robot}/ball", "robot2/ball"})
+        finally:
+            ends.set()
+            comes.join()
+
+
 # --- Waiting ---------------------------------------------------------------------------------------------------------
 
 
@@ -224,6 +270,45 @@ def test_c_waits_for_a_put_of_any_of_several_items_of_several_robots(place: Path
             python.item(name).put(b"%d" % turn)
             assert c.process.stdout is not None
             assert c.process.stdout.readline() == {"ball": "item 1\n", "plan": "item 2\n"}[name]
+
+
+def test_of_several_items_that_are_put_all_the_time_each_has_its_turn(place: Path) -> None:
+    with board(place) as python, tool(place) as c:
+        for name in ("ball", "plan", "goal"):
+            added(python, c, name)
+            python.item(name).put(b"!")
+        wanted = ("any", "ball", "-", 0, "plan", "-", 0, "goal", "-", 0, 60_000)
+        assert sorted(c.say(*wanted) for _ in range(3)) == ["item 0", "item 1", "item 2"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="another user is needed")
+def test_c_is_woken_by_a_put_into_a_file_that_another_user_writes(place: Path) -> None:
+    with board(place) as python, tool(place, opened=False) as c:
+        place.chmod(0o755)
+        for path in place.iterdir():
+            path.chmod(0o666)
+        directory.make_file(place / "own+0", layout.OWN, python.robot, items={0: Declaration("theirs", size=8)}, mode=0o644)
+        c.ok("user", 65534)
+        c.ok("open")
+        added(python, c)
+        c.ok("find", "theirs", 8)
+        with board(place) as putting:
+            file, record = putting.found("theirs", python.robot)
+            newest = file.address(record.at + layout.NEWEST_FIELD)
+            assert c.process.stdin is not None and c.process.stdout is not None
+            c.process.stdin.write("any ball - 0 theirs - 0 60000\n")
+            c.process.stdin.flush()
+            end = time.monotonic() + 30
+            while woken(newest) != 1:
+                assert time.monotonic() < end, "it does not sleep on the item of the other user"
+                time.sleep(0.001)
+            putting.item("theirs").put(b"!")
+            assert c.process.stdout.readline() == "item 1\n"
+
+
+def woken(address: int) -> int:
+    """How many slept on a word, and are awake now."""
+    return int(futex._call()(futex._number(), ctypes.c_void_p(address), futex._WAKE, futex._ALL, None, None, 0))
 
 
 # --- Writers and users -----------------------------------------------------------------------------------------------
