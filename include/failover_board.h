@@ -639,7 +639,7 @@ static inline void fb_sleep_any_(const fb_sleeper_ *sleepers, unsigned count, in
         limit.tv_nsec = (long)(end % 1000000000);
         if (syscall(FB_FUTEX_WAITV_, sleepers, count, 0, &limit, CLOCK_MONOTONIC) >= 0 || (errno != ENOSYS && errno != EPERM))
             return;
-        ns = ns > FB_POLL_NS_ ? FB_POLL_NS_ : ns;
+        ns = ns > (int64_t)FB_POLL_NS_ ? (int64_t)FB_POLL_NS_ : ns;
     }
     fb_sleep_((const void *)(uintptr_t)sleepers[0].address, (uint32_t)sleepers[0].value, ns);
 }
@@ -878,7 +878,10 @@ static inline bool fb_is_there_(const fb_area_ *area)
 static inline void fb_leave_(fb_board *board, fb_area_ **link)
 {
     fb_area_ *area = *link;
+    struct flock lock;
     *link = area->next;
+    if (area->file >= 0)
+        fb_lock_(area->file, F_OFD_SETLK, &lock, F_UNLCK, 0, 0); /* all of them: what is mapped keeps the opening, and that its locks */
     fb_shut_(area);
     if (area->is_used) {
         area->next = board->left;

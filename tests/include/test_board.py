@@ -187,6 +187,23 @@ def test_a_program_that_reads_all_robots_stays_the_writer_of_its_items(place: Pa
         assert python.item("ball").get().value == b"mine"
 
 
+def test_a_program_that_opens_the_same_board_anew_stays_the_writer_of_its_items(place: Path) -> None:
+    """What it has mapped stays mapped, and must not hold the locks of the opening before."""
+    with board(place) as python, tool(place) as c:
+        added(python, c)
+        python.add(Declaration("secret", size=8, shared=False))
+        python.item("secret").put(b"private")
+        c.ok("put", "ball", "mine")
+        c.ok("find", "secret", 8)
+        assert "private" in c.say("get", "secret", "-")
+        file, _ = python.found("secret", python.robot)
+        file.words[layout.GENERATION_AT // 8] = layout.GONE
+        assert "has no item secret" in c.say("get", "secret", "-")
+        c.ok("put", "ball", "mine")
+        with pytest.raises(WriterTakenError):
+            python.item("ball").put(b"ours")
+
+
 def test_snapshots_by_c_go_on_while_a_robot_comes_and_leaves(place: Path) -> None:
     with board(place) as python, tool(place) as c:
         added(python, c)
