@@ -179,6 +179,7 @@ class Config:
         runtime_directory: sockets; gone after a reboot.
         insecure: run without keys: any machine on the network can read memory and start programs.
         group: unix group that may use the control socket besides its owner; "" for no group.
+        page_user: the user whose process, the operators' page, may ask for other users of the group; "" for none.
         components_per_user: that a user other than root may have here, those that have ended included.
         beat_ms: period of beats to each peer.
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
@@ -209,6 +210,7 @@ class Config:
     runtime_directory: str = "/run/failover"
     insecure: bool = False
     group: str = ""
+    page_user: str = ""
     components_per_user: int = 64
     beat_ms: int = 20
     lease_ms: int = 200

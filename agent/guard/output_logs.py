@@ -133,7 +133,8 @@ class OutputLogs:
     def read(self, stream: int, offset: int, size: int = READ_LIMIT, *, committed: bool = True) -> OutputPiece:
         """The stream's bytes from ``offset`` on, at most ``size``; fewer, or none, where the stream ends.
 
-        The piece says where it begins: later than asked where the beginning is no longer kept.
+        The piece says where it begins: later than asked where the beginning is no longer kept. An offset below zero counts from
+        the present end.
 
         Args:
             committed: only bytes that no takeover can take back, of held output only safe ones; otherwise all that was written.
@@ -141,7 +142,7 @@ class OutputLogs:
         while True:
             bounds = self.bounds(stream)
             shown = (bounds.safe if self.is_held else bounds.committed) if committed else bounds.size
-            begin = max(offset, bounds.start)
+            begin = max(offset if offset >= 0 else shown + offset, bounds.start)
             end = min(shown, begin + min(size, READ_LIMIT))
             content = os.pread(self._logs[stream], end - begin, begin) if end > begin else b""
             if self._offset(stream, START) <= begin:  # otherwise it was given back while we read, and we may have read zeros

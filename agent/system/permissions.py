@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import array
 import contextlib
+import grp
 import os
 import pwd
 import select
@@ -81,6 +82,23 @@ def check_right(uid: int, component: str, owner: int | None) -> None:
         raise RefusedError(f"{component} {whose}; its owner and root may give orders and read its output", "PermissionError")
 
 
+def refusal_without_rules(uid: int, right: str, path: str, owners: Mapping[str, int | None]) -> str:
+    """Why a user may not do something where there is no rights.toml; "" if he may.
+
+    Args:
+        owners: component → whose it is. A path of none of them is a robot, an item of the board or a driver.
+    """
+    if right in ("program", "grant"):
+        return f"{right} needs a rule in rights.toml, and there is none"
+    if right not in ("read", "operate") or path not in owners:
+        return ""
+    try:
+        check_right(uid, path, owners[path])
+    except RefusedError as refusal:
+        return str(refusal)
+    return ""
+
+
 def without_output(told: Any) -> Any:
     """The same without the output of programs, in all of its sentences: for a user who may not read their output."""
     if isinstance(told, str):
@@ -94,6 +112,47 @@ def without_output(told: Any) -> Any:
 def uid_of(connection: socket.socket) -> int:
     """Whose the client is."""
     return int(_CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[1])
+
+
+def spoken_for(speaker: Caller, uid: int, page_user: str, group: str) -> Caller:
+    """The user for whom a client asks, as if that user had connected.
+
+    Args:
+        page_user: of agent.toml. group: whose members may connect.
+
+    Raises:
+        RefusedError: this client may not speak for that user, or that user may not connect.
+    """
+    if not may(speaker.uid, None) and (speaker.uid == NOBODY or speaker.uid != uid_named(page_user)):
+        raise RefusedError(
+            f"uid {speaker.uid} may not ask for other users: page_user in agent.toml names the only one who may",
+            "PermissionError",
+        )
+    if may(uid, None) and uid != speaker.uid:
+        raise RefusedError(
+            f"uid {uid} is root or the agent's own user, for whom no process may ask; give the order by the command failover",
+            "PermissionError",
+        )
+    if not may(uid, None) and not _is_member(uid, group):
+        cure = f"add it to the group {group}" if group else 'name a group in agent.toml (group = "failover"), and add it there'
+        raise RefusedError(f"uid {uid} may not use the agent's socket, so no process may ask for it; {cure}", "PermissionError")
+    return Caller(uid, NOBODY, (), Inheritance(uid, NOBODY))
+
+
+def uid_named(user: str) -> int:
+    """The number of a user's account; `NOBODY` where there is none."""
+    try:
+        return pwd.getpwnam(user).pw_uid
+    except KeyError:
+        return NOBODY
+
+
+def _is_member(uid: int, group: str) -> bool:
+    try:
+        wanted, account = grp.getgrnam(group).gr_gid, pwd.getpwuid(uid)
+    except KeyError:
+        return False
+    return wanted in os.getgrouplist(account.pw_name, account.pw_gid)
 
 
 def caller_of(connection: socket.socket) -> Caller:

@@ -166,7 +166,9 @@ class Switchboard:
         await self._begin()
         self._wires.watch()
         self._connections.open()
-        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.gated())
+        server = ControlServer(
+            self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.gated(), self.settings.config.page_user
+        )
         await server.open()
         syscalls.give_back()  # what the start has left
         try:

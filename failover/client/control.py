@@ -24,15 +24,21 @@ verb           arguments                                                result, 
 ``release``    ``name`` *must*                                          ``{name, pid}``; the program runs on, unprotected
 ``start``      ``name`` *must*                                          ``{name, robot, notes}``: of agent.toml, after its end
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
-``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]     Output …, Result ``{name, totals, exit_status}``
+``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]:    Output …, Result ``{name, totals, exit_status}``
+               below zero, from the end of the stream
 ``why``        ``name`` "", ``robot`` "", ``age_ms_max`` 0               see `WHY`
 ``rights``     ``user``, ``right``, ``path``, all *must*                ``{allow, because, groups, place}``
+``may``        ``rights`` *must*, ``paths`` *must*                      ``{robot, team, answers: {right: {path: because}}}``:
+                                                                        may this user; "" if so, else why not
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*                                          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
 ``promote``    ``name`` *must*, ``robot`` = newest checkpoint's,         ``{name, to, epoch, promoted, sentence, risks}``; unless
                ``sure`` false                                           ``sure`` nothing is done, and they tell what would be
 =============  =======================================================  ========================================================
+
+The orders ``release``, ``stop`` and ``handover`` to ``promote`` also take ``epoch``: the epoch that the user saw; if the
+component has another one when the order is obeyed, nothing is done. 0, the default: any.
 """
 
 from __future__ import annotations
@@ -61,6 +67,7 @@ rights: one sentence: by which rules and whose groups rights are decided here, a
 memory: {agent, keepers, remembered, remembered_max}: bytes of private memory of main loop and worker, and of the keepers of
     components that run here; remembered: of these, what pages are remembered in, of all components together, and its bound
     (xor_cache of agent.toml); None of a witness
+descriptors: {main_loop, worker}: open descriptors of the agent's processes
 healthy: nothing is degraded, nothing has failed, no robot is silent, as far as this robot knows; with ``team`` as far as any
     robot that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
 notes: [sentence, …]: what is missing or degraded on this robot
@@ -142,6 +149,11 @@ MESSAGE_LIMIT: Final = 16 << 20
 REQUEST_LIMIT: Final = 4 << 20
 """Bytes of one request: the kernel takes no program with more arguments and environment than 6 MB, and by default with 2 MB."""
 
+ON_BEHALF: Final = frozenset(
+    ("ping", "status", "why", "may", "logs", "start", "stop", "release", "handover", "failback", "prefer", "promote")
+)
+"""What one user's process may ask for another user: nothing that starts a program or takes a process in."""
+
 LENGTH: Final = struct.Struct(">I")
 SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
@@ -153,10 +165,16 @@ _TIMEVAL: Final = struct.Struct("@ll")
 
 
 class Request(msgspec.Struct, frozen=True):
-    """One request of a client."""
+    """One request of a client.
+
+    Attributes:
+        on_behalf: uid of the user for whom it is made; None: for the client itself. The agent takes it from root, from its own
+            user, and from ``page_user`` of agent.toml; never for root, and only for the verbs in `ON_BEHALF`.
+    """
 
     verb: str
     arguments: dict[str, Any] = {}
+    on_behalf: int | None = None
 
 
 class Update(msgspec.Struct, frozen=True, tag="update"):
@@ -234,7 +252,7 @@ class Control:
                 link.connect(address)
         except OSError as error:
             link.close()
-            raise NoAgentError(_why_not(path, error)) from error
+            raise NoAgentError(why_unreachable(path, error)) from error
         link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(0, 0))
         return cls(link, path)
 
@@ -262,7 +280,7 @@ class Control:
             AgentRefusedError, LostAgentError: as for `ask`.
             RequestError: it cannot be said.
         """
-        self._send(_encoded(Request(verb, arguments)), verb)
+        self._send(encoded(Request(verb, arguments)), verb)
         while True:
             reply = self._receive(verb)
             if isinstance(reply, Refused):
@@ -304,10 +322,7 @@ class Control:
         (size,) = LENGTH.unpack(self._exactly(LENGTH.size, verb))
         if size > MESSAGE_LIMIT:
             raise LostAgentError(f"{self._path} announced a reply of {size} bytes, over {MESSAGE_LIMIT}; is it an agent?")
-        try:
-            return _reply_decoder.decode(self._exactly(size, verb))
-        except UNDECODABLE as error:
-            raise LostAgentError(f"cannot understand the answer of {self._path} to {verb}: {error}; same version?") from error
+        return decoded(self._exactly(size, verb), self._path, verb)
 
     def _exactly(self, size: int, verb: str) -> bytes:
         parts = bytearray()
@@ -322,7 +337,12 @@ class Control:
         return bytes(parts)
 
 
-def _encoded(request: Request) -> bytes:
+def encoded(request: Request) -> bytes:
+    """A request as it is sent, without its length.
+
+    Raises:
+        RequestError: it cannot be said.
+    """
     try:
         body = _encoder.encode(request)
     except (UnicodeEncodeError, OverflowError) as error:
@@ -333,11 +353,24 @@ def _encoded(request: Request) -> bytes:
     return body
 
 
+def decoded(body: bytes, path: Path, verb: str) -> Reply:
+    """A reply of the agent at ``path`` to ``verb``.
+
+    Raises:
+        LostAgentError: it is none that this version understands.
+    """
+    try:
+        return _reply_decoder.decode(body)
+    except UNDECODABLE as error:
+        raise LostAgentError(f"cannot understand the answer of {path} to {verb}: {error}; same version?") from error
+
+
 ODD_SHOWN: Final = 60
 """Characters of a text that cannot be sent, in the message about it."""
 
 
-def _why_not(path: Path, error: OSError) -> str:
+def why_unreachable(path: Path, error: OSError) -> str:
+    """One sentence, with the cure."""
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
         ConnectionRefusedError: "the agent of this socket has ended; start failover-agent again",

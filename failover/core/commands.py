@@ -17,7 +17,7 @@ _RUNNING = frozenset({State.PRIMARY, State.FROZEN})
 
 def obey(component: Component, turn: Turn, command: Command) -> None:
     """Carry out one command, or say why not."""
-    if refusal := _why_not_by(component, command):
+    if refusal := _why_not_by(component, command) or _why_stale(component, command):
         turn.order(acts.Answer(command.request, False, refusal))
         return
     match command:
@@ -46,6 +46,17 @@ def _why_not_by(component: Component, command: Command) -> str:
     if command.by is None or component.spec is None or is_new or component.spec.owner == command.by:
         return ""
     return f"{component.name} belongs to uid {component.spec.owner}; uid {command.by} may give it no orders: nothing was done"
+
+
+def _why_stale(component: Component, command: Command) -> str:
+    """The component has moved since the user looked at it: what was right for the epoch seen may be wrong now."""
+    if isinstance(command, Run) or command.decided in (0, component.epoch):
+        return ""
+    where = f", at {component.primary}" if component.primary else ""
+    return (
+        f"{component.name} has changed since this order was decided: epoch {command.decided} then, {component.epoch} "
+        f"now{where}; look at it, and give the order again; nothing was done"
+    )
 
 
 def _run(component: Component, turn: Turn, command: Run) -> None:

@@ -264,6 +264,7 @@ class Release(Struct, frozen=True):
     request: int
     component: str
     by: int | None = None
+    decided: int = 0
 
 
 class Stop(Struct, frozen=True):
@@ -273,6 +274,7 @@ class Stop(Struct, frozen=True):
     component: str
     signal: int = 15
     by: int | None = None
+    decided: int = 0
 
 
 class Handover(Struct, frozen=True):
@@ -282,6 +284,7 @@ class Handover(Struct, frozen=True):
     component: str
     to: str = ""
     by: int | None = None
+    decided: int = 0
 
 
 class Promote(Struct, frozen=True):
@@ -295,6 +298,7 @@ class Promote(Struct, frozen=True):
     component: str
     is_trial: bool = False
     by: int | None = None
+    decided: int = 0
 
 
 class Failback(Struct, frozen=True):
@@ -303,6 +307,7 @@ class Failback(Struct, frozen=True):
     request: int
     component: str
     by: int | None = None
+    decided: int = 0
 
 
 class Prefer(Struct, frozen=True):
@@ -312,10 +317,14 @@ class Prefer(Struct, frozen=True):
     component: str
     robot: str
     by: int | None = None
+    decided: int = 0
 
 
 Command = Run | Release | Stop | Handover | Promote | Failback | Prefer
-"""``by``: uid of the user who gives the order; None: one who may give any. Its right is looked at when it is obeyed."""
+"""``by``: uid of the user who gives the order; None: one who may give any. Its right is looked at when it is obeyed.
+
+``decided``: the epoch that the user saw; if it is another one by now, nothing is done. 0: any epoch.
+"""
 
 Event = (
     Tick

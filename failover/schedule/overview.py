@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from msgspec import Struct
 
 from failover.boards import SCHEDULE_NAME, boottime, directory
+from failover.boards.openings import rows_of
 from failover.boards.schedule_file import Order, ScheduleFile
 from failover.core.schedule import layout
 from failover.core.schedule.activation import STATES, State
@@ -93,6 +95,17 @@ def overview(file: ScheduleFile) -> list[Seen]:
     places = {row.name: index for index, row in rows.items()}
     terms = {row.name: row.terms for row in rows.values() if row.terms is not None}
     return [_seen(file, rows, places[name]) for name in by_deadline(terms)]
+
+
+def owners(file: ScheduleFile, seen: Sequence[Seen], status: Mapping[str, Any] | None) -> dict[str, str]:
+    """Task → the component whose program runs it here: by the locks of its processes, else by its name."""
+    found = {}
+    here = [one for one in (status or {}).get("components", ()) if one.get("primary") == (status or {}).get("robot")]
+    names = {one["name"] for one in here}
+    for one in here:
+        rows = rows_of(one["pid"], file.identity) if one.get("pid") else set()
+        found.update({row.name: one["name"] for index, row in file.rows().items() if index in rows})
+    return {**{one.task: one.task for one in seen if one.task in names}, **found}
 
 
 def _seen(file: ScheduleFile, rows: Rows, index: int) -> Seen:

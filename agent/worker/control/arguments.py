@@ -19,14 +19,23 @@ PID_MAX: Final = (1 << 31) - 1
 USER_SIZE_MAX: Final = 256
 """Characters of a user's name: what useradd(8) takes."""
 
+RIGHTS_ASKED_MAX: Final = 8
+"""Rights in one question: there are no more."""
+
+PATHS_ASKED_MAX: Final = 4_096
+"""Paths in one question: all components of a team, and more items than a board has."""
+
 Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
 """Text that the kernel can be told: a string of C ends with a NUL."""
 
 Variable = Annotated[str, msgspec.Meta(pattern=r"\A[^\0=]+\Z")]
 """A name in the environment."""
 
-Offset = Annotated[int, msgspec.Meta(ge=0)]
-"""Of a byte in a stream, from its beginning."""
+Offset = Annotated[int, msgspec.Meta(ge=-(1 << 28))]
+"""Of a byte in a stream, from its beginning; below zero: so many bytes before its present end."""
+
+Epoch = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
+"""The epoch that an order was decided on; 0: any."""
 
 Age = Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
 """Milliseconds since something happened; 0 for no limit."""
@@ -86,6 +95,13 @@ class RightsArguments(msgspec.Struct, forbid_unknown_fields=True):
     path: str
 
 
+class MayArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``may``."""
+
+    rights: Annotated[list[str], msgspec.Meta(min_length=1, max_length=RIGHTS_ASKED_MAX)]
+    paths: Annotated[list[str], msgspec.Meta(max_length=PATHS_ASKED_MAX)]
+
+
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``protect``."""
 
@@ -103,6 +119,7 @@ class StopArguments(msgspec.Struct, forbid_unknown_fields=True):
 
     name: str
     signal: Annotated[int, msgspec.Meta(ge=1, le=SIGNAL_MAX)] = 15
+    epoch: Epoch = 0
 
 
 class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -114,9 +131,10 @@ class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``release`` and ``failback``."""
+    """Of ``release``, ``start`` and ``failback``."""
 
     name: str = ""
+    epoch: Epoch = 0
 
 
 class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -124,6 +142,7 @@ class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
 
     name: str
     to: str = ""
+    epoch: Epoch = 0
 
 
 class PromoteArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -132,6 +151,7 @@ class PromoteArguments(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     robot: str = ""
     sure: bool = False
+    epoch: Epoch = 0
 
 
 class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -139,6 +159,7 @@ class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
 
     name: str
     robot: str
+    epoch: Epoch = 0
 
 
 class StatusArguments(msgspec.Struct, forbid_unknown_fields=True):

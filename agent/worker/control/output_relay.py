@@ -62,6 +62,8 @@ class OutputRelay:
     ) -> tuple[int, int]:
         """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record.
 
+        An offset below zero counts from the end.
+
         Args:
             committed: only what no takeover can take back; all of it once it has ended.
             check: asked again and again whether a rule lets this user read it, with any owner; raises where it does not.
@@ -84,7 +86,7 @@ class OutputRelay:
                     at[stream] = piece.offset + len(piece.content)
                     sent = True
             if not sent and (over or not follow):
-                return at[1], at[2]
+                return max(at[1], 0), max(at[2], 0)
             if not sent:
                 await asyncio.sleep(POLL_S)
 

@@ -16,8 +16,15 @@ from typing import Any, Final, Protocol
 from agent.config import Settings
 from agent.errors import RefusedError
 from agent.main_loop.messages import Told
-from agent.system.permissions import may, without_output
-from agent.worker.control.arguments import NameArguments, RightsArguments, StatusArguments, WhyArguments, arguments_of
+from agent.system.permissions import may, refusal_without_rules, without_output
+from agent.worker.control.arguments import (
+    MayArguments,
+    NameArguments,
+    RightsArguments,
+    StatusArguments,
+    WhyArguments,
+    arguments_of,
+)
 from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.control.status_view import version
@@ -86,6 +93,7 @@ class Questions:
             "status": self.status,
             "why": self.why,
             "rights": self.rights,
+            "may": self.may,
             **dict.fromkeys(WORK, self._no_work),
         }
 
@@ -201,6 +209,24 @@ class Questions:
         answer, subject = await gate.explained(wanted.user, wanted.right, wanted.path, owner)
         told = {"allow": answer.allow, "because": answer.because, "groups": sorted(subject.groups)}
         return told | {"place": answer.rule.place if answer.rule is not None else ""}
+
+    async def may(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Which of these rights does the asking user have at these paths?"""
+        wanted, uid = arguments_of(MayArguments, "may", arguments), say.caller.uid
+        told = await self._lines.ask("status")
+        owners = {one.name: one.owner for one in told.status.components} if told.status else {}
+        gate = self._rules()
+        answers: dict[str, dict[str, str]] = {}
+        for right in wanted.rights:
+            asker = await gate.subject(uid, right) if gate is not None else None
+            found = answers[right] = {}
+            for path in wanted.paths:
+                if gate is not None and asker is not None:
+                    answer = gate.decision(asker, right, path, owners.get(path))
+                    found[path] = "" if answer else answer.because
+                else:
+                    found[path] = refusal_without_rules(uid, right, path, owners)
+        return {"robot": self._lines.settings.config.robot, "team": self._lines.settings.team.team, "answers": answers}
 
     async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""

@@ -37,7 +37,12 @@ OTHERS_BYTES_MAX: Final = 32 << 20
 class Admission:
     """How much of the control socket each user holds. Lives in one asyncio loop."""
 
-    def __init__(self) -> None:
+    def __init__(self, page_uid: int = -1) -> None:
+        """
+        Args:
+            page_uid: the user of the operators' page: it holds connections for many users, and gets as many as root.
+        """
+        self._page_uid = page_uid
         self._connections: Counter[int] = Counter()
         self._bytes: Counter[int] = Counter()
 
@@ -47,13 +52,15 @@ class Admission:
         Raises:
             RefusedError: the user, or all of them together, hold too many; then it is not counted.
         """
-        most = TRUSTED_CONNECTIONS_MAX if is_trusted(uid) else USER_CONNECTIONS_MAX
+        has_own_places = is_trusted(uid) or uid == self._page_uid
+        most = TRUSTED_CONNECTIONS_MAX if has_own_places else USER_CONNECTIONS_MAX
         if self._connections[uid] >= most:
             raise RefusedError(
                 f"uid {uid} holds {self._connections[uid]} connections to the agent, the most for one user; end some of its "
                 "failover commands that wait, or close connections that are not used"
             )
-        if not is_trusted(uid) and _others(self._connections) >= OTHERS_CONNECTIONS_MAX:
+        others = _others(self._connections) - self._connections[self._page_uid]
+        if not has_own_places and others >= OTHERS_CONNECTIONS_MAX:
             raise RefusedError(
                 f"users other than root hold {OTHERS_CONNECTIONS_MAX} connections to the agent, the most for all of them; end "
                 "some of their failover commands that wait, or ask as root"

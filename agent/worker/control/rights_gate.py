@@ -29,6 +29,7 @@ RIGHT_OF: Final = {
     "status": "see",
     "why": "see",
     "rights": "see",
+    "may": "see",
     "logs": "read",
     "run": "start",
     "protect": "start",

@@ -14,11 +14,11 @@ import msgspec
 
 from agent.errors import AgentError, RefusedError
 from agent.system.crash import end_worker_on_mistake
-from agent.system.permissions import Caller, caller_of, uid_of
+from agent.system.permissions import NOBODY, Caller, caller_of, spoken_for, uid_named, uid_of
 from agent.worker.control.quotas import Admission
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.linux.unix_address import address_of
-from failover.client.control import LENGTH, REQUEST_LIMIT, Output, Refused, Reply, Request, Result, Update
+from failover.client.control import LENGTH, ON_BEHALF, REQUEST_LIMIT, Output, Refused, Reply, Request, Result, Update
 from failover.errors import FailoverError
 
 OWNER_ONLY: Final = 0o600
@@ -41,7 +41,7 @@ class Conversation:
     """The answers of a verb to its client while it works, and the client's identity."""
 
     def __init__(self, writer: asyncio.StreamWriter, caller: Caller) -> None:
-        self._writer = writer
+        self.writer = writer
         self.caller = caller
 
     async def update(self, value: dict[str, Any]) -> None:
@@ -54,7 +54,7 @@ class Conversation:
 
     async def reply(self, reply: Reply) -> None:
         """One message; waits while the client does not read."""
-        await _say(self._writer, reply)
+        await _say(self.writer, reply)
 
 
 Verb = Callable[[Conversation, dict[str, Any]], Awaitable[dict[str, Any]]]
@@ -64,13 +64,18 @@ Verb = Callable[[Conversation, dict[str, Any]], Awaitable[dict[str, Any]]]
 class ControlServer:
     """The listening end. Lives in the worker's loop."""
 
-    def __init__(self, path: Path, group: str, verbs: dict[str, Verb]) -> None:
+    def __init__(self, path: Path, group: str, verbs: dict[str, Verb], page_user: str = "") -> None:
+        """
+        Args:
+            page_user: the user whose process may ask for other users, besides root and our own; "": none.
+        """
+        self._page_user = page_user
         self._path = path
         self._group = group
         self._verbs = verbs
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
-        self._admission = Admission()
+        self._admission = Admission(uid_named(page_user) if page_user else NOBODY)
 
     async def open(self) -> None:
         """Listen; only the owner, and the group if there is one, may connect.
@@ -148,10 +153,24 @@ class ControlServer:
         try:
             if not await self._receive(reader, uid, body):
                 return False
-            await self._serve(_request(body), conversation, reader)
+            request = _request(body)
+            await self._serve(request, self._for_whom(request, conversation), reader)
             return True
         finally:
             self._admission.let_go(uid, _counted(len(body)))
+
+    def _for_whom(self, request: Request, conversation: Conversation) -> Conversation:
+        """The same conversation, with the user for whom the request is made.
+
+        Raises:
+            RefusedError: the client may not speak for that user.
+        """
+        if request.on_behalf is None:
+            return conversation
+        if request.verb not in ON_BEHALF:
+            raise RefusedError(f"{request.verb} is asked by the user itself, never on behalf of one", "PermissionError")
+        caller = spoken_for(conversation.caller, request.on_behalf, self._page_user, self._group)
+        return Conversation(conversation.writer, caller)
 
     async def _receive(self, reader: asyncio.StreamReader, uid: int, body: bytearray) -> bool:
         """Add the bytes of the next request to ``body`` as they arrive; False when the client has closed instead.

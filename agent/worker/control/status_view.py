@@ -95,6 +95,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "rule": view.rule if view else None,
         "promise": view.promise if view else "not decided yet: the agent is starting",
         "memory": asdict(ours.memory) if ours.memory is not None else None,
+        "descriptors": {"main_loop": _descriptors(life.main_loop), "worker": _descriptors(os.getpid())},
         "fencing": fencing_status.sentence(fencing_status.watchdog()),
         "healthy": view.healthy if view else False,
         "notes": notes,
@@ -116,6 +117,14 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         },
         "lanes_pid": os.getpid(),
     }
+
+
+def _descriptors(pid: int) -> int | None:
+    """How many a process of this agent has open; None where the system does not tell."""
+    try:
+        return len(os.listdir(f"/proc/{pid}/fd"))
+    except OSError:
+        return None
 
 
 def _medium(view: MediumView) -> dict[str, Any]:

@@ -207,10 +207,11 @@ class Verbs(Questions):
 
     async def release(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Let a component run on unprotected; answers once its guard has been told, so that no later agent finds it again."""
-        name = await self._known(arguments_of(NameArguments, "release", arguments).name)
+        wanted = arguments_of(NameArguments, "release", arguments)
+        name = await self._known(wanted.name)
         supervisor = self._worker.supervisor(name)
         pid = supervisor.component.pid if supervisor.component is not None else None
-        await self._command(by, lambda number: events.Release(number, name))
+        await self._command(by, lambda number: events.Release(number, name, decided=wanted.epoch))
         await supervisor.let_go()  # the order came before the answer
         return {"name": name, "pid": pid}
 
@@ -234,7 +235,7 @@ class Verbs(Questions):
         wanted = arguments_of(StopArguments, "stop", arguments)
         name = await self._known(wanted.name)
         end = self._worker.supervisor(name).end()
-        await self._command(by, lambda number: events.Stop(number, name, wanted.signal))
+        await self._command(by, lambda number: events.Stop(number, name, wanted.signal, decided=wanted.epoch))
         report = await asyncio.shield(end)
         return {"name": name, "exit_status": report.status}
 
@@ -243,14 +244,15 @@ class Verbs(Questions):
         wanted = arguments_of(HandoverArguments, "handover", arguments)
         name = await self._known(wanted.name)
         await self._check_fit(name, "hand {} over to {}", wanted.to or (await self._view(name))["standby"])
-        return await self._moved(by, name, lambda number: events.Handover(number, name, wanted.to))
+        return await self._moved(by, name, lambda number: events.Handover(number, name, wanted.to, decided=wanted.epoch))
 
     async def failback(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
-        name = await self._known(arguments_of(NameArguments, "failback", arguments).name)
+        wanted = arguments_of(NameArguments, "failback", arguments)
+        name = await self._known(wanted.name)
         view = await self._view(name)
         await self._check_fit(name, "fail {} back to {}", view["prefer"] or view["home"])
-        return await self._moved(by, name, lambda number: events.Failback(number, name))
+        return await self._moved(by, name, lambda number: events.Failback(number, name, decided=wanted.epoch))
 
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot lacks of what a component needs to go on here."""
@@ -306,7 +308,7 @@ class Verbs(Questions):
         wanted = arguments_of(PreferArguments, "prefer", arguments)
         name = await self._known(wanted.name)
         await self._check_fit(name, "let {} prefer {}", wanted.robot)
-        await self._command(by, lambda number: events.Prefer(number, name, wanted.robot))
+        await self._command(by, lambda number: events.Prefer(number, name, wanted.robot, decided=wanted.epoch))
         return {"name": name, "robot": wanted.robot}
 
     async def promote(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -317,7 +319,7 @@ class Verbs(Questions):
         if robot not in self._worker.settings.team.robots:
             known = ", ".join(sorted(self._worker.settings.team.robots))
             raise RefusedError(f"cannot promote {robot!r} for {name}: the team knows {known}")
-        order = {"name": name, "robot": robot, "sure": wanted.sure}
+        order = {"name": name, "robot": robot, "sure": wanted.sure, "epoch": wanted.epoch}
         if robot == me:
             return await self._permitted(self._promoted, order, say.caller.uid)
         return await self._worker.errands.send(robot, "promoted", order, say.caller.uid)
@@ -325,7 +327,9 @@ class Verbs(Questions):
     async def _promoted(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Promote this robot, or tell what that would risk."""
         wanted = arguments_of(PromoteArguments, "promote", arguments)
-        answer = await self._command(by, lambda number: events.Promote(number, wanted.name, not wanted.sure))
+        answer = await self._command(
+            by, lambda number: events.Promote(number, wanted.name, not wanted.sure, decided=wanted.epoch)
+        )
         view = await self._view(wanted.name)
         told = {"name": wanted.name, "to": wanted.robot, "epoch": view["epoch"], "sentence": answer.sentence}
         return {**told, "promoted": wanted.sure, "risks": list(answer.risks)}

@@ -12,7 +12,6 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from failover.boards import boottime
-from failover.boards.openings import rows_of
 from failover.boards.schedule_file import Order, ScheduleFile
 from failover.cli.output import render, task_tree
 from failover.cli.output.board_tree import span
@@ -23,7 +22,7 @@ from failover.core.schedule.course import Overrun
 from failover.core.schedule.orders import Change
 from failover.core.schedule.terms import CPUS_MAX, Declaration, Kind, Terms, nanoseconds
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError, ScheduleError
-from failover.schedule.overview import Seen, is_none_there, judged, open_schedule, overview
+from failover.schedule.overview import Seen, is_none_there, judged, open_schedule, overview, owners
 
 SPANS: Final = {
     "period_ms": "period_ns",
@@ -94,17 +93,6 @@ def _team(meter: Meter) -> tuple[dict[str, Any] | None, dict[str, Use | None]]:
         return None, {}
     here = [one for one in status["components"] if one.get("primary") == status["robot"] and one.get("pid")]
     return status, {one["name"]: meter.of(one["pid"]) for one in here}
-
-
-def owners(file: ScheduleFile, seen: Sequence[Seen], status: Mapping[str, Any] | None) -> dict[str, str]:
-    """Task → the component whose program runs it here: by the locks of its processes, else by its name."""
-    found = {}
-    here = [one for one in (status or {}).get("components", ()) if one.get("primary") == (status or {}).get("robot")]
-    names = {one["name"] for one in here}
-    for one in here:
-        rows = rows_of(one["pid"], file.identity) if one.get("pid") else set()
-        found.update({row.name: one["name"] for index, row in file.rows().items() if index in rows})
-    return {**{one.task: one.task for one in seen if one.task in names}, **found}
 
 
 # --- Orders ----------------------------------------------------------------------------------------------------------

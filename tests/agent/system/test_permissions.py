@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import grp
 import os
+import pwd
 import resource
 import select
 import signal
@@ -17,7 +19,7 @@ from msgspec.structs import replace
 
 from agent.errors import RefusedError
 from agent.system import permissions
-from agent.system.permissions import NOBODY, caller_of, check_right, guest_of, inheritance_for, may
+from agent.system.permissions import NOBODY, Caller, caller_of, check_right, guest_of, inheritance_for, may, spoken_for
 from agent.worker.components.restore_limits import check_rights
 from checkpoint.errors import FormatError, MismatchError
 from checkpoint.linux.spawn.inherited_limits import Inheritance
@@ -125,6 +127,36 @@ def test_a_program_of_another_user_ends_with_its_parent_all_the_same() -> None:
         process.wait()
     assert select.select([pidfd], [], [], BOUND_S)[0]
     os.close(pidfd)
+
+
+def caller(uid: int) -> Caller:
+    return Caller(uid, uid, (), Inheritance(uid, uid))
+
+
+MEMBER, GROUP = "nobody", grp.getgrgid(pwd.getpwnam("nobody").pw_gid).gr_name
+
+
+@as_root
+def test_one_user_alone_may_ask_for_the_members_of_the_group() -> None:
+    uid = pwd.getpwnam(MEMBER).pw_uid
+    page = pwd.getpwnam("daemon").pw_uid
+    for speaker in (0, page):
+        spoken = spoken_for(caller(speaker), uid, "daemon", GROUP)
+        assert (spoken.uid, spoken.groups, spoken.inheritance.uid) == (uid, (), uid)
+    for speaker, wanted, page_user, group, why in (
+        (SOMEBODY, uid, "daemon", GROUP, "may not ask for other users"),
+        (page, uid, "", GROUP, "may not ask for other users"),
+        (page, uid, "no-such-user", GROUP, "may not ask for other users"),
+        (NOBODY, uid, "no-such-user", GROUP, "may not ask for other users"),
+        (page, 0, "daemon", GROUP, "command failover"),
+        (page, SOMEBODY, "daemon", GROUP, f"add it to the group {GROUP}"),
+        (page, page, "daemon", GROUP, f"add it to the group {GROUP}"),
+        (page, uid, "daemon", "", "name a group in agent.toml"),
+        (page, uid, "daemon", "no-such-group", "add it to the group"),
+    ):
+        with pytest.raises(RefusedError, match=why) as refused:
+            spoken_for(caller(speaker), wanted, page_user, group)
+        assert refused.value.kind == "PermissionError"
 
 
 @pytest.mark.parametrize(

@@ -329,6 +329,20 @@ def test_an_order_about_a_name_that_another_user_has_taken_meanwhile_does_nothin
         assert not any("belongs to uid" in one.sentence for one in answers)
 
 
+@pytest.mark.parametrize("order", ORDERS[1:], ids=lambda order: type(order).__name__)
+def test_an_order_that_was_decided_on_another_epoch_does_nothing_and_says_so(order: Command) -> None:
+    node = Node(ALONE, 1, VoteRecord(), 0)
+    running(node, SPEC)
+    epoch = node.status(2 * MS).components[0].epoch
+    (answer,) = node.step(replace(order, decided=epoch + 1), 2 * MS).act
+    assert isinstance(answer, acts.Answer) and not answer.ok
+    assert f"epoch {epoch + 1} then, {epoch} now, at robot1" in answer.sentence and "nothing was done" in answer.sentence
+    assert node.status(2 * MS).components[0].state is State.PRIMARY
+    for decided in (epoch, 0):
+        answers = only(node.step(replace(order, decided=decided), 3 * MS), acts.Answer)
+        assert not any("was decided" in one.sentence for one in answers)
+
+
 def test_a_released_name_is_free_for_another_user_and_what_is_kept_under_it_is_not() -> None:
     node = Node(ALONE, 1, VoteRecord(), 0)
     running(node, replace(SPEC, owner=1000))

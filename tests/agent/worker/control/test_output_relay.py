@@ -67,6 +67,14 @@ def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Pl
     assert listener.heard == heard
 
 
+@pytest.mark.parametrize(("offset", "heard"), [(-6, b"three\n"), (-1000, WRITTEN), (-1, b"\n")])
+def test_an_offset_below_zero_counts_from_the_end(places: Places, offset: int, heard: bytes) -> None:
+    listener: Any = Listener()
+    relay = OutputRelay(Worker(places, State.FINISHED))
+    totals = asyncio.run(relay.pass_on(listener, NAME, (offset, offset), committed=True, follow=False))
+    assert listener.heard == heard and totals == (len(WRITTEN), 0)
+
+
 def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wrote(places: Places) -> None:
     """That one was released; what it wrote lies here until the new one has written something."""
     logs = OutputLogs(log_directory(NAME, places))

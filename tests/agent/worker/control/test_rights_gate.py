@@ -52,7 +52,7 @@ class Robot:
     settings = SimpleNamespace(team=SimpleNamespace(team="lab"), config=SimpleNamespace(robot="robot1", insecure=False))
 
     async def ask(self, _what: str) -> Any:
-        components = [SimpleNamespace(name=one["name"], state=State.PRIMARY) for one in COMPONENTS]
+        components = [SimpleNamespace(name=one["name"], state=State.PRIMARY, owner=one["owner"]) for one in COMPONENTS]
         return SimpleNamespace(status=SimpleNamespace(components=components))
 
     def hindrance(self, _peer: str) -> str:
@@ -93,6 +93,26 @@ def test_every_verb_of_the_socket_needs_a_right() -> None:
 def test_without_a_file_all_is_as_before(asked: Asked) -> None:
     assert shown(asked("status")) == {"open": False, "secret": False, "mine": True}
     assert asked("ping")["robot"] == "robot1"
+
+
+def answers(asked: Asked, right: str, *names: str) -> list[bool]:
+    """Whether NOBODY has the right at each path."""
+    paths = [f"/lab/robot1/{name}" for name in names]
+    told = asked("may", rights=[right], paths=paths)["answers"][right]
+    assert list(told) == paths
+    return [because == "" for because in told.values()]
+
+
+def test_a_user_asks_for_all_its_rights_at_once(asked: Asked, tmp_path: Path) -> None:
+    assert answers(asked, "operate", "open", "secret", "mine", "ball") == [False, False, True, True]
+    assert answers(asked, "see", "open", "secret", "mine") == [True, True, True]
+    assert answers(asked, "program", "mine") == [False]
+    (tmp_path / RIGHTS_FILE).write_text(RULES)
+    assert answers(asked, "see", "open", "secret", "mine") == [True, False, True]
+    assert answers(asked, "operate", "open", "secret", "mine") == [False, False, True]
+    assert answers(asked, "call", "open") == [False]
+    with pytest.raises(RefusedError, match="may: its arguments are not right"):
+        asked("may", rights=["see"] * 9, paths=[])
 
 
 def test_the_rules_say_what_a_user_sees_and_reads(asked: Asked, tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import grp
 import os
+import pwd
 import socket
 import tempfile
 from collections.abc import AsyncIterator, Iterator
@@ -104,6 +106,56 @@ async def pinged(path: Path, uid: int) -> Reply:
 def refused(reply: Reply) -> str:
     assert isinstance(reply, Refused), reply
     return reply.message
+
+
+@as_root
+def test_a_request_on_behalf_of_another_user_is_that_users_and_only_for_some_verbs() -> None:
+    seen: list[int] = []
+
+    async def noted(say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
+        seen.append(say.caller.uid)
+        return {}
+
+    async def asked(path: Path, uid: int, verb: str, on_behalf: int | None) -> Reply:
+        body = msgspec.msgpack.encode(Request(verb, {}, on_behalf))
+        with connect(path, uid) as link:
+            await send(link, LENGTH.pack(len(body)) + body)
+            return await heard(link)
+
+    async def body() -> None:
+        group = grp.getgrgid(pwd.getpwnam("nobody").pw_gid).gr_name
+        with tempfile.TemporaryDirectory() as directory:
+            Path(directory).chmod(0o755)
+            path = Path(directory) / "control.sock"
+            listening = ControlServer(path, group, {"ping": noted, "run": noted}, "daemon")
+            await listening.open()
+            path.chmod(0o666)
+            page = pwd.getpwnam("daemon").pw_uid
+            try:
+                assert isinstance(await asked(path, page, "ping", NOBODY), Result)
+                assert isinstance(await asked(path, page, "ping", None), Result)
+                assert "asked by the user itself" in refused(await asked(path, page, "run", NOBODY))
+                assert "asked by the user itself" in refused(await asked(path, 0, "run", NOBODY))
+                assert "command failover" in refused(await asked(path, page, "ping", 0))
+                assert "may not ask for other users" in refused(await asked(path, SOMEBODY, "ping", NOBODY))
+            finally:
+                await listening.close()
+
+    asyncio.run(body())
+    assert seen == [NOBODY, pwd.getpwnam("daemon").pw_uid]
+
+
+@as_root
+def test_the_user_of_the_page_holds_as_many_connections_as_root() -> None:
+    admission = Admission(page_uid=SOMEBODY)
+    for _ in range(quotas.TRUSTED_CONNECTIONS_MAX):
+        admission.enter(SOMEBODY)
+    with pytest.raises(RefusedError, match="the most for one user"):
+        admission.enter(SOMEBODY)
+    for number in range(quotas.OTHERS_CONNECTIONS_MAX):
+        admission.enter(10_000 + number)
+    with pytest.raises(RefusedError, match="users other than root"):
+        admission.enter(9_999)
 
 
 @as_root
