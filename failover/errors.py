@@ -165,6 +165,10 @@ class NoAnswerError(FailoverError, TimeoutError):
     """A driver did not answer in time; whether the message was carried out is not known."""
 
 
+class PageError(FailoverError):
+    """The operators' page cannot be served as it was asked for, or a request of it is refused; the message says what to do."""
+
+
 class ProgramError(FailoverError):
     """Something about a program that is sent to a robot does not work, and nothing changed; the message says what to do."""
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-LAYERS = ("checkpoint", "failover", "agent")
+LAYERS = ("checkpoint", "failover", "agent", "page")
 
 Graph = Mapping[str, set[str]]
 """Module → modules that it imports; both dotted."""

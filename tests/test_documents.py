@@ -20,6 +20,7 @@ from agent.worker.control import status_view
 from agent.worker.network.replication_link import LinkState
 from failover.cli import parser
 from failover.config.board import BoardConfig, ItemConfig
+from failover.config.page import PageConfig, UserConfig
 from failover.config.programs import KeyConfig
 from failover.config.rights import LdapConfig, RightsConfig, RuleConfig
 from failover.config.team import Robot
@@ -138,6 +139,8 @@ def defaults(kind: type[Any]) -> dict[str, object]:
         ("team.toml: one item of the board", ItemConfig),
         ("rights.toml: who may do what", RightsConfig),
         ("rights.toml: one rule", RuleConfig),
+        ("page.toml: the operators' page", PageConfig),
+        ("page.toml: one user", UserConfig),
         ("programs.toml: one key", KeyConfig),
         ("rights.toml: the directory server", LdapConfig),
     ],

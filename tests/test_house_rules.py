@@ -15,7 +15,7 @@ import pytest
 from tests.imports import Graph, called, circles, folders, graph, imported, imports
 
 ROOT = Path(__file__).parent.parent
-FLOORS = ("checkpoint", "failover", "agent")
+FLOORS = ("checkpoint", "failover", "agent", "page")
 
 PURE_CHECKPOINT = (
     *(
@@ -63,6 +63,8 @@ DOORS = {
     "foxglove": ("failover/recording/foxglove_server.py",),
     "ldap": ("agent/directory/server.py",),
     "pickle": ("failover/state/pickled.py",),
+    "starlette": ("page/app.py",),
+    "uvicorn": ("page/serve.py",),
     "psutil": ("failover/client/process_use.py",),
     "rich": ("failover/cli/output/render.py",),
     "shtab": ("failover/cli/completion.py",),
@@ -168,6 +170,29 @@ def test_a_circle_is_seen() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
 
 
+def beside(edges: Graph) -> list[str]:
+    """The imports between the page and what it stands beside: it imports failover, and nothing imports it."""
+    return [
+        f"{name} imports {other}"
+        for name, others in edges.items()
+        for other in sorted(others)
+        if (name.split(".")[0] == "page") != (other.split(".")[0] == "page")
+        and (name.split(".")[0] != "page" or other.split(".")[0] == "agent")
+    ]
+
+
+def test_the_page_imports_failover_and_nothing_imports_the_page() -> None:
+    assert beside(graph()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "other"), [("page.app", "agent.config"), ("failover.cli.main", "page.app"), ("agent", "page")]
+)
+def test_an_import_between_the_page_and_the_rest_is_seen(module: str, other: str) -> None:
+    assert beside({module: {other}}) != []
+    assert beside({"page.app": {"failover.errors", "checkpoint.errors", "page.errors"}, "page": {"page.app"}}) == []
+
+
 CROWDED = 30
 """Modules in one folder: an example of what a reader can still look over, and no law; say here why one holds more."""
 
@@ -247,6 +272,7 @@ DATACLASSES = {
     "failover/recording/mcap_file.py": "the mcap library's records are some",
     "failover/kept_state/period.py": "a field that is not shown",
     "failover/config/board.py": "read from TOML by its fields",
+    "failover/config/page.py": "read from TOML by its fields",
     "failover/config/programs.py": "read from TOML by its fields",
     "failover/config/rights.py": "read from TOML by its fields",
     "failover/config/team.py": "read from TOML by its fields",

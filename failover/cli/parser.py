@@ -484,6 +484,23 @@ VERBS: Final = (
         "failover.cli.verbs.programs:show",
     ),
     Verb(
+        "page",
+        "the operators' page: the team live in a browser, orders, metrics for Prometheus",
+        """
+        Serve a page for browsers on this robot: the team as a tree, each component with its decisions, output and charts, the
+        board, orders with their consequences, and /metrics. Without page.toml it listens at 127.0.0.1:7480, and the kernel tells
+        which user has connected. Another address needs TLS and a login (docs/page.md). It runs until Ctrl-C, and starts without
+        an agent, which it waits for.
+
+          failover page
+          failover page --listen 127.0.0.1:8080
+          failover page --config /etc/failover/page.toml
+          failover page --password
+        """,
+        "failover.cli.arguments.page:page",
+        "failover.cli.verbs.page:page",
+    ),
+    Verb(
         "check",
         "can failover protect programs here, or this process; and what to change",
         """

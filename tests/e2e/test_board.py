@@ -49,21 +49,23 @@ def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Robo
 
 
 @contextmanager
-def two_with_boards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[RobotMachine, RobotMachine]]:
+def two_with_boards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: str = "", name: str = TEAM
+) -> Iterator[tuple[RobotMachine, RobotMachine]]:
     written = team.write
 
     def write(directory: Path, members: Team) -> None:
-        written(directory, replace(members, team=TEAM))
+        written(directory, replace(members, team=name))
         with (directory / team.TEAM_FILE).open("a") as file:
             file.write(ITEMS)
 
     monkeypatch.setattr(team, "write", write)
     try:
-        with robots.two_robots(tmp_path) as both:
+        with robots.two_robots(tmp_path, settings) as both:
             yield both
     finally:
-        for name in ("robot1", "robot2"):
-            shutil.rmtree(agents_place(TEAM, name), ignore_errors=True)
+        for robot in ("robot1", "robot2"):
+            shutil.rmtree(agents_place(name, robot), ignore_errors=True)
 
 
 def test_what_a_program_puts_at_one_robot_a_program_gets_at_the_other(pair: tuple[RobotMachine, RobotMachine]) -> None:

@@ -64,6 +64,13 @@ PROGRAMS = (
     ),
 )
 DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"], ["graph"])
+PAGES = (
+    *(
+        ["--listen", address]
+        for address in ("0.0.0.0:7480", "[::]:7480", "192.168.7.11:7480", "robot1:7480", "127.0.0.1", "127.0.0.1:x")
+    ),
+    *(["--config", file] for file in ("missing", "directory", "junk", "sparse")),
+)
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
@@ -190,6 +197,11 @@ def test_with_rights_that_are_none(act: list[str], content: str, capsys: pytest.
     assert told(capsys, "rights", *act, "--directory", "team") == main.FAILED
 
 
+@pytest.mark.parametrize("options", PAGES, ids=" ".join)
+def test_with_a_page_that_may_not_be_served(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "page", *options) == main.FAILED
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -200,6 +212,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"ps", "task", "trace", "wait-activation", "rights", "program"}
+    without |= {"page", "ps", "task", "trace", "wait-activation", "rights", "program"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
