@@ -30,6 +30,12 @@ IDLE_S: Final = 60.0
 REQUEST_S: Final = 30.0
 """How long a request may take from its first byte to its last: a client writes it at once, however busy the machine is."""
 
+MEMBER_S: Final = 60.0
+"""How long a user for whom another one asks is believed to be a member of the group: an organisation's accounts may be slow."""
+
+SPOKEN_FOR_MAX: Final = 1_024
+"""Such users that are remembered."""
+
 PIECE_SIZE: Final = 32 << 10
 """Bytes read ahead of a client (asyncio reads twice as many and one more piece); a request takes memory as it arrives."""
 
@@ -70,6 +76,7 @@ class ControlServer:
             page_user: the user whose process may ask for other users, besides root and our own; "": none.
         """
         self._page_user = page_user
+        self._spoken_for: dict[tuple[int, int], tuple[Caller, float]] = {}
         self._path = path
         self._group = group
         self._verbs = verbs
@@ -169,8 +176,14 @@ class ControlServer:
             return conversation
         if request.verb not in ON_BEHALF:
             raise RefusedError(f"{request.verb} is asked by the user itself, never on behalf of one", "PermissionError")
-        caller = spoken_for(conversation.caller, request.on_behalf, self._page_user, self._group)
-        return Conversation(conversation.writer, caller)
+        key, now_s = (conversation.caller.uid, request.on_behalf), asyncio.get_running_loop().time()
+        known = self._spoken_for.get(key)
+        if known is None or now_s > known[1]:
+            if len(self._spoken_for) >= SPOKEN_FOR_MAX:
+                self._spoken_for.clear()
+            caller = spoken_for(conversation.caller, request.on_behalf, self._page_user, self._group)
+            known = self._spoken_for[key] = (caller, now_s + MEMBER_S)
+        return Conversation(conversation.writer, known[0])
 
     async def _receive(self, reader: asyncio.StreamReader, uid: int, body: bytearray) -> bool:
         """Add the bytes of the next request to ``body`` as they arrive; False when the client has closed instead.
