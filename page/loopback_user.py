@@ -14,12 +14,16 @@ TABLES: Final = {socket.AF_INET: Path("/proc/self/net/tcp"), socket.AF_INET6: Pa
 
 LOCAL: Final = 1
 REMOTE: Final = 2
+STATE: Final = 3
 UID: Final = 7
 """Columns of the table."""
 
+ESTABLISHED: Final = "01"
+"""The only state in which the row has a user: of a socket that its program has closed the kernel writes user 0."""
+
 
 def uid_of(client: tuple[str, int], server: tuple[str, int]) -> int | None:
-    """The user whose socket it is; None where the connection is no longer there, or not from this machine.
+    """The user whose socket it is; None where the connection is not open, or not from this machine.
 
     Args:
         client, server: address and port of both ends.
@@ -32,7 +36,7 @@ def uid_of(client: tuple[str, int], server: tuple[str, int]) -> int | None:
         return None
     for line in lines:
         cells = line.split()
-        if [cells[LOCAL], cells[REMOTE]] == wanted:
+        if [cells[LOCAL], cells[REMOTE]] == wanted and cells[STATE] == ESTABLISHED:
             return int(cells[UID])
     return None
 

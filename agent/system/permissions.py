@@ -24,6 +24,8 @@ from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.inherited_limits import Inheritance
+from failover.core.rights.rules import Subject, without_rules
+from failover.errors import RightsError
 
 SO_PEERGROUPS: Final = 59
 GROUPS_SIZE_MAX: Final = 1_024
@@ -88,15 +90,17 @@ def refusal_without_rules(uid: int, right: str, path: str, owners: Mapping[str, 
     Args:
         owners: component → whose it is. A path of none of them is a robot, an item of the board or a driver.
     """
-    if right in ("program", "grant"):
-        return f"{right} needs a rule in rights.toml, and there is none"
-    if right not in ("read", "operate") or path not in owners:
-        return ""
+    owner = owners.get(path)
     try:
-        check_right(uid, path, owners[path])
-    except RefusedError as refusal:
+        if right in ("read", "operate") and path in owners:
+            check_right(uid, path, owner)
+            return ""
+        decided = without_rules(
+            Subject(f"uid:{uid}", uid=uid, is_owner=may(uid, owner), stands_above=may(uid, None)), right, path
+        )
+    except (RefusedError, RightsError) as refusal:
         return str(refusal)
-    return ""
+    return "" if decided else decided.because
 
 
 def without_output(told: Any) -> Any:

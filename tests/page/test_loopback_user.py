@@ -35,6 +35,18 @@ def test_a_connection_that_is_not_there_is_no_users() -> None:
     assert uid_of(("127.0.0.1", 1), ("127.0.0.1", 2)) is None
 
 
+def test_a_connection_that_its_program_has_closed_is_no_users() -> None:
+    """The kernel's table names user 0 for it, which is root."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        client = socket.create_connection(listening.getsockname())
+        ends = client.getsockname(), listening.getsockname()
+        taken, _ = listening.accept()
+        with taken:
+            client.close()
+            assert uid_of(*ends) is None, "still half open"
+        assert uid_of(*ends) is None, "it rests (TIME_WAIT)"
+
+
 @pytest.mark.root
 def test_a_socket_is_of_the_user_who_made_it() -> None:
     os.seteuid(OTHER)

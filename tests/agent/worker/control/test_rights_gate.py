@@ -104,13 +104,16 @@ def answers(asked: Asked, right: str, *names: str) -> list[bool]:
 
 
 def test_a_user_asks_for_all_its_rights_at_once(asked: Asked, tmp_path: Path) -> None:
-    assert answers(asked, "operate", "open", "secret", "mine", "ball") == [False, False, True, True]
+    assert answers(asked, "operate", "open", "secret", "mine", "ball") == [False, False, True, False]
+    assert answers(asked, "read", "mine", "ball") == [True, False]
+    assert answers(asked, "call", "mine", "arm") == [True, False], "a driver that no component is: root and the agent's user"
     assert answers(asked, "see", "open", "secret", "mine") == [True, True, True]
     assert answers(asked, "program", "mine") == [False]
     (tmp_path / RIGHTS_FILE).write_text(RULES)
     assert answers(asked, "see", "open", "secret", "mine") == [True, False, True]
     assert answers(asked, "operate", "open", "secret", "mine") == [False, False, True]
     assert answers(asked, "call", "open") == [False]
+    assert asked("may", uid=os.geteuid(), rights=["call"], paths=["/lab/robot1/arm"])["answers"]["call"]["/lab/robot1/arm"] == ""
     with pytest.raises(RefusedError, match="may: its arguments are not right"):
         asked("may", rights=["see"] * 9, paths=[])
 
