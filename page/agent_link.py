@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from checkpoint.linux.unix_address import address_of
 from failover.client.control import (
@@ -25,6 +25,9 @@ from failover.client.control import (
     why_unreachable,
 )
 from failover.errors import AgentRefusedError, LostAgentError, NoAgentError
+
+ANSWER_S: Final = 10.0
+"""How long an answer may take: an agent waits 2 s for other robots, and a busy machine is slower. After it the agent hangs."""
 
 
 class AgentLink:
@@ -53,20 +56,28 @@ class AgentLink:
             raise NoAgentError(why_unreachable(path, error)) from error
         return cls(path, reader, writer)
 
-    async def ask(self, verb: str, on_behalf: int | None = None, **arguments: Any) -> dict[str, Any]:
-        """Make a request and wait for its result.
+    async def ask(
+        self, verb: str, on_behalf: int | None = None, *, within_s: float = ANSWER_S, **arguments: Any
+    ) -> dict[str, Any]:
+        """Make a request and wait for its result. After a `LostAgentError` the connection is of no more use.
 
         Args:
             on_behalf: uid of the user for whom it is made; None: of this process itself.
 
         Raises:
             AgentRefusedError: the agent says no.
-            LostAgentError: it went away before it answered.
+            LostAgentError: it went away before it answered, or did not answer in time.
         """
-        async with contextlib.aclosing(self.stream(verb, on_behalf, **arguments)) as replies:
-            async for reply in replies:
-                if isinstance(reply, Result):
-                    return reply.value
+        try:
+            async with asyncio.timeout(within_s), contextlib.aclosing(self.stream(verb, on_behalf, **arguments)) as replies:
+                async for reply in replies:
+                    if isinstance(reply, Result):
+                        return reply.value
+        except TimeoutError:
+            raise LostAgentError(
+                f"the agent at {self._path} has not answered {verb} within {within_s:.0f} s: it hangs, or its robot is "
+                "overloaded; see its log"
+            ) from None
         raise LostAgentError(f"the agent at {self._path} ended its answer to {verb} without a result; see its log")
 
     async def stream(
@@ -113,7 +124,9 @@ class AgentLink:
         await self.close()
 
 
-async def ask_once(path: Path | None, verb: str, on_behalf: int | None = None, **arguments: Any) -> dict[str, Any]:
+async def ask_once(
+    path: Path | None, verb: str, on_behalf: int | None = None, *, within_s: float = ANSWER_S, **arguments: Any
+) -> dict[str, Any]:
     """One request over a connection of its own. Raises as `AgentLink.open` and `AgentLink.ask`."""
     async with await AgentLink.open(path) as link:
-        return await link.ask(verb, on_behalf, **arguments)
+        return await link.ask(verb, on_behalf, within_s=within_s, **arguments)

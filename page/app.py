@@ -40,7 +40,7 @@ from page.errors import TurnedAwayError
 from page.feeds import Feeds
 from page.limits import BODY_S, BODY_SIZE_MAX, LIVE_SIZE_MAX, PAGE_SESSIONS_MAX
 from page.loopback_user import uid_of
-from page.orders import Orders, Wish
+from page.orders import BOOT, Orders, Wish
 from page.sessions import Session, Sessions
 from page.viewers import People, Viewer
 
@@ -447,7 +447,7 @@ async def _body(request: Request, kind: type[T]) -> T:
 
 
 def _told(session: Session) -> Response:
-    return _json({"user": session.user, "token": session.token})
+    return _json({"user": session.user, "token": session.token, "boot": BOOT})
 
 
 def _json(value: dict[str, Any], status: int = 200, headers: dict[str, str] | None = None) -> Response:

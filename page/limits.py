@@ -43,11 +43,23 @@ MESSAGES_AT_ONCE: Final = 40
 ORDERS_WAITING_MAX: Final = 64
 """Of one user, behind the one that is carried out."""
 
+ORDER_AGE_MAX_S: Final = 15.0
+"""From the press of a button until the order is taken: a later one meets a team that its user no longer knows."""
+
+ORDER_WAITS_MAX_S: Final = 60.0
+"""Behind the earlier orders of its user, for the same reason."""
+
+ORDER_S: Final = 120.0
+"""How long the agent may take to carry an order out: a large component moves over a slow link."""
+
 ORDERS_SHOWN: Final = 500
 """Orders that the log remembers."""
 
 IDS_REMEMBERED: Final = 1_024
-"""Of one session's orders: one that is sent again because its answer was lost is not carried out again."""
+"""Of one user's orders: one that is sent again because its answer was lost is not carried out again."""
+
+USERS_REMEMBERED: Final = 256
+"""Users whose orders are remembered."""
 
 SESSION_S: Final = 12 * 3600.0
 """After so long without a request a session is over: a working day."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import secrets
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
@@ -17,16 +18,33 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
-from failover.drivers.proxy import proxy
+from failover.core.naming.tree import Place
+from failover.drivers.here import Here, here
+from failover.drivers.lookup import lookup
+from failover.drivers.proxy import Proxy
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError
 from page.agent_link import ask_once
 from page.errors import TurnedAwayError
-from page.limits import ORDERS_SHOWN, ORDERS_WAITING_MAX
+from page.limits import (
+    IDS_REMEMBERED,
+    ORDER_AGE_MAX_S,
+    ORDER_S,
+    ORDER_WAITS_MAX_S,
+    ORDERS_SHOWN,
+    ORDERS_WAITING_MAX,
+    USERS_REMEMBERED,
+)
 from page.sessions import Session
 
 LOG: Final = logging.getLogger("failover.page")
 
+BOOT: Final = secrets.token_urlsafe(9)
+"""Of this process: it remembers which orders it has taken, and a process before it has taken others."""
+
 CALL: Final = "call"
+
+ONE_LINE: Final = r"\A[^\x00-\x1f\x7f-\x9f\u2028\u2029]*\Z"
+"""No control characters: names are written into the log, a line each."""
 
 CALL_S: Final = 10.0
 """How long a driver may take."""
@@ -44,15 +62,19 @@ class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         id: made by the client, another one for each order: one that comes twice is carried out once.
         name: of the component, or the driver's path. to: a robot, for handover, prefer and promote.
+            For failback the robot that the user saw as its target, "" for any.
         epoch: that the user saw. call, body: a driver's verb and its arguments.
+        boot: `BOOT` of the page's process that the client knows. age_ms: since its user gave the order.
     """
 
-    id: Annotated[str, msgspec.Meta(min_length=8, max_length=64)]
+    id: Annotated[str, msgspec.Meta(min_length=8, max_length=64, pattern=ONE_LINE)]
     verb: Literal["handover", "failback", "prefer", "promote", "stop", "start", "release", "call"]
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=300)]
-    to: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=300, pattern=ONE_LINE)]
+    boot: Annotated[str, msgspec.Meta(max_length=64)]
+    to: Annotated[str, msgspec.Meta(max_length=64, pattern=ONE_LINE)] = ""
     epoch: Annotated[int, msgspec.Meta(ge=0)] = 0
-    call: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    age_ms: Annotated[float, msgspec.Meta(ge=0)] = 0
+    call: Annotated[str, msgspec.Meta(max_length=64, pattern=r"\A\w*\Z")] = ""
     body: Any = None
 
 
@@ -71,13 +93,18 @@ class Order(msgspec.Struct):
     state: Literal["waiting", "running", "done", "refused"] = "waiting"
     says: str = ""
     took_ms: int | None = None
+    taken_s: float = msgspec.field(default_factory=time.monotonic)
 
     def told(self) -> dict[str, Any]:
-        """For the clients."""
+        """For the clients of its user."""
         wish = self.wish
         what = f"{wish.call} {_brief(wish.body)}".strip() if wish.verb == CALL else wish.to
         fields = {"number": self.number, "at": self.at, "user": self.user, "verb": wish.verb, "name": wish.name, "what": what}
         return fields | {"id": wish.id, "epoch": wish.epoch, "state": self.state, "says": self.says, "took_ms": self.took_ms}
+
+    def told_others(self) -> dict[str, Any]:
+        """For other users: without a driver's arguments, and without the result, which may hold an answer or output."""
+        return self.told() | {"what": self.wish.call or self.wish.to, "says": ""}
 
 
 class Orders:
@@ -93,20 +120,28 @@ class Orders:
         self._numbers = itertools.count(1)
         self._queues: dict[tuple[str, int | None], asyncio.Queue[Order]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self.log: OrderedDict[int, dict[str, Any]] = OrderedDict()
+        self._known: OrderedDict[tuple[str, int | None], OrderedDict[str, int]] = OrderedDict()
+        self.log: OrderedDict[int, tuple[dict[str, Any], dict[str, Any]]] = OrderedDict()
+        """Number → the order as its user may see it, and as others may."""
         self.ended: Counter[str] = Counter()
 
     def give(self, session: Session, wish: Wish) -> int:
         """Take an order; its number in the log. It is carried out after the earlier ones of its user.
 
         Raises:
-            TurnedAwayError: the session gives too many, or too many of this user wait.
+            TurnedAwayError: it is for another process or too old; the session gives too many, or too many of this user wait.
         """
-        if (known := session.given(wish.id)) is not None:
+        whose = (session.user, session.uid)
+        if wish.boot != BOOT:
+            raise TurnedAwayError(409, "the page was started again meanwhile: whether this order was carried out is not known")
+        if (known := self._known.get(whose, {}).get(wish.id)) is not None:
             return known
+        if wish.age_ms > ORDER_AGE_MAX_S * 1000:
+            raise TurnedAwayError(
+                409, f"this order is {wish.age_ms / 1000:.0f} s old and was not taken; look again, and give it anew"
+            )
         if wait_s := session.orders.wait_s():
             raise TurnedAwayError(429, "too many orders in a short time; this one was not taken", wait_s)
-        whose = (session.user, session.uid)
         queue = self._queues.get(whose)
         if queue is None:
             queue = self._queues[whose] = asyncio.Queue(ORDERS_WAITING_MAX)
@@ -118,7 +153,7 @@ class Orders:
             queue.put_nowait(order)
         except asyncio.QueueFull:
             raise TurnedAwayError(429, f"{ORDERS_WAITING_MAX} orders of {session.user} wait already", 1) from None
-        session.note(wish.id, order.number)
+        self._remember(whose, order)
         LOG.info("order %d of %s: %s %s %s", order.number, session.user, wish.verb, wish.name, wish.to or wish.call)
         self._tell(order)
         return order.number
@@ -139,21 +174,29 @@ class Orders:
 
     async def _carry_out(self, whose: tuple[str, int | None], queue: asyncio.Queue[Order]) -> None:
         """All orders of one user, one after the other; ends when there is none."""
-        while not queue.empty():
-            order = queue.get_nowait()
-            order.state, began_s = "running", time.monotonic()
-            self._tell(order)
-            try:
-                order.says, order.state = await self._done(order), "done"
-            except LostAgentError as error:
-                order.says, order.state = f"{error}; whether it was carried out is not known: look at the tree", "refused"
-            except FailoverError as error:
-                order.says, order.state = str(error), "refused"
-            order.took_ms = round((time.monotonic() - began_s) * 1000)
-            self.ended[order.state] += 1
-            LOG.info("order %d is %s: %s", order.number, order.state, order.says)
-            self._tell(order)
-        del self._queues[whose]
+        try:
+            while not queue.empty():
+                await self._carry_out_one(queue.get_nowait())
+        finally:
+            del self._queues[whose]
+
+    async def _carry_out_one(self, order: Order) -> None:
+        order.state, began_s = "running", time.monotonic()
+        self._tell(order)
+        try:
+            order.says, order.state = await self._done(order), "done"
+        except LostAgentError as error:
+            order.says, order.state = f"{error}; whether it was carried out is not known: look at the tree", "refused"
+        except FailoverError as error:
+            order.says, order.state = str(error), "refused"
+        except Exception:
+            LOG.exception("order %d: a mistake in the page", order.number)
+            order.says = "a mistake in the page, see its log; whether it was carried out is not known: look at the tree"
+            order.state = "refused"
+        order.took_ms = round((time.monotonic() - began_s) * 1000)
+        self.ended[order.state] += 1
+        LOG.info("order %d is %s", order.number, order.state)
+        self._tell(order)
 
     async def _done(self, order: Order) -> str:
         """Carry one out; what came of it.
@@ -162,37 +205,63 @@ class Orders:
             FailoverError: it was refused, or its end is not known; says which.
         """
         wish = order.wish
+        if (waited_s := time.monotonic() - order.taken_s) > ORDER_WAITS_MAX_S:
+            raise TurnedAwayError(
+                409, f"it has waited {waited_s:.0f} s behind earlier orders, and was not carried out; look again"
+            )
         if wish.verb == CALL:
             return await self._call(order)
         arguments: dict[str, Any] = {"name": wish.name}
         if wish.verb not in WITHOUT_EPOCH:
             arguments["epoch"] = wish.epoch
-        if wish.verb == "handover":
+        if wish.verb in ("handover", "failback"):
             arguments["to"] = wish.to
         if wish.verb in ("prefer", "promote"):
             arguments["robot"] = wish.to
         if wish.verb == "promote":
             arguments["sure"] = True
-        return _sentence(wish, await ask_once(self._socket, wish.verb, order.uid, **arguments))
+        return _sentence(wish, await ask_once(self._socket, wish.verb, order.uid, within_s=ORDER_S, **arguments))
 
     async def _call(self, order: Order) -> str:
-        """Have a driver carry a verb out, if the rules let this user."""
+        """Have a driver carry a verb out, if the rules let this user. Rules are about paths, so no other name is taken."""
         wish = order.wish
-        may = await ask_once(self._socket, "may", order.uid, rights=[CALL], paths=[wish.name])
-        if because := may["answers"][CALL][wish.name]:
-            raise AgentRefusedError(because, "PermissionError")
-        return _brief(await asyncio.to_thread(_called, wish))
+        our, place = await asyncio.to_thread(_found, wish.name)
+        if place.record.path != wish.name:
+            raise AgentRefusedError(
+                f"{wish.name} is no path of a driver: call it by its path, {place.record.path}", "PermissionError"
+            )
+        may = await ask_once(self._socket, "may", order.uid, rights=["see", CALL], paths=[wish.name])
+        for right in ("see", CALL):
+            if because := may["answers"][right][wish.name]:
+                raise AgentRefusedError(because, "PermissionError")
+        return _brief(await asyncio.to_thread(_called, our, place, wish))
+
+    def _remember(self, whose: tuple[str, int | None], order: Order) -> None:
+        """Know the order again, in whatever session of its user."""
+        known = self._known.setdefault(whose, OrderedDict())
+        self._known.move_to_end(whose)
+        known[order.wish.id] = order.number
+        if len(known) > IDS_REMEMBERED:
+            known.popitem(last=False)
+        if len(self._known) > USERS_REMEMBERED:
+            self._known.popitem(last=False)
 
     def _tell(self, order: Order) -> None:
-        self.log[order.number] = order.told()
+        self.log[order.number] = order.told(), order.told_others()
         while len(self.log) > ORDERS_SHOWN:
             self.log.popitem(last=False)
         self._changed()
 
 
-def _called(wish: Wish) -> Any:
-    """What the driver returns."""
-    with proxy(wish.name) as driver:
+def _found(name: str) -> tuple[Here, Place]:
+    """The driver that answers to a name."""
+    our = here()
+    return our, lookup(our, name)
+
+
+def _called(our: Here, place: Place, wish: Wish) -> Any:
+    """What the driver at that place returns."""
+    with Proxy(our, place) as driver:
         return driver.call(wish.call, wish.body, timeout=CALL_S)
 
 

@@ -139,7 +139,7 @@ def standing(component: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _orders(component: Mapping[str, Any], robots: Sequence[str], denied: str) -> dict[str, dict[str, Any]]:
-    """Verb → ``says``, its consequences; ``to``, the robots to choose from; ``why_not``, "" if it can be given now."""
+    """Verb → ``says``, its consequences; ``to``, robots to choose from, or ``target``, the only one; ``why_not``, "" for now."""
     name, primary, state = str(component["name"]), component.get("primary") or "", component.get("state")
     runs = component.get("role") == "primary" and state in ("running", "degraded", "frozen")
     over = state in ("ended", "failed")
@@ -152,6 +152,7 @@ def _orders(component: Mapping[str, Any], robots: Sequence[str], denied: str) ->
         "handover": {"says": f"{name} runs {here}. {_move(component)}", "to": others, "why_not": not_running or nobody},
         "failback": {
             "says": f"{name} runs {here} and moves back to {home}. {_move(component)}",
+            "target": home,
             "why_not": not_running or (f"it runs at {home} already" if home == primary else nobody),
         },
         "prefer": {

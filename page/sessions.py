@@ -16,7 +16,6 @@ from typing import Final
 from failover.config.page import UserConfig, is_password
 from page.errors import TurnedAwayError
 from page.limits import (
-    IDS_REMEMBERED,
     ORDERS_A_S,
     ORDERS_AT_ONCE,
     PAGE_SESSIONS_MAX,
@@ -54,21 +53,10 @@ class Session:
         self.seen_s = time.monotonic()
         self.live = 0
         self.orders = Rate(ORDERS_A_S, ORDERS_AT_ONCE)
-        self._given: OrderedDict[str, int] = OrderedDict()
 
     def is_token(self, token: str) -> bool:
         """Whether a POST comes from this session's own page."""
         return hmac.compare_digest(token.encode(), self.token.encode())
-
-    def given(self, order: str) -> int | None:
-        """The number of an order that this session has given before; None: it has not."""
-        return self._given.get(order)
-
-    def note(self, order: str, number: int) -> None:
-        """Remember it."""
-        self._given[order] = number
-        if len(self._given) > IDS_REMEMBERED:
-            self._given.popitem(last=False)
 
 
 class Sessions:

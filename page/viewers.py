@@ -210,9 +210,10 @@ class People:
         for number, other in enumerate(sorted(self.viewers, key=lambda one: (one.session.user, id(one)))):
             looks = other.look if other.look in visible else ""
             found[f"person:{number}"] = {"user": other.session.user, "looks": looks, "me": other is viewer}
-        for number, told in self.orders.log.items() if self.orders is not None else ():
-            mine = told["user"] == viewer.session.user
-            if mine or f"component:{told['name']}" in visible or f"driver:{told['name']}" in visible:
+        for number, (own, told) in self.orders.log.items() if self.orders is not None else ():
+            if told["user"] == viewer.session.user:
+                found[f"order:{number}"] = own
+            elif f"component:{told['name']}" in visible or f"driver:{told['name']}" in visible:
                 found[f"order:{number}"] = told
         return found
 

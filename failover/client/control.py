@@ -31,7 +31,7 @@ verb           arguments                                                result, 
 ``may``        ``rights`` *must*, ``paths`` *must*                      ``{robot, team, answers: {right: {path: because}}}``:
                                                                         may this user; "" if so, else why not
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
-``failback``   ``name`` *must*                                          as ``handover``
+``failback``   ``name`` *must*, ``to`` "": the target expected          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
 ``promote``    ``name`` *must*, ``robot`` = newest checkpoint's,         ``{name, to, epoch, promoted, sentence, risks}``; unless
                ``sure`` false                                           ``sure`` nothing is done, and they tell what would be

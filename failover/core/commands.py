@@ -157,7 +157,10 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
 
 def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
     home = component.rules.prefer or (component.spec.home if component.spec else "")
-    if home == turn.me and component.state in _RUNNING:
+    if home and command.to not in ("", home):
+        refusal = f"{component.name} would move to {home} now, and not to {command.to}; look at it, and give the order again"
+        turn.order(acts.Answer(command.request, False, f"{refusal}; nothing was done"))
+    elif home == turn.me and component.state in _RUNNING:
         why = "its preferred robot" if component.rules.prefer else "where it was started"
         turn.order(acts.Answer(command.request, True, f"{component.name} runs at {home} already, {why}"))
     elif not home:

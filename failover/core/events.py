@@ -302,11 +302,15 @@ class Promote(Struct, frozen=True):
 
 
 class Failback(Struct, frozen=True):
-    """Operator: move the component back to the robot that is preferred, or else to where it was started."""
+    """Operator: move the component back to the robot that is preferred, or else to where it was started.
+
+    ``to``: the robot that the user expects; if it is another one, nothing is done. "": whichever it is.
+    """
 
     request: int
     component: str
     by: int | None = None
+    to: str = ""
     decided: int = 0
 
 

@@ -23,6 +23,7 @@ const rows = (kind) => [...table].filter(([key]) => key.startsWith(kind + ":")).
 const compare = (a, b) => a[0].localeCompare(b[0], "en", { numeric: true });
 const ms = (value) => value == null ? "–" : value < 1000 ? `${+value.toFixed(value < 10 ? 2 : 0)} ms` : value < 120000 ? `${(value / 1000).toFixed(1)} s` : `${Math.round(value / 60000)} min`;
 const size = (value) => { for (const unit of ["B", "KB", "MB"]) { if (value < 1000) return `${+value.toFixed(1)} ${unit}`; value /= 1000; } return `${value.toFixed(1)} GB`; };
+const clock = (date) => date.toDateString() === new Date().toDateString() ? date.toLocaleTimeString("en-GB") : date.toLocaleString("en-GB");
 const short = (name) => name.split("/").pop();
 const list = (values) => values.length ? values.join(", ") : "–";
 const link = (kind, name) => `#/${kind}/${encodeURIComponent(name)}`;
@@ -36,10 +37,7 @@ const take = (message) => {
   for (const [key, fields] of Object.entries(message.set || {})) table.set(key, { ...table.get(key), ...fields });
   for (const [key, names] of Object.entries(message.without || {})) for (const name of names) delete table.get(key)[name];
   for (const key of message.gone || []) table.delete(key);
-  for (const [key, fields] of Object.entries(message.set || {})) {
-    if (key.startsWith("order:") && mine.has(table.get(key).id)) tellOrder(table.get(key));
-    if (key === view?.key && (fields.lag_ms !== undefined || fields.value !== undefined)) addPoint(key, table.get(key));
-  }
+  for (const key of Object.keys(message.set || {})) if (key.startsWith("order:") && mine.has(table.get(key).id)) tellOrder(table.get(key));
   if (message.past) past.set(message.past.key, message.past.points.map(([age, values]) => [performance.now() / 1000 - age, values]));
   if (message.story) story.set(message.story.name, message.story);
   if (message.output) takeOutput(message.output);
@@ -48,11 +46,10 @@ const take = (message) => {
 const takeOutput = ({ name, text, left_out, says }) => {
   const held = output.get(name) || { 1: "", 2: "", says: "" };
   for (const [stream, more] of Object.entries(text)) held[stream] = (held[stream] + more).slice(-32768);
-  output.set(name, { ...held, says: says || (left_out ? `${size(left_out)} were left out: this page was too slow for them` : held.says) });
+  output.set(name, { ...held, says: says || (left_out ? `${size(left_out)} were left out: this page was too slow for them` : "") });
 };
 const addPoint = (key, fields) => {
   const points = past.get(key) || [], now = performance.now() / 1000;
-  if (points.length && now - points.at(-1)[0] < 1) return;
   points.push([now, key.startsWith("item:") ? [fields.value] : [fields.lag_ms, fields.freeze_us == null ? null : fields.freeze_us / 1000]]);
   past.set(key, points.slice(-600));
 };
@@ -62,12 +59,16 @@ const draw = () => {
   set(at("title"), team.team ? `${team.team}: ${team.healthy ? "all is well" : "look here"}` : "failover");
   document.title = team.team ? `${team.healthy && !team.away ? "" : "! "}${team.team} – failover` : "failover";
   set(at("promise"), team.promise || "");
-  away(lost || team.away || "");
+  away(lost || team.away || (team.old_s ? `The agent has told nothing new for ${team.old_s} s.` : ""));
   const people = rows("person").map(([, one]) => one);
   set(at("people"), people.length < 2 ? people.map((one) => one.user).join() : people.map((one) => `${one.user}${one.me ? " (you)" : one.looks ? ` looks at ${short(one.looks)}` : ""}`).join(", "));
   drawTree();
   view?.update?.();
 };
+setInterval(() => {   // a point a second, also of a value that stands still
+  const one = table.get(view?.key);
+  if (one && !lost && !table.get("team")?.away && /^(component|item):/.test(view.key)) { addPoint(view.key, one); draw(); }
+}, 1000);
 const away = (why) => { at("away").hidden = !why; set(at("away"), why && `What you see is old. ${why}`); };
 
 // --- The tree -----------------------------------------------------------------------------------------------------------
@@ -99,11 +100,11 @@ const drawTree = () => {
     seen.add(one.key);
     let node = nodes.get(one.key);
     if (!node) {
-      const row = el("span", { class: "row" }, el("span", { class: "sign", "aria-hidden": "true" }), el("span", { class: "name" }), el("span", { class: "word" }));
+      const row = el("span", { class: "row" }, el("span", { class: "toggle", "aria-hidden": "true" }), el("span", { class: "sign", "aria-hidden": "true" }), el("span", { class: "name" }), el("span", { class: "word" }));
       node = el("li", { role: "treeitem", tabindex: nodes.size ? "-1" : "0", "data-key": one.key }, row);
       nodes.set(one.key, node);
     }
-    const [icon, name, word] = node.firstChild.children;
+    const [, icon, name, word] = node.firstChild.children;
     set(icon, one.sign[0]); mark(icon, "class", `sign ${one.sign[1]}`);
     set(name, one.name); set(word, one.word || "");
     mark(node.firstChild, "title", one.why || "");
@@ -120,16 +121,23 @@ const drawTree = () => {
     parents.push(group); counts.push(0);
   }
   for (const [key, node] of nodes) if (!seen.has(key)) { node.remove(); nodes.delete(key); }
-  if (had?.isConnected && document.activeElement !== had) had.focus();   // it was moved to another robot
-  if (!at("tree").querySelector("[tabindex='0']")) at("tree").firstChild?.setAttribute("tabindex", "0");
+  const reached = at("tree").querySelector("[tabindex='0']"), shown = reached ? visible(reached) : at("tree").firstChild;
+  if (had && (shown !== had || document.activeElement !== had)) focusNode(shown);   // it was moved to another robot, or is gone
+  else if (shown && shown !== reached) { reached?.setAttribute("tabindex", "-1"); shown.tabIndex = 0; }
 };
+const visible = (node) => { for (let up = node; up = up.parentElement.closest("[role=treeitem]");) if (up.getAttribute("aria-expanded") === "false") node = up; return node; };
 const focusNode = (node) => {
   if (!node) return;
   for (const other of at("tree").querySelectorAll("[tabindex='0']")) other.tabIndex = -1;
   node.tabIndex = 0; node.focus();
 };
 const go = (node) => { const [kind, ...rest] = node.dataset.key.split(":"); location.hash = kind === "team" || !rest[0] ? "#/" : link(kind, rest.join(":")); };
-at("tree").addEventListener("click", (event) => { const node = event.target.closest("[role=treeitem]"); if (node) { focusNode(node); go(node); } });
+at("tree").addEventListener("click", (event) => { 
+  const node = event.target.closest("[role=treeitem]"), open = node?.getAttribute("aria-expanded");
+  if (!node) return;
+  focusNode(node);
+  if (open && event.target.classList.contains("toggle")) mark(node, "aria-expanded", String(open === "false")); else go(node);
+});
 at("tree").addEventListener("keydown", (event) => {
   const node = event.target.closest("[role=treeitem]"), open = node.getAttribute("aria-expanded");
   const shown = [...at("tree").querySelectorAll("[role=treeitem]")].filter((one) => !one.parentElement.closest("[aria-expanded=false]"));
@@ -204,7 +212,7 @@ const decision = (line) => {
   const when = new Date(line.at * 1000), turn = line.epoch_before !== line.epoch;
   const known = [line.component && `epoch ${turn ? `${line.epoch_before} → ` : ""}${line.epoch}`, line.state, line.checkpoint_age_ms == null ? "" : `checkpoint ${ms(line.checkpoint_age_ms)} old`, line.repeats ? `said ${line.repeats + 1} times` : "",
     ...line.seen.map((peer) => `${peer.robot} ${peer.state}, heard ${ms(Math.round(peer.silent_ms))} ago`), line.doubt_ms >= 1 ? `time known within ${ms(line.doubt_ms)}` : ""];
-  return el("li", { class: turn ? "turn" : null }, el("time", { datetime: when.toISOString() }, `${when.toLocaleTimeString("en-GB")}.${String(when.getMilliseconds()).padStart(3, "0")}`), el("span", { class: "by" }, line.robot), line.did, el("span", { class: "facts" }, known.filter(Boolean).join(" · ")));
+  return el("li", { class: turn ? "turn" : null }, el("time", { datetime: when.toISOString() }, `${clock(when)}.${String(when.getMilliseconds()).padStart(3, "0")}`), el("span", { class: "by" }, line.robot), line.did, el("span", { class: "facts" }, known.filter(Boolean).join(" · ")));
 };
 const tableOf = (columns, kind = "") => {
   const body = el("tbody"), node = el("div", { class: `scroll ${kind}`, tabindex: "0", role: "region", "aria-label": `${columns[0]}s` }, el("table", { class: kind ? null : "facts" }, el("thead", {}, el("tr", {}, ...columns.map((one) => el("th", { scope: "col" }, one)))), body)), made = new Map();
@@ -274,7 +282,7 @@ const itemView = (name) => {
 const ordersView = () => {
   const all = tableOf(["Number", "At", "User", "Order", "State", "Result"]);
   return { key: "", node: [el("h2", {}, "Orders on this page"), all.node], update() {
-    all.fill(rows("order").sort((a, b) => b[1].number - a[1].number).map(([, one]) => [one.number, [String(one.number), new Date(one.at * 1000).toLocaleTimeString("en-GB"), one.user, `${one.verb} ${one.name} ${one.what}`, one.state, [one.says, one.took_ms == null ? "" : `(${ms(one.took_ms)})`].join(" ")]]));
+    all.fill(rows("order").sort((a, b) => b[1].number - a[1].number).map(([, one]) => [one.number, [String(one.number), clock(new Date(one.at * 1000)), one.user, `${one.verb} ${one.name} ${one.what}`, one.state, [one.says, one.took_ms == null ? "" : `(${ms(one.took_ms)})`].join(" ")]]));
   } };
 };
 const driverView = (path) => {
@@ -298,32 +306,48 @@ const callDriver = (path, verb, inputs) => {
 };
 
 // --- Orders -------------------------------------------------------------------------------------------------------------------
-const post = async (path, body) => {
-  const answer = await fetch(path, { method: "POST", headers: { "content-type": "application/json", "x-failover-token": session?.token || "" }, body: JSON.stringify(body) });
+const ORDER_MS = 15000;   // an order is taken within this time, or not at all
+const post = async (path, body, limit = 15000) => {
+  const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(limit), headers: { "content-type": "application/json", "x-failover-token": session?.token || "" }, body: JSON.stringify(body) });
   return [answer.status, await answer.json()];
 };
 let given = Promise.resolve();
-const give = (wish) => { given = given.then(() => giveNow(wish)); };   // one after the other: none overtakes an earlier one
-const giveNow = async (wish) => {
-  const order = { ...wish, id: crypto.randomUUID() };
+const give = (wish) => {   // one after the other: none overtakes an earlier one
+  const order = { ...wish, id: crypto.randomUUID(), boot: session.boot }, since = performance.now();
   mine.add(order.id);
-  for (;;) {
+  given = given.then(() => giveNow(order, since));
+};
+const giveNow = async (order, since) => {
+  for (let sent = false, why = "there was no time for it";;) {
+    const age_ms = performance.now() - since, unknown = sent ? "; whether it was carried out is not known: look at the team" : "";
+    if (age_ms > ORDER_MS) return notGiven(order, `${why}; it is not sent again${unknown}`);
     let status, said;
-    try { [status, said] = await post("/orders", order); } catch { [status, said] = [0, { again_ms: 1000 }]; }   // sent again with its ID: it is carried out once
-    if (status === 202) return said.number;
-    if (!said.again_ms) return say(said.error, true);
+    try { [status, said] = await post("/orders", { ...order, age_ms }, 5000); } catch { sent = true; [status, said] = [0, { error: "no answer came", again_ms: 1000 }]; }   // sent again with its ID: it is carried out once
+    if (status === 202) return;
+    if (!said.again_ms) return notGiven(order, `${said.error}${unknown}`);
+    why = said.error;
     await new Promise((done) => setTimeout(done, said.again_ms));
   }
 };
+const notGiven = (order, why) => { mine.delete(order.id); say(`${order.verb} ${short(order.name)}: ${why}`, true); };
 const tellOrder = (order) => { if (order.state === "done" || order.state === "refused") { mine.delete(order.id); say(`${order.verb} ${short(order.name)}: ${order.says || "done"}`, order.state === "refused"); } };
 const say = (text, bad = false) => { const told = el("p", { class: bad ? "bad" : null }, text); at("said").append(told); setTimeout(() => told.remove(), bad ? 20000 : 8000); };
 const confirmOrder = async (name, verb) => {
   const key = `component:${name}`, seen = table.get(key), order = seen.orders[verb], box = at("dialog");
   const to = order.to ? el("select", {}, ...order.to.map((robot) => el("option", { value: robot }, robot || "the one with the newest checkpoint"))) : null;
+  let robot = order.target || "";
   const [risks_, setRisks] = notes(), changed = el("p", { class: "warn", role: "status" }), act = el("button", { type: "submit", class: "main" }, LABELS[verb].replace("…", ""));
-  const ask = async () => { if (verb !== "promote") return; const [, said] = await post("/risks", { name, robot: to.value }); setRisks([said.error || said.sentence, ...(said.risks || [])]); };
+  const ask = async () => {   // what is at risk depends on the robot, so the order names the one of which it was told
+    if (verb !== "promote") return;
+    const wanted = to.value;
+    act.disabled = true;
+    const [, said] = await post("/risks", { name, robot: wanted }).catch(() => [0, { error: "No answer came: choose again." }]);
+    if (to.value !== wanted) return;
+    robot = said.to; act.disabled = !!said.error;
+    setRisks([said.error || said.sentence, ...(said.risks || [])]);
+  };
   to?.addEventListener("change", ask);
-  box.replaceChildren(el("form", { onsubmit: (event) => { event.preventDefault(); box.close(); give({ verb, name, to: to?.value || "", epoch: seen.epoch || 0 }); } },
+  box.replaceChildren(el("form", { onsubmit: (event) => { event.preventDefault(); box.close(); give({ verb, name, to: verb === "promote" ? robot : to ? to.value : robot, epoch: seen.epoch || 0 }); } },
     el("h2", { id: "asked" }, `${LABELS[verb].replace("…", "")}: ${name}`), el("p", {}, order.says), risks_, to && el("label", {}, "Robot", to), changed, el("div", { class: "buttons" }, act, el("button", { type: "button", onclick: () => box.close() }, "Cancel"))));
   setRisks([]); box.showModal(); (to || act).focus(); ask();
   const watch = setInterval(() => { const now = table.get(key); if (!box.open) clearInterval(watch); else if (now?.epoch !== seen.epoch) set(changed, `It has changed meanwhile: epoch ${seen.epoch} → ${now?.epoch}, it runs at ${now?.primary}. This order will be refused; cancel, and look again.`); }, 200);
@@ -343,10 +367,12 @@ const look = () => { output.clear(); if (socket?.readyState === 1) socket.send(J
 addEventListener("hashchange", () => { if (location.hash.startsWith("#/")) { show(); } });
 at("skip").addEventListener("click", (event) => { event.preventDefault(); at("main").focus(); });
 
+at("logout").addEventListener("click", async () => { await post("/logout", {}).catch(() => 0); location.reload(); });
+
 const login = () => {
   view = null;
   const name = el("input", { autocomplete: "username", required: true }), password = el("input", { type: "password", autocomplete: "current-password", required: true }), why = el("p", { class: "bad", role: "alert" });
-  at("main").replaceChildren(el("h2", {}, "Log in"), el("form", { onsubmit: async (event) => { event.preventDefault(); const [status, said] = await post("/login", { name: name.value, password: password.value }); if (status !== 200) return set(why, said.error); session = said; connect(); } }, el("label", {}, "Name", name), el("label", {}, "Password", password), el("button", { type: "submit", class: "main" }, "Log in")), why);
+  at("main").replaceChildren(el("h2", {}, "Log in"), el("form", { onsubmit: async (event) => { event.preventDefault(); const [status, said] = await post("/login", { name: name.value, password: password.value }); if (status !== 200) return set(why, said.error); session = said; at("logout").hidden = false; connect(); } }, el("label", {}, "Name", name), el("label", {}, "Password", password), el("button", { type: "submit", class: "main" }, "Log in")), why);
   name.focus();
 };
 const begin = async () => {
@@ -354,7 +380,7 @@ const begin = async () => {
     const answer = await fetch("/session"), said = await answer.json();
     if (answer.status === 401) return login();
     if (!answer.ok) throw new Error(said.error);
-    session = said; connect();
+    session = said; at("logout").hidden = !said.login; connect();
   } catch (error) { away(lost = `This page does not reach its server: ${error.message}.`); setTimeout(begin, wait = Math.min(wait * 2, 5000)); }
 };
 const connect = () => {

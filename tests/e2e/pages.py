@@ -47,6 +47,7 @@ class Served:
         self.origin = url.rstrip("/")
         self.cookie = ""
         self.token = ""
+        self.boot = ""
 
     def ask(self, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, Mapping[str, str], bytes]:
         """One request as it is, with these headers; underscores in their names stand for hyphens."""
@@ -63,14 +64,17 @@ class Served:
         """Have a session, as the page's script does."""
         status, headers, body = self.ask("GET", "/session")
         assert status == 200, body
-        self.cookie, self.token = headers["set-cookie"].partition(";")[0], json.loads(body)["token"]
+        said = json.loads(body)
+        self.cookie, self.token, self.boot = headers["set-cookie"].partition(";")[0], said["token"], said["boot"]
 
     def own(self) -> dict[str, str]:
         """The headers of a POST of our own page."""
         return {"Origin": self.origin, "Cookie": self.cookie, "x-failover-token": self.token, "Content-Type": "application/json"}
 
     def post(self, path: str, body: Any, **changed: str) -> tuple[int, Any]:
-        """A POST of our own page, with some headers changed; "" leaves one out."""
+        """A POST of our own page, with some headers changed; "" leaves one out. An order is bound to the page that began it."""
+        if path == "/orders" and isinstance(body, dict):
+            body = {"boot": self.boot, **body}
         headers = {name: value for name, value in {**self.own(), **changed}.items() if value}
         status, _, said = self.ask("POST", path, body, **headers)
         return status, json.loads(said)

@@ -34,6 +34,7 @@ method, path, body = sys.argv[1:]
 headers = {}
 if method == "POST":
     _, cookie, session = ask("GET", "/session")
+    body = json.dumps({"boot": json.loads(session)["boot"], **json.loads(body)})
     headers = {"Cookie": cookie.partition(";")[0], "x-failover-token": json.loads(session)["token"]}
     headers |= {"Origin": "http://127.0.0.1:7480", "Content-Type": "application/json"}
 status, _, said = ask(method, path, body or None, **headers)
@@ -99,7 +100,7 @@ def test_an_order_has_the_rights_of_the_user_who_gives_it(machine: Machine) -> N
         if user != "alice":
             assert "is refused" in journal, journal
             assert component(machine, "alices")["state"] in ("running", "degraded"), user
-    assert "is done: it has ended" in journal
+    assert "is done" in journal
     assert component(machine, "alices")["state"] == "ended"
 
 

@@ -7,9 +7,9 @@ import pytest
 from failover.config.page import hashed, is_password
 from page import rate, sessions
 from page.errors import TurnedAwayError
-from page.limits import IDS_REMEMBERED, PAGE_SESSIONS_MAX, SESSION_S, SESSIONS_OF_USER_MAX
+from page.limits import PAGE_SESSIONS_MAX, SESSION_S, SESSIONS_OF_USER_MAX
 from page.rate import Rate
-from page.sessions import Session, Sessions
+from page.sessions import Sessions
 
 
 class Clock:
@@ -66,13 +66,6 @@ def test_where_all_sessions_have_a_window_one_more_is_refused_with_the_reason(cl
     with pytest.raises(TurnedAwayError, match="close one of them") as refused:
         known.begin("one more", 1)
     assert refused.value.status == 503 and len(known) == PAGE_SESSIONS_MAX
-
-
-def test_a_session_remembers_its_orders_up_to_a_limit() -> None:
-    session = Session("anna", None)
-    for number in range(IDS_REMEMBERED + 1):
-        session.note(f"order-{number}", number)
-    assert session.given("order-0") is None and session.given("order-1") == 1
 
 
 def test_wrong_passwords_make_the_next_try_wait_longer_and_a_right_one_ends_that(clock: Clock) -> None:

@@ -131,14 +131,14 @@ class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``release``, ``start`` and ``failback``."""
+    """Of ``release`` and ``start``."""
 
     name: str = ""
     epoch: Epoch = 0
 
 
 class HandoverArguments(msgspec.Struct, forbid_unknown_fields=True):
-    """Of ``handover``."""
+    """Of ``handover`` and ``failback``."""
 
     name: str
     to: str = ""

@@ -27,6 +27,9 @@ from failover.core.types import ENDED, ComponentView, PeerView, State
 POLL_S: Final = 0.02
 """How soon new output is passed on to a client that watches."""
 
+POLL_ELSEWHERE_S: Final = 0.2
+"""The same where another robot has the output: each look is a question to it."""
+
 PIECE_SIZE: Final = 128 << 10
 """Bytes read from another robot at a time: less than the replication link's largest message."""
 
@@ -88,7 +91,7 @@ class OutputRelay:
             if not sent and (over or not follow):
                 return max(at[1], 0), max(at[2], 0)
             if not sent:
-                await asyncio.sleep(POLL_S)
+                await asyncio.sleep(POLL_ELSEWHERE_S if elsewhere else POLL_S)
 
     async def piece(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """A piece of a stream for another robot: what is committed here, all of it once the component has ended."""

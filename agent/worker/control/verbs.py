@@ -248,11 +248,11 @@ class Verbs(Questions):
 
     async def failback(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
         """Move a component back to the robot that is preferred, or where it was started."""
-        wanted = arguments_of(NameArguments, "failback", arguments)
+        wanted = arguments_of(HandoverArguments, "failback", arguments)
         name = await self._known(wanted.name)
         view = await self._view(name)
         await self._check_fit(name, "fail {} back to {}", view["prefer"] or view["home"])
-        return await self._moved(by, name, lambda number: events.Failback(number, name, decided=wanted.epoch))
+        return await self._moved(by, name, lambda number: events.Failback(number, name, to=wanted.to, decided=wanted.epoch))
 
     async def lacks(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """What this robot lacks of what a component needs to go on here."""

@@ -343,6 +343,16 @@ def test_an_order_that_was_decided_on_another_epoch_does_nothing_and_says_so(ord
         assert not any("was decided" in one.sentence for one in answers)
 
 
+def test_a_failback_to_another_robot_than_the_user_saw_does_nothing() -> None:
+    node = Node(ALONE, 1, VoteRecord(), 0)
+    running(node, SPEC)
+    (answer,) = node.step(Failback(2, SPEC.name, to="robot9"), 2 * MS).act
+    assert isinstance(answer, acts.Answer) and not answer.ok
+    assert "would move to robot1 now, and not to robot9" in answer.sentence and "nothing was done" in answer.sentence
+    (answer,) = node.step(Failback(3, SPEC.name, to="robot1"), 3 * MS).act
+    assert isinstance(answer, acts.Answer) and answer.ok
+
+
 def test_a_released_name_is_free_for_another_user_and_what_is_kept_under_it_is_not() -> None:
     node = Node(ALONE, 1, VoteRecord(), 0)
     running(node, replace(SPEC, owner=1000))
