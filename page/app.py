@@ -2,7 +2,8 @@
 
 Who may do what is the agent's to decide; here is decided who it is that asks, and that the question comes from our own page:
 
-* On the loopback, Host must be a name of the loopback: a name of another site that leads here is refused.
+* On the loopback, Host must be the address that is listened at: a name of another site that leads here is refused, and so is
+  localhost, which can be another user's program at the other family's address.
 * A WebSocket and a POST must have our own Origin; a POST must be JSON, with the session's token.
 * The cookie is HttpOnly and SameSite=Strict, and Secure under TLS. Nothing of another site is loaded or connected to.
 """
@@ -16,6 +17,7 @@ import contextlib
 import logging
 import math
 import os
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -34,13 +36,25 @@ from failover.config.page import PageConfig
 from failover.config.rights import is_loopback
 from failover.errors import AgentRefusedError, FailoverError
 from page import exposition
-from page.agent_link import ask_once
+from page.agent_link import AgentLink, ask_once
 from page.assets import Assets
 from page.errors import TurnedAwayError
-from page.feeds import Feeds
-from page.limits import BODY_S, BODY_SIZE_MAX, LIVE_SIZE_MAX, PAGE_SESSIONS_MAX
+from page.feeds import Feed, Feeds
+from page.limits import (
+    ASKED_A_S,
+    ASKED_AT_ONCE,
+    BODY_S,
+    BODY_SIZE_MAX,
+    HEALTH_S,
+    LIVE_SIZE_MAX,
+    PAGE_SESSIONS_MAX,
+    SESSIONS_OF_USER_MAX,
+)
 from page.loopback_user import uid_of
 from page.orders import BOOT, Orders, Wish
+from page.passwords import Passwords
+from page.picture import of_items, of_tasks
+from page.rate import Rates
 from page.sessions import Session, Sessions
 from page.viewers import People, Viewer
 
@@ -50,7 +64,6 @@ COOKIE: Final = "failover"
 SECURE_COOKIE: Final = "__Host-failover"
 """With the port after it: a browser gives a cookie of one port of a host to all its ports, where other robots' pages may be."""
 
-LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "[::1]", "localhost"})
 TOKEN_HEADER: Final = "x-failover-token"
 
 HEADERS: Final = {
@@ -103,7 +116,12 @@ class Page:
         self._is_secure = bool(config.certificate)
         self._socket = socket
         self._assets = Assets()
-        self.sessions = Sessions(config.users)
+        self._users = config.users
+        self.sessions = Sessions()
+        self._passwords = Passwords(config.users)
+        self._asked = Rates(ASKED_A_S, ASKED_AT_ONCE)
+        self._probe: asyncio.Task[bool] | None = None
+        self._probed_s = 0.0
         self._feeds = Feeds(socket)
         self._people = People(self._feeds)
         self._orders = Orders(socket, self._people.changed)
@@ -132,6 +150,7 @@ class Page:
         yield
         await self._orders.close()
         await self._feeds.close()
+        self._passwords.close()
 
     def _served(self, answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
         """The same, with its errors as sentences."""
@@ -154,8 +173,11 @@ class Page:
 
     def _check_host(self, asked: HTTPConnection) -> None:
         name, _ = _host(asked)
-        if self._is_local and name not in LOOPBACK_NAMES and name != self._server[0]:
-            raise TurnedAwayError(421, f"this page is at {self._server[0]}, not at {name[:64]!r}")
+        own = f"[{self._server[0]}]" if ":" in self._server[0] else self._server[0]
+        if self._is_local and name != own:
+            raise TurnedAwayError(
+                421, f"this page is at {own}, not at {name[:64]!r}: write {own} where your browser shows the address"
+            )
 
     def _cookie(self, asked: HTTPConnection) -> str:
         return f"{SECURE_COOKIE if self._is_secure else COOKIE}-{_host(asked)[1]}"
@@ -174,26 +196,48 @@ class Page:
         Raises:
             TurnedAwayError: it cannot be told.
         """
-        if self.sessions.users:
+        if self._users:
+            return None
+        uid = self._peer(asked)
+        assert uid is not None, "PageConfig.check: without users it listens on the loopback"
+        return accounts.name_of(uid) or f"uid {uid}", on_behalf_of(uid)
+
+    def _peer(self, asked: HTTPConnection) -> int | None:
+        """The user of this robot whose program has connected; None where other machines may connect.
+
+        Raises:
+            TurnedAwayError: it cannot be told.
+        """
+        if not self._is_local:
             return None
         client = asked.client
         uid = uid_of((client.host, client.port), self._server) if client is not None else None
         if uid is None:
             raise TurnedAwayError(403, "the kernel does not tell whose program has connected; connect from this robot itself")
-        return accounts.name_of(uid) or f"uid {uid}", on_behalf_of(uid)
+        return uid
+
+    def _place(self, asked: HTTPConnection) -> str:
+        """From where it is asked, for limits: a user of this robot, or an address. Raises as `_peer`."""
+        peer = self._peer(asked)
+        return f"uid {peer}" if peer is not None else asked.client.host if asked.client else ""
+
+    def _check_rate(self, asked: HTTPConnection) -> None:
+        """Raises TurnedAwayError: it asks too often."""
+        if wait_s := self._asked.wait_s(f"{asked.url.path} {self._place(asked)}"):
+            raise TurnedAwayError(429, "too many requests in a short time", wait_s)
 
     def _known(self, asked: HTTPConnection) -> Session:
         """The session of a request.
 
         Raises:
-            TurnedAwayError: there is none, or it is another user's.
+            TurnedAwayError: there is none, or it is another user's. A browser gives the cookie to every port of this machine, so
+                the user whose program has connected must be the same, too.
         """
         cookie = asked.cookies.get(self._cookie(asked), "")
         session = self.sessions.of(cookie) if cookie else None
         if session is None:
             raise TurnedAwayError(401, "no session: load the page anew")
-        user = self._local_user(asked)
-        if user is not None and user != (session.user, session.uid):
+        if self._peer(asked) != session.peer:
             raise TurnedAwayError(403, "this session is another user's: load the page anew")
         return session
 
@@ -222,45 +266,42 @@ class Page:
 
     async def _session(self, request: Request) -> Response:
         """Who am I? Begins a session where no login is needed."""
+        self._check_rate(request)
         try:
-            return _told(self._known(request))
+            return self._told(self._known(request))
         except TurnedAwayError:
             user = self._local_user(request)
-            if user is None:
-                raise TurnedAwayError(401, "log in") from None
-            return self._begun(request, *user)
+        if user is None:
+            raise TurnedAwayError(401, "log in")
+        return await self._begun(request, *user)
 
-    def _begun(self, request: Request, user: str, uid: int | None) -> Response:
-        session = self.sessions.begin(user, uid)
-        response = _told(session)
+    async def _begun(self, request: Request, user: str, uid: int | None) -> Response:
+        """A session of a user for whom the agent answers: those whom it refuses take no place of others.
+
+        Raises:
+            FailoverError: it does not answer.
+        """
+        if uid is not None:
+            await ask_once(self._socket, "ping", uid)
+        session = self.sessions.begin(user, uid, self._peer(request))
+        response = self._told(session)
         response.set_cookie(self._cookie(request), session.id, path="/", httponly=True, samesite="strict", secure=self._is_secure)
         return response
+
+    def _told(self, session: Session) -> Response:
+        return _json({"user": session.user, "token": session.token, "boot": BOOT, "login": bool(self._users)})
 
     async def _login(self, request: Request) -> Response:
         self._check_origin(request)
         wanted = await _body(request, Login)
-        name = await self._right_password(wanted.name, wanted.password)
-        LOG.info("%s has logged in from %s", name, request.client.host if request.client else "?")
-        return self._begun(request, name, self._account(name))
-
-    async def _right_password(self, name: str, password: str) -> str:
-        """The name, if the password is right.
-
-        Raises:
-            TurnedAwayError: it is not, or too many wrong ones came before.
-        """
-        if not self.sessions.users:
-            raise TurnedAwayError(404, "nobody logs in here: the kernel tells whose program has connected")
-        if wait_s := self.sessions.wait_s(name):
-            raise TurnedAwayError(429, f"wrong passwords for this name: wait {math.ceil(wait_s)} s", wait_s)
-        right = await asyncio.to_thread(self.sessions.is_right, name, password)
-        self.sessions.note_try(name, right=right)
-        if not right:
-            raise TurnedAwayError(403, "name and password do not belong together")
-        return name
+        if not self._users:
+            raise TurnedAwayError(404, "there is no login here: the kernel tells whose program has connected")
+        await self._passwords.check(wanted.name, wanted.password, self._place(request), forgives=True)
+        LOG.info("%s has logged in from %s", wanted.name, self._place(request))
+        return await self._begun(request, wanted.name, self._account(wanted.name))
 
     def _account(self, name: str) -> int | None:
-        account = self.sessions.users[name].account
+        account = self._users[name].account
         if not account:
             return None
         uid = accounts.uid_of(account)
@@ -278,19 +319,23 @@ class Page:
         return _json({"number": self._orders.give(session, wish)}, 202)
 
     async def _risks(self, request: Request) -> Response:
+        self._check_rate(request)
         session, wanted = await self._posted(request, Risk)
         told = await self._orders.risks(session, wanted.name, wanted.robot)
         return _json({"sentence": told.get("sentence", ""), "risks": told.get("risks", []), "to": told.get("to", "")})
 
     async def _metrics(self, request: Request) -> Response:
+        self._check_rate(request)
         uid = await self._scraper(request)
-        status = await ask_once(self._socket, "status", uid)
-        around = await self._feeds.around(status)
+        async with await AgentLink.open(self._socket) as link:
+            status = await link.ask("status", uid)
+            around = await self._feeds.around()
+            may = await Feed(uid).rights(link, status, around, [])
         found = exposition.Exposition()
         exposition.of_team(found, status)
         exposition.of_components(found, status["components"])
-        exposition.of_board(found, around.items)
-        exposition.of_tasks(found, around.tasks)
+        exposition.of_board(found, [*of_items(around.items, str(status["team"]), may).values()])
+        exposition.of_tasks(found, [*of_tasks(around.tasks, status, around.owners, may).values()])
         exposition.of_page(found, len(self.sessions), self._orders.ended)
         return Response(found.text(), headers={"content-type": exposition.CONTENT_TYPE})
 
@@ -306,14 +351,24 @@ class Page:
             scheme = name = password = ""
         if scheme.lower() != "basic" or not name:
             raise TurnedAwayError(401, "metrics need a name and a password of page.toml (basic_auth of Prometheus)")
-        return self._account(await self._right_password(name, password))
+        await self._passwords.check(name, password, self._place(request), forgives=False)
+        return self._account(name)
 
     async def _health(self, _request: Request) -> Response:
+        """Anyone may ask: one question a second to the agent, however many ask us, and no word more than its answer."""
+        now_s = time.monotonic()
+        if self._probe is None or (self._probe.done() and now_s - self._probed_s > HEALTH_S):
+            self._probe, self._probed_s = asyncio.create_task(self._answers()), now_s
+        is_there = await asyncio.shield(self._probe)
+        return _json({"agent": is_there}, 200 if is_there else 503)
+
+    async def _answers(self) -> bool:
+        """Whether the agent answers."""
         try:
             await ask_once(self._socket, "ping")
-        except FailoverError as error:
-            return _json({"agent": False, "because": str(error)}, 503)
-        return _json({"agent": True})
+        except FailoverError:
+            return False
+        return True
 
     # --- Live -------------------------------------------------------------------------------------------------------
 
@@ -326,6 +381,8 @@ class Page:
             session = self._known(link)
             if len(self._people.viewers) >= PAGE_SESSIONS_MAX:
                 raise TurnedAwayError(503, f"{PAGE_SESSIONS_MAX} windows of this page are open, the most there may be")
+            if self._people.windows_of(session) >= SESSIONS_OF_USER_MAX:
+                raise TurnedAwayError(503, f"{SESSIONS_OF_USER_MAX} windows of {session.user} are open; close one of them")
             feed = self._feeds.take(session.uid, wake)
         except TurnedAwayError as error:
             await link.accept()  # a browser tells its script a reason only of a connection that was accepted
@@ -340,6 +397,7 @@ class Page:
             await self._conversed(link, viewer)
         finally:
             session.live -= 1
+            session.seen_s = time.monotonic()
             self._people.viewers.discard(viewer)
             self._people.changed()
             self._feeds.give_back(feed, wake)
@@ -365,8 +423,8 @@ class Page:
                 raise error
 
     async def _until_over(self, session: Session) -> None:
-        """Until the session has ended: by a logout in another window."""
-        while self.sessions.of(session.id) is not None:
+        """Until the session has ended: by a logout in another window, or with time."""
+        while not self.sessions.is_over(session):
             await asyncio.sleep(1)
         raise TurnedAwayError(401, "this session is over")
 
@@ -444,10 +502,6 @@ async def _body(request: Request, kind: type[T]) -> T:
         return msgspec.json.decode(bytes(content), type=kind)
     except (msgspec.DecodeError, RecursionError) as error:
         raise TurnedAwayError(400, f"a request that no page of ours sends: {error}") from error
-
-
-def _told(session: Session) -> Response:
-    return _json({"user": session.user, "token": session.token, "boot": BOOT})
 
 
 def _json(value: dict[str, Any], status: int = 200, headers: dict[str, str] | None = None) -> Response:

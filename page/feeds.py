@@ -6,6 +6,7 @@ A feed asks the agent on behalf of its user, so the agent's rules decide what is
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -13,11 +14,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
-from page.agent_link import AgentLink
+from page.agent_link import AgentLink, ask_once
 from page.errors import TurnedAwayError
-from page.limits import AWAY_S, CHARTS_MAX, FEEDS_MAX, PERIOD_S, POINTS
+from page.limits import AWAY_S, CHARTS_MAX, FEEDS_MAX, PERIOD_S, POINTS, STALE_S
 from page.picture import Answers, Table, item_path, of_drivers, of_items, of_status, of_tasks
 from page.surroundings import Around, Rows, Surroundings, drivers
+
+LOG: Final = logging.getLogger("failover.page")
 
 LOAD: Final = 4
 """A look waits so many times as long as it took before the next one: at most a fifth of the time is spent looking."""
@@ -25,8 +28,11 @@ LOAD: Final = 4
 RIGHTS_S: Final = 5.0
 """How long an answer about rights is believed. The agent checks each order itself."""
 
-PATHS_ASKED: Final = 4_000
-"""Paths in one question about rights: the agent takes no more than 4,096."""
+DECISIONS_ASKED: Final = 512
+"""Rights times paths in one question: the agent takes no more."""
+
+OWNERS_S: Final = 1.0
+"""How long it is believed which component runs which task."""
 
 FULL_PACE: Final = 4
 """Feeds that get a picture each `PERIOD_S`; with more of them all are slower: at most twenty pictures a second."""
@@ -55,27 +61,39 @@ class Feed:
         self.takers: set[asyncio.Event] = set()
         self.task: asyncio.Task[None] | None = None
         self._may = Answers()
+        self._at_s = time.monotonic()
         self._asked: tuple[Any, ...] = ()
         self._may_until_s = 0.0
 
     def show(self, table: Table) -> None:
         """There is another picture."""
-        self.table = table
-        for taker in self.takers:
-            taker.set()
+        self.table, self._at_s = table, time.monotonic()
+        self._wake()
 
     def show_away(self, why: str) -> None:
         """The agent does not answer; the last picture stays, and says so."""
-        self.show({**self.table, "team": {**self.table["team"], "away": why}})
+        self.table = {**self.table, "team": {**self.table["team"], "away": why}}
+        self._wake()
+
+    def old_s(self) -> int:
+        """The age of the picture; 0 where it is as new as it should be."""
+        age_s = time.monotonic() - self._at_s
+        return round(age_s) if age_s > STALE_S else 0
+
+    def _wake(self) -> None:
+        for taker in self.takers:
+            taker.set()
 
     async def rights(self, link: AgentLink, status: Mapping[str, Any], around: Around, names: Rows) -> Answers:
         """What this user may do with all that there is; asked again after `RIGHTS_S`, or for something new."""
         components = {str(one["name"]): one.get("owner") for one in status["components"]}
         items = [item_path(status["team"], one) for one in around.items]
         callees = [str(one["path"]) for one in names]
-        asked = (components, items, callees)
+        robot = f"/{status['team']}/{status['robot']}"
+        asked = (components, items, callees, robot)
         if asked != self._asked or time.monotonic() > self._may_until_s:
             about = await self._answers(link, ("see", "operate"), list(components))
+            about["see"] |= (await self._answers(link, ("see",), [robot, *items, *callees]))["see"]
             about |= await self._answers(link, ("read",), items)
             self._may = Answers(**about, **await self._answers(link, ("call",), callees))
             self._asked, self._may_until_s = asked, time.monotonic() + RIGHTS_S
@@ -83,8 +101,9 @@ class Feed:
 
     async def _answers(self, link: AgentLink, rights: Sequence[str], paths: Sequence[str]) -> dict[str, dict[str, str]]:
         found: dict[str, dict[str, str]] = {right: {} for right in rights}
-        for begin in range(0, len(paths), PATHS_ASKED):
-            part = paths[begin : begin + PATHS_ASKED]
+        most = DECISIONS_ASKED // len(rights)
+        for begin in range(0, len(paths), most):
+            part = paths[begin : begin + most]
             told = await link.ask("may", self.uid, rights=list(rights), paths=list(part))
             for right, answers in told["answers"].items():
                 found[right] |= answers
@@ -100,6 +119,8 @@ class Feeds:
         self._surroundings = Surroundings()
         self._looking = asyncio.Lock()
         self._around, self._around_s = Around(), 0.0
+        self._own: dict[str, Any] | None = None
+        self._own_s = 0.0
         self._names: Rows = []
         self._naming: asyncio.Task[None] | None = None
         self._points: dict[str, deque[tuple[float, list[float | None]]]] = {}
@@ -137,13 +158,32 @@ class Feeds:
         await asyncio.gather(*tasks, return_exceptions=True)
         self._surroundings.close()
 
-    async def around(self, status: Mapping[str, Any]) -> Around:
-        """Board and tasks; users who look at once look once."""
+    async def around(self) -> Around:
+        """Board and tasks, with all of them; users who look at once look once.
+
+        Raises:
+            NoAgentError, LostAgentError: the agent does not tell which components there are.
+        """
         async with self._looking:
             if time.monotonic() - self._around_s >= PERIOD_S / 2:
-                self._around = await asyncio.to_thread(self._surroundings.look, status)
+                looking = asyncio.ensure_future(asyncio.to_thread(self._surroundings.look, await self._own_view()))
+                try:
+                    self._around = await asyncio.shield(looking)
+                except asyncio.CancelledError:
+                    await asyncio.wait({looking})  # its thread uses the board, and another one must wait for it
+                    raise
                 self._around_s = time.monotonic()
             return self._around
+
+    async def _own_view(self) -> dict[str, Any] | None:
+        """The status as this process's own user sees it: no user's view tells whose a task is that it must not see."""
+        if time.monotonic() - self._own_s >= OWNERS_S:
+            try:
+                self._own = await ask_once(self._socket, "status")
+            except AgentRefusedError:
+                self._own = None
+            self._own_s = time.monotonic()
+        return self._own
 
     def past(self, key: str) -> list[tuple[float, list[float | None]]]:
         """The points of a chart: age in seconds and values, oldest first."""
@@ -165,14 +205,17 @@ class Feeds:
                 feed.show_away(str(error))
             except FailoverError as error:  # a question that cannot be asked: of our own making, and told
                 feed.show_away(f"this page cannot ask the agent: {error}")
+            except Exception:
+                LOG.exception("a mistake in the page")
+                feed.show_away("a mistake in the page; see its log")
             await asyncio.sleep(AWAY_S)
 
     async def _look(self, feed: Feed, link: AgentLink) -> None:
         status = await link.ask("status", feed.uid, team=True)
-        around, names = await self.around(status), self._names
+        around, names = await self.around(), self._names
         may = await feed.rights(link, status, around, names)
         table = of_status(status, may)
-        table |= of_tasks(around.tasks, str(status["robot"]), around.owners, may)
+        table |= of_tasks(around.tasks, status, around.owners, may)
         table |= of_items(around.items, str(status["team"]), may)
         table |= of_drivers(names, may)
         self._note(table)
@@ -180,7 +223,10 @@ class Feeds:
 
     async def _ask_for_names(self) -> None:
         while True:
-            self._names = await asyncio.to_thread(drivers)
+            try:
+                self._names = await asyncio.to_thread(drivers)
+            except Exception:
+                LOG.exception("a mistake in the page: it does not know which drivers there are")
             await asyncio.sleep(NAMES_S if self._names else NO_NAMES_S)
 
     def _note(self, table: Table) -> None:

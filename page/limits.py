@@ -8,7 +8,7 @@ PAGE_SESSIONS_MAX: Final = 64
 """People and programs that look at once: each may hold a connection to the agent, which gives the page 128."""
 
 SESSIONS_OF_USER_MAX: Final = 16
-"""Of these, one user's: no user shuts another out."""
+"""Of these, one user's sessions, and windows: no user shuts another out."""
 
 FEEDS_MAX: Final = 16
 """Users who look at once, however many windows each has: the agent is asked for each of them, by that user's rights."""
@@ -40,6 +40,12 @@ MESSAGES_A_S: Final = 20.0
 MESSAGES_AT_ONCE: Final = 40
 """… and at once."""
 
+LOOK_S: Final = 0.5
+"""Between two rows that one client looks at: for each the agents of the team are asked."""
+
+STALE_S: Final = 3.0
+"""A picture that is older says so."""
+
 ORDERS_WAITING_MAX: Final = 64
 """Of one user, behind the one that is carried out."""
 
@@ -62,7 +68,28 @@ USERS_REMEMBERED: Final = 256
 """Users whose orders are remembered."""
 
 SESSION_S: Final = 12 * 3600.0
-"""After so long without a request a session is over: a working day."""
+"""After so long without a request or an open window a session is over: a working day."""
+
+SESSION_MAX_S: Final = 24 * 3600.0
+"""After so long it is over in any case."""
+
+GUESSES_AT_ONCE: Final = 8
+"""Passwords that wait to be checked, one after the other."""
+
+ASKED_A_S: Final = 10.0
+"""Sessions, metrics and risks for one user or address a second, in the long run …"""
+
+ASKED_AT_ONCE: Final = 40
+"""… and at once."""
+
+HEALTH_S: Final = 1.0
+"""How long an answer about the agent's health is given again: anyone may ask."""
+
+HEAD_S: Final = 10.0
+"""How long the head of a request may take."""
+
+CONNECTIONS_OF_ONE_MAX: Final = 64
+"""Connections of one user of this robot, or of one address; WebSockets, which are limited for each user, not counted."""
 
 PERIOD_S: Final = 0.2
 """Between two pictures for one user; a client gets at most so many a second: five."""

@@ -35,12 +35,15 @@ LIVING: Final = ("live", "suspect")
 
 
 class Answers(Struct, frozen=True):
-    """What a user may do: path → why not, "" if he may. A path that was not asked for is not shown."""
+    """What a user may do: path → why not, "" if he may. What was not asked for he may not."""
 
     see: Mapping[str, str] = {}
     read: Mapping[str, str] = {}
     operate: Mapping[str, str] = {}
     call: Mapping[str, str] = {}
+
+
+UNASKED: Final = "the agent has not said yet whether you may"
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -108,7 +111,7 @@ def _peer(peer: Mapping[str, Any]) -> dict[str, Any]:
 def of_component(component: Mapping[str, Any], robots: Sequence[str], may: Answers) -> dict[str, Any]:
     """One component, as its primary tells it where that one answers."""
     word, why = standing(component)
-    denied = may.operate.get(str(component["name"]), "")
+    denied = may.operate.get(str(component["name"]), UNASKED)
     moving = {name: None if (value := component.get(name)) is None else round(value) for name in MOVING}
     orders = {} if component.get("state") is None else _orders(component, robots, denied)
     return {name: component.get(name) for name in SHOWN} | moving | {"word": word, "why": why, "orders": orders}
@@ -198,21 +201,23 @@ def _move(component: Mapping[str, Any]) -> str:
 # --- What is beside the agent's answer -------------------------------------------------------------------------------
 
 
-def of_tasks(tasks: Iterable[Mapping[str, Any]], robot: str, owners: Mapping[str, str], may: Answers) -> Table:
-    """Tasks of this robot's schedule; one that a component runs is seen by those who see the component."""
+def of_tasks(tasks: Iterable[Mapping[str, Any]], status: Mapping[str, Any], owners: Mapping[str, str], may: Answers) -> Table:
+    """Tasks of this robot's schedule: who sees the component sees its task, who sees the robot a task of no component."""
     found: Table = {}
     for one in tasks:
         owner = owners.get(one["task"], "")
-        if not owner or may.see.get(owner, "-") == "":
-            found[f"task:{one['task']}"] = {**one, "robot": robot, "component": owner}
+        if may.see.get(owner or f"/{status['team']}/{status['robot']}", UNASKED) == "":
+            found[f"task:{one['task']}"] = {**one, "robot": str(status["robot"]), "component": owner}
     return found
 
 
 def of_items(items: Iterable[Mapping[str, Any]], team: str, may: Answers) -> Table:
-    """Items of the board, with their values for those who may read them."""
+    """Items of the board for those who see them, with their values for those who may read them."""
     found: Table = {}
     for one in items:
-        because = may.read.get(item_path(team, one), "")
+        if may.see.get(item_path(team, one), UNASKED):
+            continue
+        because = may.read.get(item_path(team, one), UNASKED)
         shown = one if not because else {**one, "value": None, "complaint": because}
         found[f"item:{one['robot']}/{one['item']}"] = dict(shown)
     return found
@@ -224,5 +229,7 @@ def item_path(team: str, item: Mapping[str, Any]) -> str:
 
 
 def of_drivers(places: Iterable[Mapping[str, Any]], may: Answers) -> Table:
-    """Drivers that this page can reach, with the reason why this user may not call them."""
-    return {f"driver:{one['path']}": {**one, "why_not": may.call.get(str(one["path"]), "")} for one in places}
+    """Drivers that this page can reach, for those who see them, with the reason why this user may not call them."""
+    paths = {str(one["path"]): one for one in places}
+    seen = {path: one for path, one in paths.items() if may.see.get(path, UNASKED) == ""}
+    return {f"driver:{path}": {**one, "why_not": may.call.get(path, UNASKED)} for path, one in seen.items()}

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import socket
 import ssl
+from collections import Counter
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
+import h11
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from failover.config.page import PageConfig
+from failover.config.rights import is_loopback
 from failover.errors import PageError
 from page.app import Page
-from page.limits import CONNECTIONS_MAX, HEAD_SIZE_MAX, LIVE_SIZE_MAX
+from page.limits import CONNECTIONS_MAX, CONNECTIONS_OF_ONE_MAX, HEAD_S, HEAD_SIZE_MAX, LIVE_SIZE_MAX
+from page.loopback_user import uid_of
 
-KEEP_ALIVE_S: Final = 20
+KEEP_ALIVE_S: Final = round(HEAD_S)
 SHUTDOWN_S: Final = 2
 """How long clients may take to hang up when the page ends."""
 
@@ -25,6 +31,62 @@ PING_S: Final = 20.0
 
 WAITING_MAX: Final = 128
 """Connections that wait to be taken."""
+
+
+class FairProtocol(H11Protocol):
+    """HTTP; hangs up on a client that sends no whole head in time, and on the connections of one client beyond a limit."""
+
+    _open: ClassVar[Counter[str]] = Counter()
+    _whose = ""
+    _late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Count it, and wait for the first head."""
+        super().connection_made(transport)
+        self._whose = self._client()
+        self._open[self._whose] += 1
+        if self._open[self._whose] > CONNECTIONS_OF_ONE_MAX:
+            transport.abort()
+        else:
+            self._late = self.loop.call_later(HEAD_S, transport.close)
+
+    def handle_events(self) -> None:
+        """Wait for the rest of a head, however slowly it comes, and for the next one."""
+        super().handle_events()
+        if self.conn.their_state is not h11.IDLE:
+            self._be_patient()
+        elif self._late is None:
+            self._late = self.loop.call_later(HEAD_S, self.transport.close)
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """It is no connection of ours from here on."""
+        self._leave()
+        super().handle_websocket_upgrade(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count it no more."""
+        self._leave()
+        super().connection_lost(exc)
+
+    def _client(self) -> str:
+        """A user of this robot, or an address."""
+        host = self.client[0] if self.client else ""
+        if self.client is None or self.server is None or self.server[1] is None or not is_loopback(host):
+            return host
+        return f"uid {uid_of(self.client, (self.server[0], self.server[1]))}"
+
+    def _be_patient(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
+
+    def _leave(self) -> None:
+        self._be_patient()
+        if self._whose:
+            self._open[self._whose] -= 1
+            if not self._open[self._whose]:
+                del self._open[self._whose]
+            self._whose = ""
 
 
 def serve(config: PageConfig, agent: Path | None, *, as_json: bool) -> None:
@@ -47,7 +109,7 @@ def serve(config: PageConfig, agent: Path | None, *, as_json: bool) -> None:
         uvicorn.Config(
             page.app,
             loop="asyncio",
-            http="h11",
+            http=FairProtocol,
             ws="websockets-sansio",
             ws_max_size=LIVE_SIZE_MAX * 4,
             ws_ping_interval=PING_S,

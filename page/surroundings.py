@@ -51,11 +51,11 @@ class Surroundings:
         self._board: Board | None = None
         self._board_again_s = 0.0
 
-    def look(self, status: Mapping[str, Any]) -> Around:
+    def look(self, status: Mapping[str, Any] | None) -> Around:
         """Board and tasks.
 
         Args:
-            status: of the agent; for whose the tasks are.
+            status: of the agent; for whose the tasks are. None: it is not told.
         """
         tasks, owners = _tasks(status)
         return Around(self._items(), tasks, owners)
@@ -112,7 +112,7 @@ def _ms(span_ns: int | None) -> int | None:
     return None if span_ns is None else round(span_ns / NS_PER_MS)
 
 
-def _tasks(status: Mapping[str, Any]) -> tuple[Rows, Mapping[str, str]]:
+def _tasks(status: Mapping[str, Any] | None) -> tuple[Rows, Mapping[str, str]]:
     try:
         file = schedule.open_schedule()
     except (FailoverError, OSError):

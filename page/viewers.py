@@ -19,7 +19,7 @@ from failover.errors import FailoverError
 from page.agent_link import AgentLink
 from page.errors import TurnedAwayError
 from page.feeds import Feed, Feeds, charted
-from page.limits import MESSAGES_A_S, MESSAGES_AT_ONCE, OUTPUT_HELD, OUTPUT_TAIL, PERIOD_S, STORY_LINES
+from page.limits import LOOK_S, MESSAGES_A_S, MESSAGES_AT_ONCE, OUTPUT_HELD, OUTPUT_TAIL, PERIOD_S, STORY_LINES
 from page.orders import Orders
 from page.picture import Table, changes
 from page.rate import Rate
@@ -29,6 +29,9 @@ COMPONENT: Final = "component:"
 
 STORY_AGAIN_S: Final = 10.0
 """How old a timeline gets while its component stands still."""
+
+OLD_AGAIN_S: Final = 1.0
+"""Between two words to a client that a picture is old."""
 
 OUTPUT_AGAIN_S: Final = 2.0
 """Between two tries to follow an output that cannot be had."""
@@ -60,8 +63,10 @@ class Viewer:
         self._sent: Table = {}
         self._output: dict[int, bytearray] = {}
         self._left_out = 0
-        self._output_says = ""
-        self._extra: list[dict[str, Any]] = []
+        self._output_says = self._output_said = ""
+        self._extra: dict[str, dict[str, Any]] = {}
+        self._wanted: str | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._following: list[asyncio.Task[None]] = []
         self._rate = Rate(MESSAGES_A_S, MESSAGES_AT_ONCE)
 
@@ -74,7 +79,9 @@ class Viewer:
             for message in self._news():
                 await send(_said(message))
             await asyncio.sleep(PERIOD_S)
-            await self.wake.wait()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(OLD_AGAIN_S):
+                    await self.wake.wait()
 
     async def listen(self, receive: Callable[[], Awaitable[str]]) -> None:
         """Take what the client says.
@@ -90,10 +97,18 @@ class Viewer:
                 wanted = _looks.decode(text)
             except (msgspec.DecodeError, RecursionError) as error:
                 raise TurnedAwayError(400, f"a message that no page of ours sends: {error}") from error
-            await self._look_at(wanted.look)
+            self._wanted = wanted.look
+            if self._looking is None or self._looking.done():
+                self._looking = asyncio.create_task(self._look_around())
 
     async def close(self) -> None:
         """Follow nothing any more."""
+        if self._looking is not None:
+            self._looking.cancel()
+            await asyncio.gather(self._looking, return_exceptions=True)
+        await self._unfollow()
+
+    async def _unfollow(self) -> None:
         for task in self._following:
             task.cancel()
         await asyncio.gather(*self._following, return_exceptions=True)
@@ -103,34 +118,43 @@ class Viewer:
 
     def _news(self) -> list[dict[str, Any]]:
         table = {**self.feed.table, **self._people.table(self)}
+        if old_s := self.feed.old_s():
+            table["team"] = {**table["team"], "old_s": old_s}
         news = changes(self._sent, table)
         self._sent = table
-        messages, self._extra = self._extra, []
-        if news:
-            messages.insert(0, news)
-        if self._output or self._output_says or self._left_out:
+        messages = [*([news] if news else []), *self._extra.values()]
+        self._extra = {}
+        if self._output or self._left_out or self._output_says != self._output_said:
             texts = {stream: content.decode(errors="replace") for stream, content in self._output.items()}
             told = {"name": self.look.removeprefix(COMPONENT), "left_out": self._left_out, "says": self._output_says}
             messages.append({"output": told | {"text": texts}})
-            self._output, self._left_out, self._output_says = {}, 0, ""
+            self._output, self._left_out, self._output_said = {}, 0, self._output_says
         return messages
 
-    def _tell(self, message: dict[str, Any]) -> None:
-        self._extra.append(message)
+    def _tell(self, kind: str, message: dict[str, Any]) -> None:
+        """The newest of its kind, for a client that reads slowly."""
+        self._extra[kind] = {kind: message}
         self.wake.set()
 
     # --- What is looked at ---
 
+    async def _look_around(self) -> None:
+        """Look at what was wanted last, and not at all that was wanted before it."""
+        while self._wanted is not None:
+            wanted, self._wanted = self._wanted, None
+            await self._look_at(wanted)
+            await asyncio.sleep(LOOK_S)
+
     async def _look_at(self, key: str) -> None:
-        await self.close()
-        self._output, self._left_out, self._output_says, self._extra = {}, 0, "", []
+        await self._unfollow()
+        self._output, self._left_out, self._output_says, self._output_said, self._extra = {}, 0, "", "", {}
         self.look = key if key in self.feed.table else ""
         self._people.changed()
         fields = self.feed.table.get(self.look)
         if fields is None:
             return
         if charted(self.look, fields) is not None:
-            self._tell({"past": {"key": self.look, "points": self._people.feeds.past(self.look)}})
+            self._tell("past", {"key": self.look, "points": self._people.feeds.past(self.look)})
         if self.look.startswith(COMPONENT):
             name = self.look.removeprefix(COMPONENT)
             self._following = [asyncio.create_task(self._follow_story(name)), asyncio.create_task(self._follow_output(name))]
@@ -146,21 +170,22 @@ class Viewer:
                     told = await link.ask("why", self.session.uid, name=name)
                 story = [_brief(line) for line in told["story"][-STORY_LINES:]]
                 silent = [one["robot"] for one in told["robots"] if not one["answered"]]
-                message = {"story": {"name": name, "lines": story, "silent": silent, "says": ""}}
+                message = {"name": name, "lines": story, "silent": silent, "says": ""}
             except FailoverError as error:
-                message = {"story": {"name": name, "lines": [], "silent": [], "says": str(error)}}
+                message = {"name": name, "lines": [], "silent": [], "says": str(error)}
             if message != last:
                 last = message
-                self._tell(message)
+                self._tell("story", message)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(STORY_AGAIN_S):
                     while seen == [self.feed.table.get(COMPONENT + name, {}).get(part) for part in _DECIDED]:
                         await asyncio.sleep(PERIOD_S)
 
     async def _follow_output(self, name: str) -> None:
-        """The end of what its program has written, and all that follows."""
+        """The end of what its program has written, and all that follows; also after another start."""
         offsets = [-OUTPUT_TAIL, -OUTPUT_TAIL]
         while True:
+            began = self._standing(name)
             try:
                 async with await AgentLink.open(self._socket) as link:
                     replies = link.stream("logs", self.session.uid, name=name, follow=True, offsets=offsets)
@@ -168,14 +193,23 @@ class Viewer:
                         async for reply in replies:
                             if isinstance(reply, Output):
                                 offsets[reply.stream - 1] = reply.offset + len(reply.content)
+                                self._output_says = ""
                                 self._hold(reply)
                 self._output_says = "it has ended"
                 self.wake.set()
-                return
+                ended = self._standing(name)
+                while self._standing(name) in (began, ended):
+                    await asyncio.sleep(PERIOD_S)
+                offsets = [-OUTPUT_TAIL, -OUTPUT_TAIL]
             except FailoverError as error:
                 self._output_says = str(error)
                 self.wake.set()
                 await asyncio.sleep(OUTPUT_AGAIN_S)
+
+    def _standing(self, name: str) -> list[Any]:
+        """What another start of a component changes."""
+        fields = self.feed.table.get(COMPONENT + name, {})
+        return [fields.get("state"), fields.get("epoch"), fields.get("pid")]
 
     def _hold(self, reply: Output) -> None:
         held = self._output.setdefault(reply.stream, bytearray())
@@ -197,6 +231,10 @@ class People:
         self.feeds = feeds
         self.orders: Orders | None = None
         self.viewers: set[Viewer] = set()
+
+    def windows_of(self, session: Session) -> int:
+        """How many windows the user of a session has open."""
+        return sum((one.session.user, one.session.uid) == (session.user, session.uid) for one in self.viewers)
 
     def changed(self) -> None:
         """Someone came, went or looks elsewhere, or an order stands otherwise."""

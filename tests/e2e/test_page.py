@@ -7,18 +7,22 @@ import grp
 import json
 import os
 import pwd
+import signal
 import socket
 import ssl
 import subprocess
+import sys
 import uuid
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from failover.boards.board import Board
 from failover.config.page import hashed
-from page.limits import BODY_SIZE_MAX, LIVE_SIZE_MAX, ORDERS_AT_ONCE
+from page.limits import BODY_SIZE_MAX, CONNECTIONS_OF_ONE_MAX, LIVE_SIZE_MAX, ORDERS_AT_ONCE, SESSIONS_OF_USER_MAX
 from tests.e2e import pages, robots
 from tests.e2e.pages import COUNT, Served, served
 from tests.e2e.robots import RobotMachine, until
@@ -29,6 +33,7 @@ pytestmark = [pytest.mark.skipif(bool(pages.why_not()), reason=pages.why_not() o
 
 ROOT = os.geteuid() == 0
 MEMBER = "nobody"
+STRANGER = 54_321
 SETTINGS = f'group = "{grp.getgrgid(pwd.getpwnam(MEMBER).pw_gid).gr_name}"\n' if ROOT else ""
 NAME = f"/{TEAM}/robot1/count"
 
@@ -131,7 +136,8 @@ def test_the_whole_team_comes_once_and_then_what_changes(client: Client) -> None
     assert (one["primary"], one["standby"], one["word"]) == ("robot1", "robot2", "protected")
     before = len(client.messages)
     client.until(lambda: len(client.messages) > before + 5, "changes")
-    later = [message["set"][f"component:{NAME}"] for message in client.messages[before:] if f"component:{NAME}" in message["set"]]
+    changed = [message.get("set", {}).get(f"component:{NAME}") for message in client.messages[before:]]
+    later = [fields for fields in changed if fields]
     assert later and all("promise" not in fields and "orders" not in fields for fields in later), "what stands still is not sent"
 
 
@@ -214,11 +220,53 @@ def test_what_the_agent_refuses_is_said_in_its_words(client: Client, page: Serve
 
 def test_too_many_orders_at_once_are_told_when_to_come_again(client: Client, page: Served) -> None:
     wishes = [{"id": str(uuid.uuid4()), "verb": "prefer", "name": "/no/such", "to": "robot1"} for _ in range(3 * ORDERS_AT_ONCE)]
-    answers = [page.post("/orders", wish) for wish in wishes]
-    assert {status for status, _ in answers} <= {202, 429}, "a slow machine gives them slowly enough"
+    with ThreadPoolExecutor(16) as pool:
+        answers = list(pool.map(lambda wish: page.post("/orders", wish), wishes))
+    assert {status for status, _ in answers} == {202, 429}
     assert all(said["again_ms"] > 0 for status, said in answers if status == 429)
     taken = [wish["id"] for wish, (status, _) in zip(wishes, answers, strict=True) if status == 202]
     assert {client.ended(wish)["state"] for wish in taken} == {"refused"}
+
+
+DRIVER = """
+import failover
+
+@failover.driver("Lab/robot1/Arm", alias="arm")
+class Arm:
+    @failover.query
+    def secret(self) -> str:
+        return "swordfish"
+
+failover.run(Arm)
+"""
+
+
+def test_a_driver_is_called_by_its_path_alone_for_which_the_rules_are(pair: Pair, tmp_path: Path) -> None:
+    drivers = tmp_path / "drivers"
+    drivers.mkdir(mode=0o700)
+    environment = {"FAILOVER_DRIVERS": str(drivers), "FAILOVER_ROBOT": "robot1"}
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER], env={**os.environ, **environment})
+    try:
+        with served(pair[0], tmp_path / "page", **environment) as page:
+            page.begin()
+            client = Client(page)
+            with client.link:
+                client.until(lambda: "driver:Lab/robot1/Arm" in client.table, "the driver")
+                refused = client.ended(give(page, "call", name="arm", call="secret"))
+                assert refused["state"] == "refused" and "call it by its path, Lab/robot1/Arm" in refused["says"], refused
+                done = client.ended(give(page, "call", name="Lab/robot1/Arm", call="secret"))
+                assert (done["state"], done["says"]) == ("done", '"swordfish"')
+            log = page.log.read_text()
+        assert "is done" in log and "swordfish" not in log
+    finally:
+        driver.kill()
+        driver.wait()
+
+
+def test_an_order_for_a_page_that_was_started_again_is_not_carried_out_twice(client: Client, page: Served) -> None:
+    wish = {"id": str(uuid.uuid4()), "verb": "prefer", "name": NAME, "to": "robot1", "boot": "of-a-page-before"}
+    status, said = page.post("/orders", wish)
+    assert status == 409 and "is not known" in said["error"] and not said["again_ms"]
 
 
 # --- What it refuses -----------------------------------------------------------------------------------------------------
@@ -246,11 +294,12 @@ def test_a_request_of_another_site_is_refused_and_the_agents_notice_nothing(page
         "a sandboxed frame": ({"Origin": "null"}, 403),
         "another port of this machine": ({"Origin": "http://127.0.0.1:1"}, 403),
         "no session": ({"Cookie": ""}, 401),
-        "a session that there is not": ({"Cookie": "failover=xxxx"}, 401),
+        "a session that there is not": ({"Cookie": f"failover-{page.port}=xxxx"}, 401),
         "no token": ({"x-failover-token": ""}, 403),
         "a token that is wrong": ({"x-failover-token": "wrong"}, 403),
         "a form": ({"Content-Type": "application/x-www-form-urlencoded"}, 415),
         "plain text, which needs no leave": ({"Content-Type": "text/plain"}, 415),
+        "localhost, which may be another user's": ({"Host": f"localhost:{page.port}"}, 421),
         "a name that another site has point here": ({"Host": f"attacker.example:{page.port}"}, 421),
     }
     for what, (changed, status) in refusals.items():
@@ -269,7 +318,7 @@ def test_a_websocket_of_another_site_hears_nothing(page: Served) -> None:
         ("http://attacker.example", page.cookie),
         (None, page.cookie),
         (page.origin, ""),
-        (page.origin, "failover=x"),
+        (page.origin, f"failover-{page.port}=x"),
     ):
         headers = {"Cookie": cookie} if cookie else {}
         with connect(f"ws://127.0.0.1:{page.port}/live", origin=origin, additional_headers=headers) as link:  # type: ignore[arg-type]
@@ -356,6 +405,54 @@ def test_a_session_is_of_the_user_whose_program_has_connected(page: Served) -> N
         os.seteuid(0)
 
 
+@pytest.mark.root
+def test_no_session_begins_for_a_user_whom_the_agent_refuses(page: Served) -> None:
+    os.seteuid(STRANGER)
+    try:
+        status, _, body = page.ask("GET", "/session")
+    finally:
+        os.seteuid(0)
+    assert status == 409 and "may not use the agent's socket" in json.loads(body)["error"]
+
+
+def test_a_user_has_so_many_windows(page: Served) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    others = [Client(page) for _ in range(SESSIONS_OF_USER_MAX)]
+    try:
+        for other in others:
+            other.until(lambda other=other: other.component(), "the team")  # type: ignore[misc]
+        with Client(page).link as last, pytest.raises(ConnectionClosed) as closed:
+            last.recv(pages.PATIENCE_S)
+        assert closed.value.rcvd is not None and "16 windows" in closed.value.rcvd.reason
+    finally:
+        for other in others:
+            other.link.close()
+
+
+def test_a_client_that_sends_no_request_is_hung_up_on_and_holds_so_many_connections(page: Served) -> None:
+    links = [socket.create_connection(("127.0.0.1", page.port), pages.PATIENCE_S) for _ in range(CONNECTIONS_OF_ONE_MAX + 8)]
+    try:
+        links[0].sendall(b"GET / HTTP/1.1\r\nX-Slow: ")
+        ends = [until(lambda link=link: hung_up(link), "the page to hang up") for link in (links[-1], links[1], links[0])]  # type: ignore[misc]
+        assert all(ends)
+    finally:
+        for link in links:
+            link.close()
+    until(lambda: page.ask("GET", "/healthz")[0] == 200, "the page to answer")
+
+
+def hung_up(link: socket.socket) -> bool:
+    """Whether the other end has closed a connection."""
+    link.setblocking(False)
+    try:
+        return link.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
 @pytest.mark.command("openssl")
 def test_people_log_in_with_a_password_over_tls(pair: Pair, tmp_path: Any) -> None:
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
@@ -394,9 +491,10 @@ def test_people_log_in_with_a_password_over_tls(pair: Pair, tmp_path: Any) -> No
         assert status == 200 and prometheus_text.read(body.decode())["failover_healthy"]
         assert ask("POST", "/logout", {}, Cookie=cookie, x_failover_token=token, **post)[0] == 200
         assert ask("GET", "/session", Cookie=cookie)[0] == 401
-        for _ in range(4):
-            status, _, body = ask("POST", "/login", {"name": "ben", "password": "x"}, **post)
-        assert status == 429 and "wait" in json.loads(body)["error"]
+        with ThreadPoolExecutor(8) as pool:
+            guesses = [pool.submit(ask, "POST", "/login", {"name": "anna", "password": str(one)}, **post) for one in range(40)]
+        statuses = [one.result()[0] for one in guesses]
+        assert set(statuses) == {403, 429} and statuses.count(403) < 10, "parallel guesses are counted, too"
 
 
 # --- An agent that is away -------------------------------------------------------------------------------------------------
@@ -407,8 +505,20 @@ def test_while_the_agent_is_away_the_page_says_so_and_then_goes_on_by_itself(cli
     client.until(lambda: client.table["team"]["away"], "the page to see it")
     assert "start failover-agent" in client.table["team"]["away"]
     assert client.component(), "what was known is still shown"
-    assert page.ask("GET", "/healthz")[0] == 503 and page.ask("GET", "/metrics")[0] == 503
+    until(lambda: page.ask("GET", "/healthz")[0] == 503, "its health to be told")
+    assert page.ask("GET", "/metrics")[0] == 503
     lost = client.ended(give(page, "stop", epoch=client.component()["epoch"]))
     assert lost["state"] == "refused" and "cannot reach the agent" in lost["says"]
     robots.start_agent(pair[0])
     client.until(lambda: client.table["team"]["away"] == "" and client.component().get("word") == "protected", "the agent again")
+
+
+def test_an_agent_that_hangs_is_told_and_is_not_shown_as_alive(client: Client, page: Served, pair: Pair) -> None:
+    """The last test: the worker of robot1 stands still, with all its connections open."""
+    worker = robots.host_pid(pair[0], pair[0].status()["lanes_pid"])
+    os.kill(worker, signal.SIGSTOP)
+    try:
+        client.until(lambda: client.table["team"].get("old_s", 0) >= 3, "the age of the picture")
+    finally:
+        os.kill(worker, signal.SIGCONT)
+    client.until(lambda: client.table["team"]["away"] == "" and "old_s" not in client.table["team"], "the agent again")

@@ -15,6 +15,8 @@ from tests.page.status import component, status
 
 NAME = "/lab/robot1/count"
 ROBOTS = ["robot1", "robot2"]
+ALL = Answers(see={NAME: ""}, operate={NAME: ""})
+STATUS = {"team": "lab", "robot": "robot1"}
 
 
 @pytest.mark.parametrize(
@@ -60,18 +62,18 @@ def test_team_robots_and_components_are_rows() -> None:
 
 
 def test_orders_that_make_no_sense_now_say_why() -> None:
-    orders = of_component(component(), ROBOTS, Answers())["orders"]
+    orders = of_component(component(), ROBOTS, ALL)["orders"]
     assert orders["handover"]["to"] == ["robot2"] and orders["handover"]["why_not"] == ""
     assert orders["failback"]["why_not"] == "it runs at robot1 already"
     assert orders["promote"]["why_not"] == "it runs at robot1"
     assert orders["start"]["why_not"] == "it has not ended: it is running"
     assert orders["stop"]["why_not"] == "" and "SIGTERM" in orders["stop"]["says"]
-    alone = of_component(component(), ["robot1"], Answers())["orders"]
+    alone = of_component(component(), ["robot1"], ALL)["orders"]
     assert alone["handover"]["why_not"] == "no other robot is heard"
 
 
 def test_a_confirmation_names_how_long_it_stands_still_and_what_is_lost() -> None:
-    says = of_component(component(), ROBOTS, Answers())["orders"]["handover"]["says"]
+    says = of_component(component(), ROBOTS, ALL)["orders"]["handover"]["says"]
     assert "2 ms" in says and "no work is lost" in says and "connections" in says
 
 
@@ -83,16 +85,34 @@ def test_a_user_without_the_right_sees_the_rule_that_denies() -> None:
 
 def test_the_value_of_an_item_that_may_not_be_read_does_not_leave_the_robot() -> None:
     item = {"robot": "robot1", "item": "ball", "value": 41, "complaint": ""}
-    (row,) = picture.of_items([item], "lab", Answers(read={"/lab/robot1/ball": "no rule"})).values()
+    path = "/lab/robot1/ball"
+    (row,) = picture.of_items([item], "lab", Answers(see={path: ""}, read={path: "no rule"})).values()
     assert row["value"] is None and row["complaint"] == "no rule"
-    (row,) = picture.of_items([item], "lab", Answers(read={"/lab/robot1/ball": ""})).values()
+    (row,) = picture.of_items([item], "lab", Answers(see={path: ""})).values()
+    assert row["value"] is None, "not asked is not allowed"
+    (row,) = picture.of_items([item], "lab", Answers(see={path: ""}, read={path: ""})).values()
     assert row["value"] == 41
+    for see in ({path: "no rule"}, {}):
+        assert picture.of_items([item], "lab", Answers(see=see, read={path: ""})) == {}
+
+
+def test_a_driver_is_shown_to_those_who_see_it_and_called_by_those_who_may() -> None:
+    driver = {"path": "lab/arm"}
+    assert picture.of_drivers([driver], Answers(see={"lab/arm": "no rule"}, call={"lab/arm": ""})) == {}
+    assert picture.of_drivers([driver], Answers(call={"lab/arm": ""})) == {}
+    (row,) = picture.of_drivers([driver], Answers(see={"lab/arm": ""})).values()
+    assert row["why_not"] == picture.UNASKED
+    (row,) = picture.of_drivers([driver], Answers(see={"lab/arm": ""}, call={"lab/arm": ""})).values()
+    assert row["why_not"] == ""
 
 
 def test_a_task_is_seen_by_those_who_see_its_component() -> None:
     tasks, owners = [{"task": "map"}, {"task": "other"}], {"map": NAME}
-    assert set(picture.of_tasks(tasks, "robot1", owners, Answers(see={NAME: "no rule"}))) == {"task:other"}
-    assert set(picture.of_tasks(tasks, "robot1", owners, Answers(see={NAME: ""}))) == {"task:map", "task:other"}
+    here = "/lab/robot1"
+    assert set(picture.of_tasks(tasks, STATUS, owners, Answers(see={NAME: "no rule", here: ""}))) == {"task:other"}
+    assert set(picture.of_tasks(tasks, STATUS, owners, Answers(see={NAME: "", here: "no rule"}))) == {"task:map"}
+    assert set(picture.of_tasks(tasks, STATUS, owners, Answers(see={NAME: "", here: ""}))) == {"task:map", "task:other"}
+    assert picture.of_tasks(tasks, STATUS, owners, Answers()) == {}
 
 
 tables = st.dictionaries(st.text(max_size=2), st.dictionaries(st.text(max_size=2), st.integers(0, 2), max_size=3), max_size=4)

@@ -1,14 +1,13 @@
-"""Sessions and logins: cookies end, no user shuts another out, and guesses of a password become slow."""
+"""Sessions: cookies end, and no user shuts another out."""
 
 from __future__ import annotations
 
 import pytest
 
-from failover.config.page import hashed, is_password
 from page import rate, sessions
 from page.errors import TurnedAwayError
-from page.limits import PAGE_SESSIONS_MAX, SESSION_S, SESSIONS_OF_USER_MAX
-from page.rate import Rate
+from page.limits import PAGE_SESSIONS_MAX, SESSION_MAX_S, SESSION_S, SESSIONS_OF_USER_MAX
+from page.rate import Rate, Rates
 from page.sessions import Sessions
 
 
@@ -26,20 +25,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
-def test_a_password_is_kept_as_a_digest_with_a_salt_of_its_own() -> None:
-    one, other = hashed("swordfish"), hashed("swordfish")
-    assert one != other and "swordfish" not in one
-    assert is_password("swordfish", one) and is_password("swordfish", other)
-    assert not is_password("swordfisch", one) and not is_password("", one)
-    assert not is_password("x", "scrypt:16384:8:1:!!!!") and not is_password("x", "")
-
-
-def test_a_line_that_would_take_all_memory_is_no_password() -> None:
-    assert not is_password("x", f"scrypt:4194304:99:1:{'A' * 24}:{'A' * 44}")
-
-
 def test_a_session_ends_after_a_day_without_a_request_and_not_while_a_window_is_open(clock: Clock) -> None:
-    known = Sessions({})
+    known = Sessions()
     session, watched = known.begin("anna", 1000), known.begin("ben", 1001)
     watched.live = 1
     clock.now_s += SESSION_S + 1
@@ -49,7 +36,7 @@ def test_a_session_ends_after_a_day_without_a_request_and_not_while_a_window_is_
 
 
 def test_a_user_with_many_sessions_loses_its_own_oldest_and_no_other_users(clock: Clock) -> None:
-    known = Sessions({})
+    known = Sessions()
     first = known.begin("ben", 1001)
     own = []
     for _ in range(SESSIONS_OF_USER_MAX + 1):
@@ -60,7 +47,7 @@ def test_a_user_with_many_sessions_loses_its_own_oldest_and_no_other_users(clock
 
 
 def test_where_all_sessions_have_a_window_one_more_is_refused_with_the_reason(clock: Clock) -> None:
-    known = Sessions({})
+    known = Sessions()
     for number in range(PAGE_SESSIONS_MAX):
         known.begin(f"user{number}", number).live = 1
     with pytest.raises(TurnedAwayError, match="close one of them") as refused:
@@ -68,21 +55,23 @@ def test_where_all_sessions_have_a_window_one_more_is_refused_with_the_reason(cl
     assert refused.value.status == 503 and len(known) == PAGE_SESSIONS_MAX
 
 
-def test_wrong_passwords_make_the_next_try_wait_longer_and_a_right_one_ends_that(clock: Clock) -> None:
-    known = Sessions({})
-    waits = []
-    for _ in range(12):
-        known.note_try("anna", right=False)
-        waits.append(known.wait_s("anna"))
-        clock.now_s += waits[-1]
-    assert waits[:5] == [0, 0, 1, 2, 4] and waits[-1] == 60
-    assert known.wait_s("ben") == 0
-    known.note_try("anna", right=True)
-    assert known.wait_s("anna") == 0
+def test_a_session_ends_after_a_day_however_much_it_is_used(clock: Clock) -> None:
+    known = Sessions()
+    session = known.begin("anna", 1000)
+    session.live = 1
+    clock.now_s += SESSION_MAX_S - 1
+    assert known.of(session.id) is session
+    clock.now_s += 2
+    assert known.is_over(session) and known.of(session.id) is None and len(known) == 0
 
 
-def test_a_name_that_there_is_not_is_as_wrong_as_a_password() -> None:
-    assert not Sessions({}).is_right("nobody", "") and not Sessions({}).is_right("nobody", "x")
+def test_who_only_watches_whether_a_session_is_over_does_not_prolong_it(clock: Clock) -> None:
+    known = Sessions()
+    session = known.begin("anna", 1000)
+    for _ in range(4):
+        clock.now_s += SESSION_S / 3
+        over = known.is_over(session)
+    assert over
 
 
 def test_a_rate_lets_some_through_at_once_and_then_some_a_second(clock: Clock) -> None:
@@ -93,3 +82,10 @@ def test_a_rate_lets_some_through_at_once_and_then_some_a_second(clock: Clock) -
     assert limit.wait_s() == 0 and limit.wait_s() > 0
     clock.now_s += 60
     assert [limit.wait_s() > 0 for _ in range(4)] == [False, False, False, True]
+
+
+def test_each_who_asks_has_a_rate_and_those_who_ask_no_more_are_forgotten(clock: Clock) -> None:
+    limit = Rates(a_second=1, at_once=1, most=2)
+    assert [limit.wait_s(who) > 0 for who in ("anna", "ben", "anna")] == [False, False, True]
+    assert limit.wait_s("carl") == 0 and len(limit._rates) == 2
+    assert limit.wait_s("anna") > 0, "the newest are remembered"
