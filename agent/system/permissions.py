@@ -118,16 +118,16 @@ def uid_of(connection: socket.socket) -> int:
     return int(_CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[1])
 
 
-def spoken_for(speaker: Caller, uid: int, page_user: str, group: str) -> Caller:
+def spoken_for(speaker: Caller, uid: int, page_uid: int, group: str) -> Caller:
     """The user for whom a client asks, as if that user had connected.
 
     Args:
-        page_user: of agent.toml. group: whose members may connect.
+        page_uid: of page_user in agent.toml; `NOBODY`: there is none. group: whose members may connect.
 
     Raises:
         RefusedError: this client may not speak for that user, or that user may not connect.
     """
-    if not may(speaker.uid, None) and (speaker.uid == NOBODY or speaker.uid != uid_named(page_user)):
+    if not may(speaker.uid, None) and (speaker.uid == NOBODY or speaker.uid != page_uid):
         raise RefusedError(
             f"uid {speaker.uid} may not ask for other users: page_user in agent.toml names the only one who may",
             "PermissionError",

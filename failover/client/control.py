@@ -29,7 +29,7 @@ verb           arguments                                                result, 
 ``why``        ``name`` "", ``robot`` "", ``age_ms_max`` 0               see `WHY`
 ``rights``     ``user``, ``right``, ``path``, all *must*                ``{allow, because, groups, place}``
 ``may``        ``rights`` *must*, ``paths`` *must*                      ``{robot, team, answers: {right: {path: because}}}``:
-                                                                        may this user; "" if so, else why not
+                                                                        may this user; "" if so, else why not; 512 at most
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*, ``to`` "": the target expected          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``

@@ -22,8 +22,11 @@ USER_SIZE_MAX: Final = 256
 RIGHTS_ASKED_MAX: Final = 8
 """Rights in one question: there are no more."""
 
-PATHS_ASKED_MAX: Final = 4_096
-"""Paths in one question: all components of a team, and more items than a board has."""
+DECISIONS_ASKED_MAX: Final = 512
+"""Rights times paths in one question: each is a look through all rules, and other clients wait meanwhile."""
+
+PATH_SIZE_MAX: Final = 300
+"""Characters of a path in such a question."""
 
 Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
 """Text that the kernel can be told: a string of C ends with a NUL."""
@@ -99,7 +102,7 @@ class MayArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``may``."""
 
     rights: Annotated[list[str], msgspec.Meta(min_length=1, max_length=RIGHTS_ASKED_MAX)]
-    paths: Annotated[list[str], msgspec.Meta(max_length=PATHS_ASKED_MAX)]
+    paths: Annotated[list[Annotated[str, msgspec.Meta(max_length=PATH_SIZE_MAX)]], msgspec.Meta(max_length=DECISIONS_ASKED_MAX)]
 
 
 class ProtectArguments(msgspec.Struct, forbid_unknown_fields=True):

@@ -18,6 +18,7 @@ from agent.errors import RefusedError
 from agent.main_loop.messages import Told
 from agent.system.permissions import may, refusal_without_rules, without_output
 from agent.worker.control.arguments import (
+    DECISIONS_ASKED_MAX,
     MayArguments,
     NameArguments,
     RightsArguments,
@@ -44,6 +45,9 @@ LIVING: Final = ("live", "suspect")
 
 WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "start", "stop")
 """What takes a program, its output, or a word that others obey."""
+
+DECISIONS_AT_ONCE: Final = 50
+"""Answers of ``may`` before other clients have their turn."""
 
 QUESTIONS: Final = ("standing", "picture", "story")
 """What any member may ask of another one. The rest are orders, and a witness's are refused: it may be any user's process."""
@@ -213,6 +217,10 @@ class Questions:
     async def may(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Which of these rights does the asking user have at these paths?"""
         wanted, uid = arguments_of(MayArguments, "may", arguments), say.caller.uid
+        if len(wanted.rights) * len(wanted.paths) > DECISIONS_ASKED_MAX:
+            raise RefusedError(
+                f"may: {len(wanted.rights)} rights at {len(wanted.paths)} paths; ask {DECISIONS_ASKED_MAX} at a time"
+            )
         told = await self._lines.ask("status")
         owners = {one.name: one.owner for one in told.status.components} if told.status else {}
         gate = self._rules()
@@ -220,7 +228,9 @@ class Questions:
         for right in wanted.rights:
             asker = await gate.subject(uid, right) if gate is not None else None
             found = answers[right] = {}
-            for path in wanted.paths:
+            for number, path in enumerate(wanted.paths):
+                if number % DECISIONS_AT_ONCE == 0:
+                    await asyncio.sleep(0)
                 if gate is not None and asker is not None:
                     answer = gate.decision(asker, right, path, owners.get(path))
                     found[path] = "" if answer else answer.because

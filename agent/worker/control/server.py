@@ -75,14 +75,14 @@ class ControlServer:
         Args:
             page_user: the user whose process may ask for other users, besides root and our own; "": none.
         """
-        self._page_user = page_user
+        self._page_uid = uid_named(page_user) if page_user else NOBODY
         self._spoken_for: dict[tuple[int, int], tuple[Caller, float]] = {}
         self._path = path
         self._group = group
         self._verbs = verbs
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
-        self._admission = Admission(uid_named(page_user) if page_user else NOBODY)
+        self._admission = Admission(self._page_uid)
 
     async def open(self) -> None:
         """Listen; only the owner, and the group if there is one, may connect.
@@ -161,12 +161,12 @@ class ControlServer:
             if not await self._receive(reader, uid, body):
                 return False
             request = _request(body)
-            await self._serve(request, self._for_whom(request, conversation), reader)
+            await self._serve(request, await self._for_whom(request, conversation), reader)
             return True
         finally:
             self._admission.let_go(uid, _counted(len(body)))
 
-    def _for_whom(self, request: Request, conversation: Conversation) -> Conversation:
+    async def _for_whom(self, request: Request, conversation: Conversation) -> Conversation:
         """The same conversation, with the user for whom the request is made.
 
         Raises:
@@ -181,7 +181,9 @@ class ControlServer:
         if known is None or now_s > known[1]:
             if len(self._spoken_for) >= SPOKEN_FOR_MAX:
                 self._spoken_for.clear()
-            caller = spoken_for(conversation.caller, request.on_behalf, self._page_user, self._group)
+            caller = await asyncio.to_thread(
+                spoken_for, conversation.caller, request.on_behalf, self._page_uid, self._group
+            )  # a directory of users may be slow
             known = self._spoken_for[key] = (caller, now_s + MEMBER_S)
         return Conversation(conversation.writer, known[0])
 

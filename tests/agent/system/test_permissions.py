@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from agent.errors import RefusedError
 from agent.system import permissions
-from agent.system.permissions import NOBODY, Caller, caller_of, check_right, guest_of, inheritance_for, may, spoken_for
+from agent.system.permissions import NOBODY, Caller, caller_of, check_right, guest_of, inheritance_for, may, spoken_for, uid_named
 from agent.worker.components.restore_limits import check_rights
 from checkpoint.errors import FormatError, MismatchError
 from checkpoint.linux.spawn.inherited_limits import Inheritance
@@ -141,7 +141,7 @@ def test_one_user_alone_may_ask_for_the_members_of_the_group() -> None:
     uid = pwd.getpwnam(MEMBER).pw_uid
     page = pwd.getpwnam("daemon").pw_uid
     for speaker in (0, page):
-        spoken = spoken_for(caller(speaker), uid, "daemon", GROUP)
+        spoken = spoken_for(caller(speaker), uid, uid_named("daemon"), GROUP)
         assert (spoken.uid, spoken.groups, spoken.inheritance.uid) == (uid, (), uid)
     for speaker, wanted, page_user, group, why in (
         (SOMEBODY, uid, "daemon", GROUP, "may not ask for other users"),
@@ -155,7 +155,7 @@ def test_one_user_alone_may_ask_for_the_members_of_the_group() -> None:
         (page, uid, "daemon", "no-such-group", "add it to the group"),
     ):
         with pytest.raises(RefusedError, match=why) as refused:
-            spoken_for(caller(speaker), wanted, page_user, group)
+            spoken_for(caller(speaker), wanted, uid_named(page_user), group)
         assert refused.value.kind == "PermissionError"
 
 

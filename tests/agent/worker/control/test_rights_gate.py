@@ -118,6 +118,15 @@ def test_a_user_asks_for_all_its_rights_at_once(asked: Asked, tmp_path: Path) ->
         asked("may", rights=["see"] * 9, paths=[])
 
 
+def test_a_question_for_many_rights_is_bounded_and_others_have_their_turn(asked: Asked) -> None:
+    told = asked("may", rights=["see", "read"], paths=[f"/lab/robot1/{number}" for number in range(256)])
+    assert len(told["answers"]["read"]) == 256
+    with pytest.raises(RefusedError, match="2 rights at 257 paths; ask 512 at a time"):
+        asked("may", rights=["see", "read"], paths=[f"/lab/robot1/{number}" for number in range(257)])
+    with pytest.raises(RefusedError, match="may: its arguments are not right"):
+        asked("may", rights=["see"], paths=["/" + "x" * 300])
+
+
 def test_the_rules_say_what_a_user_sees_and_reads(asked: Asked, tmp_path: Path) -> None:
     (tmp_path / RIGHTS_FILE).write_text(RULES)
     assert shown(asked("status")) == {"open": False, "mine": True}
