@@ -134,8 +134,9 @@ class Orders:
         whose = (session.user, session.uid)
         if wish.boot != BOOT:
             raise TurnedAwayError(409, "the page was started again meanwhile: whether this order was carried out is not known")
-        if (known := self._known.get(whose, {}).get(wish.id)) is not None:
-            return known
+        taken = self._known.get(whose)
+        if taken is not None and wish.id in taken:
+            return taken[wish.id]
         if wish.age_ms > ORDER_AGE_MAX_S * 1000:
             raise TurnedAwayError(
                 409, f"this order is {wish.age_ms / 1000:.0f} s old and was not taken; look again, and give it anew"

@@ -33,14 +33,14 @@ WAITING_MAX: Final = 128
 """Connections that wait to be taken."""
 
 
-class FairProtocol(H11Protocol):
+class FairProtocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not read
     """HTTP; hangs up on a client that sends no whole head in time, and on the connections of one client beyond a limit."""
 
     _open: ClassVar[Counter[str]] = Counter()
     _whose = ""
     _late: asyncio.TimerHandle | None = None
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.Transport) -> None:
         """Count it, and wait for the first head."""
         super().connection_made(transport)
         self._whose = self._client()
