@@ -329,6 +329,18 @@ class Settings:
         """All members but this one, by name."""
         return {name: robot for name, robot in self.team.robots.items() if name != self.config.robot}
 
+    def with_robots(self, robots: Mapping[str, Robot], change: int = 0) -> Settings:
+        """The same agent in a team of these members."""
+        return replace(self, team=replace(self.team, robots=dict(robots), change=change))
+
+    def with_key(self) -> Settings:
+        """The same agent with the secret key that lies in the team directory now.
+
+        Raises:
+            TeamFileError: it cannot be read.
+        """
+        return replace(self, secret_key=team_directory.read_secret_key(Path(self.config.team_directory), self.config.robot))
+
     def component(self, name: str) -> ComponentConfig:
         """The operator's settings for a component; the defaults where he gave none."""
         return self.config.components.get(name, ComponentConfig())
@@ -356,6 +368,20 @@ def load(path: Path) -> Settings:
     _check_components(path, config, members)
     _check_tasks(path, config, members)
     return Settings(path, config, members, secret)
+
+
+def check_team(settings: Settings, team: Team) -> None:
+    """Whether this robot's configuration fits a team in which it may soon be.
+
+    Raises:
+        ConfigError: it would not start in it; names the line.
+    """
+    path, config = settings.path, settings.config
+    if config.robot not in team.robots:
+        return
+    _check_keys(path, config, team)
+    _check_rule(path, config, team)
+    _check_components(path, config, team)
 
 
 def _check_keys(path: Path, config: Config, members: Team) -> None:

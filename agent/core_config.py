@@ -40,6 +40,7 @@ def node_config(settings: Settings) -> types.Config:
         witnesses=_members(settings, "witness"),
         patience_ms=config.patience_s * 1_000,
         boot_patience_ms=config.boot_patience_s * 1_000,
+        seat=settings.me.seat,
         components=tuple(declared(settings, name, task) for name, task in config.tasks.items()),
     )
 

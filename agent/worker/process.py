@@ -144,6 +144,11 @@ class Worker(Switchboard):
         return Inventory(_held(store), found)
 
     async def _provide_board(self) -> None:
+    async def prepare_team(self) -> None:
+        """See `agent.worker.hub.Switchboard.prepare_team`: a file of the board for each member."""
+        if self._board_place is not None:
+            await self._provide_board()
+
         if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):
             self._provide_place_of_schedule()
             return

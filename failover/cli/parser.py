@@ -292,13 +292,14 @@ VERBS: Final = (
         "team",
         "the robots of the team, and their keys",
         """
-        Begin a team, enrol robots, list them. The team file is the same on every robot and holds nothing secret; a robot's secret
-        key stays on that robot alone. failover team ACT --help explains an act.
+        Begin a team, bring robots into it, take them out, list them. No agent is restarted for that. The team file is the same on
+        every robot and holds nothing secret; a robot's secret key stays on that robot alone. failover team ACT --help explains
+        an act.
 
-          failover team create lab
-          failover team enrol robot1 192.168.7.11
-          failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
-          failover team show
+          failover team create lab                             # on the first robot
+          failover team invite robot2                          # there: prints a line
+          failover team join robot2@192.168.7.11:7423/3ljz     # on robot2: that line, whole
+          failover team list
         """,
         "failover.cli.arguments.team:team",
         "failover.cli.verbs.team:show",

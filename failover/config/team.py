@@ -23,6 +23,7 @@ from checkpoint.store.whole_file import write_whole
 from failover.config import strict_toml
 from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
 from failover.core.frames.roster import Roster, roster
+from failover.core.team_changes import seats
 from failover.core.wire import names
 from failover.errors import NameFormatError, TeamFileError
 
@@ -53,21 +54,24 @@ class Robot:
         beats: "host:port" for each of its links; beats go to all of them.
         bulk: "host:port" on the wired link, for snapshots.
         public_key: Z85, or "" in a team without keys.
+        seat: its number in the team, which stays while members come and go; -1: by the order of names.
     """
 
     beats: tuple[str, ...]
     bulk: str
     role: Role = "robot"
     public_key: str = ""
+    seat: int = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Team:
-    """The members, by name, and the items of their board."""
+    """The members, by name, and the items of their board. ``change``: how often failover has changed the members."""
 
     team: str
     robots: dict[str, Robot] = field(default_factory=dict)
     board: BoardConfig = field(default_factory=BoardConfig)
+    change: int = 0
 
     def items(self) -> Board:
         """The board's declarations, checked when the file was read.
@@ -92,13 +96,28 @@ def read(directory: Path) -> Team:
     if not path.exists():
         raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or copy it here from another robot")
     team = strict_toml.read(path, Team)
-    if len(team.robots) > ROBOT_LIMIT:
-        raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
-    for name, robot in team.robots.items():
-        check_robot(str(path), name, robot)
+    check_team(str(path), team)
     if team.board.items:
         board_of(team.board, lambda keys: strict_toml.place_of(path, keys))
     return team
+
+
+def check_team(where: str, team: Team) -> None:
+    """Refuse members that cannot be a team.
+
+    Raises:
+        TeamFileError: says which and why.
+    """
+    if len(team.robots) > ROBOT_LIMIT:
+        raise TeamFileError(f"{where}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
+    for name, robot in team.robots.items():
+        check_robot(where, name, robot)
+    given = sorted(robot.seat for robot in team.robots.values())
+    if given and given[-1] >= 0 and (given[0] < 0 or len(set(given)) < len(given) or given[-1] >= ROBOT_LIMIT):
+        raise TeamFileError(
+            f"{where}: each member has a seat of its own from 0 to {ROBOT_LIMIT - 1}, or none has one; copy the file from a "
+            "robot where it is whole"
+        )
 
 
 def check_robot(where: str, name: str, robot: Robot) -> None:
@@ -139,7 +158,8 @@ def split_address(address: str, where: str) -> tuple[str, int]:
         TeamFileError: it is neither.
     """
     host, separator, port = address.rpartition(":")
-    if not separator or not host or not port.isdigit() or not 0 < int(port) < 1 << 16:
+    is_host = bool(separator and host) and host.isprintable() and not set(host) & set(' "\\')
+    if not is_host or not port.isdecimal() or not port.isascii() or not 0 < int(port) < 1 << 16:
         raise TeamFileError(f"{where}: {address!r} is no address; write host:port")
     return host.strip("[]"), int(port)
 
@@ -153,7 +173,10 @@ def write(directory: Path, team: Team) -> None:
     """Write the team file whole: aside, then renamed. The operator's lines below ``[board]`` stay as they are."""
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / TEAM_FILE
-    write_whole(path, (_as_toml(team) + _board_text(path, team.board)).encode(), mode=0o666, lasts="process")
+    mode = path.stat().st_mode & 0o777 if path.exists() else None
+    write_whole(path, (_as_toml(team) + _board_text(path, team.board)).encode(), mode=0o666, lasts="name")
+    if mode is not None:
+        path.chmod(mode)  # an agent's umask is another one than a person's, and programs read the file
 
 
 def _board_text(path: Path, board: BoardConfig) -> str:
@@ -169,8 +192,13 @@ def _board_text(path: Path, board: BoardConfig) -> str:
 
 
 def enrol(team: Team, name: str, robot: Robot) -> Team:
-    """The team with one more robot, or with that robot's entry replaced."""
+    """The team with one more robot, or with that robot's entry replaced, which keeps its seat."""
     check_robot("the new robot", name, robot)
+    if len(team.robots) >= ROBOT_LIMIT and name not in team.robots:
+        raise TeamFileError(f"team {team.team} has {ROBOT_LIMIT} members, and no more find a place")
+    taken = {other: member.seat for other, member in team.robots.items()}
+    if robot.seat < 0 and any(seat >= 0 for seat in taken.values()):
+        robot = replace(robot, seat=seats(taken | {name: taken.get(name, -1)}, [*taken, name])[name])
     return replace(team, robots={**team.robots, name: robot})
 
 
@@ -197,7 +225,36 @@ def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
         raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
     with open(descriptor, "w") as file:
         file.write(secret + "\n")
+        file.flush()
+        os.fsync(descriptor)
     return path
+
+
+def propose_secret_key(directory: Path, robot: str, secret: str) -> Path:
+    """Keep the key that is to take the place of this robot's own one, until the team has taken its public half.
+
+    Raises:
+        TeamFileError: it cannot be written.
+    """
+    path = secret_key_path(directory, robot).with_suffix(".next")
+    try:
+        write_whole(path, (secret + "\n").encode(), mode=0o600, lasts="name")
+    except OSError as error:
+        raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
+    return path
+
+
+def change_secret_key(directory: Path, robot: str) -> None:
+    """Put the key that was proposed in the place of the present one.
+
+    Raises:
+        TeamFileError: there is none.
+    """
+    path = secret_key_path(directory, robot)
+    try:
+        path.with_suffix(".next").replace(path)
+    except OSError as error:
+        raise TeamFileError(f"cannot change the key {path}: {error.strerror}") from error
 
 
 def read_secret_key(directory: Path, robot: str) -> str:
@@ -230,8 +287,10 @@ def forget_secret_key(directory: Path, robot: str) -> None:
 
 def _as_toml(team: Team) -> str:
     lines = ["# The team: the same file on every robot. Nothing in it is secret.", f'team = "{team.team}"']
+    lines += [f"change = {team.change}"] if team.change else []
     for name, robot in sorted(team.robots.items()):
         beats = ", ".join(f'"{address}"' for address in robot.beats)
         lines += ["", f'[robots."{name}"]', f'role = "{robot.role}"', f"beats = [{beats}]", f'bulk = "{robot.bulk}"']
         lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
+        lines += [f"seat = {robot.seat}"] if robot.seat >= 0 else []
     return "\n".join(lines) + "\n"

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from agent import config as configuration
-from agent.main_loop.messages import Happened, Inventory, ToMainLoop, ToWorker, event_of
+from agent.main_loop.messages import Happened, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
 from agent.worker.witness import Witness
@@ -96,8 +96,9 @@ def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(sett
                 await asyncio.sleep(0)
             speaking.cancel()
             main_loop = Channel(theirs, ToMainLoop)
-            return [main_loop.receive()[0] for _ in range(3)]
+            return [main_loop.receive()[0] for _ in range(4)]
 
-    inventory, *later = asyncio.run(first_words())
+    members, inventory, *later = asyncio.run(first_words())
+    assert members == TeamIs(settings.team.robots)
     assert isinstance(inventory, Inventory) and inventory.found == (found,)
     assert [event_of(message) for message in later if isinstance(message, Happened)] == [end, end]

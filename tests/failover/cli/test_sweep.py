@@ -26,7 +26,10 @@ UNDER_AN_AGENT = {
 }
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")
-TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
+TEAMS = (
+    *(["show"], ["list"], ["invite", "r"], ["join", "junk"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"]),
+    *(["create", "x", "--directory", "/proc/1/team"], ["create", "x", "--empty", "--directory", "/proc/1/team"]),
+)
 BOARDS = (
     [],
     ["get", "ball"],
@@ -67,6 +70,7 @@ DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
+    *(["team", "invite", "x", "--port", port] for port in ("-1", "65536", "x")),
     *(["board", "record", "x", *rest] for rest in (["--rate", "0"], ["--rate", "2000"], ["--for", "soon"], ["--max-size", "9"])),
     *(["board", "serve", "--foxglove", port] for port in ("-1", "65536", "x")),
     *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
@@ -133,6 +137,11 @@ def test_with_a_process_that_cannot_be_captured(capsys: pytest.CaptureFixture[st
 def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     directory = [] if "--directory" in act else ["--directory", "directory"]
     assert told(capsys, "team", *act, *directory) == main.FAILED
+
+
+def test_without_an_agent_no_member_leaves(capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "team", "remove", "r", "--socket", "nowhere") == main.NO_AGENT
+    assert told(capsys, "team", "rotate", "--directory", "directory", "--socket", "nowhere") == main.FAILED  # no keys are there
 
 
 @pytest.mark.parametrize("at", ["nowhere", "directory", "junk"])

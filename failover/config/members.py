@@ -1,0 +1,61 @@
+"""A team with one member more, one less, or one with another key: the next change of its team file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from failover.config.addresses import check_addresses
+from failover.config.team import Robot, Team, enrol
+from failover.core.frames.roster import roster
+from failover.core.team_changes import seats
+from failover.errors import TeamFileError
+
+
+def joined(team: Team, name: str, member: Robot) -> Team:
+    """The team with one member more.
+
+    Raises:
+        TeamFileError: it belongs to the team already, or its name, address or key cannot be right.
+    """
+    if name in team.robots:
+        raise TeamFileError(f"{name} belongs to team {team.team} already; failover team remove {name} takes it out")
+    check_addresses(name, member, team.robots)
+    seated = _seated(team)
+    return replace(enrol(seated, name, replace(member, seat=-1)), change=team.change + 1)
+
+
+def rekeyed(team: Team, name: str, public_key: str) -> Team:
+    """The team with another key of one member.
+
+    Raises:
+        TeamFileError: there is no such member, or the key is none.
+    """
+    if name not in team.robots or not team.robots[name].public_key:
+        raise TeamFileError(f"{name} has no key in team {team.team}")
+    seated = _seated(team)
+    return replace(enrol(seated, name, replace(seated.robots[name], public_key=public_key)), change=team.change + 1)
+
+
+def left(team: Team, name: str, me: str) -> Team:
+    """The team with one member less.
+
+    Args:
+        me: this robot, which cannot be the one.
+
+    Raises:
+        TeamFileError: there is no such member, or it is this robot.
+    """
+    if name not in team.robots:
+        raise TeamFileError(f"{name} is no member of team {team.team}, which knows {', '.join(sorted(team.robots))}")
+    if name == me:
+        raise TeamFileError(f"{me} cannot take itself out of its team; give the command at another robot of the team")
+    seated = _seated(team)
+    return replace(
+        seated, robots={other: robot for other, robot in seated.robots.items() if other != name}, change=team.change + 1
+    )
+
+
+def _seated(team: Team) -> Team:
+    """Each member with a seat: as long as members had none, their places were those of the order of names."""
+    given = seats({name: robot.seat for name, robot in team.robots.items()}, roster(team.robots).names)
+    return replace(team, robots={name: replace(robot, seat=given[name]) for name, robot in team.robots.items()})
