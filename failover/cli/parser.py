@@ -289,6 +289,22 @@ VERBS: Final = (
         "failover.cli.verbs.components:prefer",
     ),
     Verb(
+        "lost",
+        "where two copies of a component ran: the state of the one that lost",
+        """
+        Two robots alone that were cut from each other may both have run a component. When they meet again one copy stays, and
+        the state of the other one is kept at its robot. failover status tells of it until a person has looked. These acts need
+        root, and no agent.
+
+          failover lost list
+          failover lost inspect mapper
+          failover lost restore mapper
+          failover lost remove mapper
+        """,
+        "failover.cli.arguments.lost:lost",
+        "failover.cli.verbs.lost:listed",
+    ),
+    Verb(
         "team",
         "the robots of the team, and their keys",
         """

@@ -98,7 +98,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        with_acts = verb in (("team",), ("board",), ("task",), ("rights",), ("program",))
+        with_acts = verb in (("team",), ("board",), ("task",), ("rights",), ("program",), ("lost",))
         statuses.append(main.main([*argv, *asked] if with_acts else [*verb, *asked, *rest]))
         said = capsys.readouterr()
         if asked:
@@ -199,6 +199,12 @@ def test_with_rights_that_are_none(act: list[str], content: str, capsys: pytest.
     assert told(capsys, "rights", *act, "--directory", "team") == main.FAILED
 
 
+@pytest.mark.parametrize("act", ["inspect", "restore", "remove"])
+def test_with_copies_that_lost_and_are_not_there(act: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for at in ("nowhere", "directory", "junk"):
+        assert told(capsys, "lost", act, "mapper", "--state", at) == main.FAILED
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -209,6 +215,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"ps", "task", "trace", "wait-activation", "rights", "program"}
+    without |= {"ps", "task", "trace", "wait-activation", "rights", "program", "lost"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
