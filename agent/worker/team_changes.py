@@ -31,7 +31,7 @@ from failover.core.team_changes import USE_NS, Grants, missing, step
 from failover.core.types import ENDED, HOLDING
 from failover.errors import FailoverError
 
-GRANT_PATIENCE_S: Final = 5.0
+GRANT_PATIENCE_S: Final = 15.0
 """A member that does not answer in this time counts as one that cannot be reached."""
 
 BEHIND_S: Final = 1.0

@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from failover.core.types import MS
 
-GRANT_NS: Final = 20_000 * MS
+GRANT_NS: Final = 60_000 * MS
 """A grant holds for so long; no clock of a robot that was given one can be so far off that half of it seems longer."""
 
 USE_NS: Final = GRANT_NS // 2

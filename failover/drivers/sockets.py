@@ -29,6 +29,9 @@ RETRANSMIT_LIMIT_MS: Final = 3_000
 
 HANDSHAKE_LIMIT_MS: Final = 5_000
 
+ONE_TIME_LIMIT_MS: Final = 30_000
+"""The handshake of an invitation: it happens once, on machines that may be starting, and a failure costs a person's time."""
+
 HANDSHAKE_FAILED: Final = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
@@ -223,6 +226,7 @@ class OneTimeListener:
         """
         self._context = context()
         self._socket = _limited(self._context.socket(zmq.ROUTER))
+        self._socket.setsockopt(zmq.HANDSHAKE_IVL, ONE_TIME_LIMIT_MS)
         self._socket.curve_server = True
         self._socket.curve_secretkey = z85.encode(secret)
         self._socket.zap_domain = ZAP_DOMAIN
@@ -269,6 +273,7 @@ class OneTimeWay:
         self._context = context()
         self._socket = _limited(self._context.socket(zmq.DEALER))
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        self._socket.setsockopt(zmq.HANDSHAKE_IVL, ONE_TIME_LIMIT_MS)
         self._socket.curve_publickey = _public(secret)
         self._socket.curve_secretkey = z85.encode(secret)
         self._socket.curve_serverkey = _public(listener)

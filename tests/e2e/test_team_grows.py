@@ -16,7 +16,7 @@ from tests.e2e import robots
 from tests.e2e.growing import GrowingStage, machines, together
 from tests.e2e.test_orders import COUNTING
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def agents(stage: GrowingStage, *names: str) -> list[tuple[int, int]]:

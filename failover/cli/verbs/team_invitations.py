@@ -39,11 +39,11 @@ SPAN_MS_MAX: Final = 86_400_000
 """A day."""
 
 CONNECT_S: Final = 5.0
-HANDSHAKE_MS: Final = 10_000
-ANSWER_MS: Final = 60_000
+HANDSHAKE_MS: Final = 30_000
+ANSWER_MS: Final = 90_000
 """The inviting robot asks the other members first."""
 
-CONFIRM_MS: Final = 10_000
+CONFIRM_MS: Final = 30_000
 POLL_MS: Final = 500
 FAREWELL_MS: Final = 2_000
 
