@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from agent.config import Settings
-from agent.core_config import node_config
+from agent.core_config import node_config, team_config
 from agent.errors import AgentError
 from agent.main_loop import messages, starvation, vote_record
 from agent.main_loop.beat_sockets import NOT_CAST, TURN_LIMIT, BeatLane
@@ -466,7 +466,7 @@ class MainLoop:
         self._unlike.intersection_update(robots)
         if self._board is not None:
             self._open_board()  # the worker has made the files of those that came
-        self._step(TeamChanged(node_config(settings)))
+        self._step(TeamChanged(team_config(settings)))
         log.info("the team is %s now", ", ".join(sorted(robots)))
 
     def _take_inventory(self, inventory: Inventory) -> None:

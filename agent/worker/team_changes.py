@@ -235,6 +235,7 @@ class TeamChanges:
             return {"change": before.change}
         if after.change == before.change:
             raise RefusedError(f"it has another change {before.change} of the team")
+        check_team(self._lines.settings, after)
         if self._lines.settings.config.robot not in after.robots:
             await self._leave(after)
         else:

@@ -42,7 +42,7 @@ class Unread(Struct, frozen=True):
 
 
 class TeamChanged(Struct, frozen=True):
-    """One member has joined the team or left it, or has other keys: this robot's configuration from now on.
+    """One member has joined the team or left it, or has other keys: this robot's configuration from now on, without components.
 
     A member that joins counts as silent until it is heard: no takeover waits for it.
     """

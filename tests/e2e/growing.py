@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -78,10 +79,12 @@ class GrowingStage(SwitchStage):
         beats, bulk = self._ports[2 * self.names.index(name) :][:2]
         return ["--address", f"127.0.0.1:{beats}", "--bulk", f"127.0.0.1:{bulk}"]
 
-    def create(self, name: str) -> None:
-        """Begin a team there, and start its agent."""
+    def create(self, name: str, board: str = "") -> None:
+        """Begin a team there, with this table of its board, and start its agent."""
         ran = self.typed(name, "create", "lab", *self.own_addresses(name))
         assert ran.returncode == 0, ran.stderr
+        with (self.place(name) / team.TEAM_FILE).open("a") as file:
+            file.write(board)
         self.switch_on(name)
 
     def switch_on(self, name: str) -> None:
@@ -135,6 +138,9 @@ def machines(directory: Path, count: int, *, own_network: bool = False, settings
                     assert not robots.mistake(robot), f"a mistake in the agent of {robot.name}:\n{robots.mistake(robot)}"
         finally:
             stage.show()
+            for robot in stage.robots:
+                if (board := robot.socket.parent / "board").is_symlink():
+                    shutil.rmtree(board.resolve(), ignore_errors=True)
 
 
 def together(stage: GrowingStage, *names: str) -> None:
