@@ -333,14 +333,6 @@ class Settings:
         """The same agent in a team of these members."""
         return replace(self, team=replace(self.team, robots=dict(robots), change=change))
 
-    def with_key(self) -> Settings:
-        """The same agent with the secret key that lies in the team directory now.
-
-        Raises:
-            TeamFileError: it cannot be read.
-        """
-        return replace(self, secret_key=team_directory.read_secret_key(Path(self.config.team_directory), self.config.robot))
-
     def component(self, name: str) -> ComponentConfig:
         """The operator's settings for a component; the defaults where he gave none."""
         return self.config.components.get(name, ComponentConfig())

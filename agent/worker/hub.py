@@ -134,10 +134,7 @@ class Switchboard:
 
     async def take_team(self, team: Team) -> None:
         """Go on with these members: the main loop's frames and rules, and every connection."""
-        has_new_key = team.robots[self.settings.config.robot].public_key != self.settings.me.public_key
         self.settings = self.settings.with_robots(team.robots, team.change)
-        if has_new_key and not self.settings.config.insecure:
-            self.settings = self.settings.with_key()
         await self.prepare_team()
         self._say(TeamIs(dict(team.robots)))
         await self._connections.change(self.settings, self._keys())

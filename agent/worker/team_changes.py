@@ -124,8 +124,6 @@ class TeamChanges:
         await self._be_granted(before, after, removed)
         if removed and not self._lines.hindrance(removed):
             await self._lines.errands.send(removed, "team_taken", told_of(after), patience_s=GRANT_PATIENCE_S)
-        if wanted.act == "rotate":
-            await asyncio.to_thread(team_file.change_secret_key, Path(settings.config.team_directory), me)
         await asyncio.to_thread(self._write, after)
         others = [peer for peer in settings.peers if peer != removed]
         done = await asyncio.gather(*(self._told(peer, after) for peer in others))
@@ -265,15 +263,11 @@ class TeamChanges:
 
 def _wanted(before: Team, wanted: TeamArguments, me: str) -> Team:
     """Raises RefusedError: there can be no such team."""
-    from failover.config.members import joined, left, rekeyed  # here: a worker that changes no team does not load them
+    from failover.config.members import joined, left  # here: a worker that changes no team does not load them
 
     try:
         if wanted.act == "remove":
             return left(before, wanted.robot, me)
-        if wanted.act == "rotate":
-            if wanted.robot != me:
-                raise RefusedError(f"{me} changes its own key alone; give the command on {wanted.robot}")
-            return rekeyed(before, me, wanted.public_key)
         if wanted.member is None:
             raise RefusedError(f"the addresses and the key of {wanted.robot} are missing")
         return joined(before, wanted.robot, wanted.member)

@@ -1,4 +1,4 @@
-"""A team with one member more, one less, or one with another key: the next change of its team file."""
+"""A team with one member more, or one less: the next change of its team file."""
 
 from __future__ import annotations
 
@@ -22,18 +22,6 @@ def joined(team: Team, name: str, member: Robot) -> Team:
     check_addresses(name, member, team.robots)
     seated = _seated(team)
     return replace(enrol(seated, name, replace(member, seat=-1)), change=team.change + 1)
-
-
-def rekeyed(team: Team, name: str, public_key: str) -> Team:
-    """The team with another key of one member.
-
-    Raises:
-        TeamFileError: there is no such member, or the key is none.
-    """
-    if name not in team.robots or not team.robots[name].public_key:
-        raise TeamFileError(f"{name} has no key in team {team.team}")
-    seated = _seated(team)
-    return replace(enrol(seated, name, replace(seated.robots[name], public_key=public_key)), change=team.change + 1)
 
 
 def left(team: Team, name: str, me: str) -> Team:

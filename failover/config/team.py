@@ -230,33 +230,6 @@ def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
     return path
 
 
-def propose_secret_key(directory: Path, robot: str, secret: str) -> Path:
-    """Keep the key that is to take the place of this robot's own one, until the team has taken its public half.
-
-    Raises:
-        TeamFileError: it cannot be written.
-    """
-    path = secret_key_path(directory, robot).with_suffix(".next")
-    try:
-        write_whole(path, (secret + "\n").encode(), mode=0o600, lasts="name")
-    except OSError as error:
-        raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
-    return path
-
-
-def change_secret_key(directory: Path, robot: str) -> None:
-    """Put the key that was proposed in the place of the present one.
-
-    Raises:
-        TeamFileError: there is none.
-    """
-    path = secret_key_path(directory, robot)
-    try:
-        path.with_suffix(".next").replace(path)
-    except OSError as error:
-        raise TeamFileError(f"cannot change the key {path}: {error.strerror}") from error
-
-
 def read_secret_key(directory: Path, robot: str) -> str:
     """This robot's secret key.
 

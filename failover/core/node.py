@@ -371,7 +371,7 @@ def _say_who_belongs(turn: Turn, before: tuple[str, ...]) -> None:
     news = [f"{robot} joins the team" for robot in joined] + [f"{robot} leaves the team" for robot in left]
     together = len(turn.config.peers) + 1
     how = f"{turn.config.quorum} are a majority" if turn.config.by_majority else "by rule = pair"
-    turn.say_of_robot(f"{'; '.join(news) or 'the keys of the team change'}: now {together} {how}")
+    turn.say_of_robot(f"{'; '.join(news) or 'an entry of the team changes'}: now {together} {how}")
 
 
 def _as_declared(spec: ComponentSpec, said: Rules) -> ComponentSpec:

@@ -11,11 +11,8 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from failover.boards.board import Board
-from failover.cli.demo.robots import RobotMachine
 from failover.config.invitation import SECRET_SIZE, read
 from tests.e2e import robots
-from tests.e2e.bridged import BOARD
 from tests.e2e.growing import GrowingStage, machines, together
 from tests.e2e.test_orders import COUNTING
 
@@ -127,36 +124,6 @@ def test_a_robot_that_runs_a_program_is_not_taken_out_and_one_that_runs_none_end
         robots.until(lambda: "robot 'robot2' is not in" in log.read_text(), "an agent there to say why it does not begin")
         shown = robots.component(stage.machine("robot1"), "count")
         assert shown["role"] == "primary"
-
-
-def test_a_robot_gets_another_key_while_its_program_is_protected_and_its_board_goes_on(tmp_path: Path) -> None:
-    with machines(tmp_path, 2) as stage:
-        stage.create("robot1", BOARD)
-        stage.brought("robot1", "robot2")
-        together(stage, "robot1", "robot2")
-        first, second = stage.machine("robot1"), stage.machine("robot2")
-        robots.until(lambda: hears_on_its_board(first, "robot2") and hears_on_its_board(second, "robot1"), "frames with items")
-        robots.run(first, "count", *COUNTING)
-        robots.until_protected(first)
-        before, key = agents(stage, "robot1", "robot2"), stage.members("robot2").robots["robot1"].public_key
-        ran = stage.typed("robot1", "rotate")
-        assert ran.returncode == 0, ran.stderr
-        assert stage.members("robot1").robots == stage.members("robot2").robots
-        assert stage.members("robot2").robots["robot1"].public_key != key
-        together(stage, "robot1", "robot2")
-        held = robots.checkpoints(second, "count")
-        robots.until(lambda: robots.checkpoints(second, "count") > held, "checkpoints under the new key")
-        counting = robots.component(first, "count")
-        assert (counting["epoch"], counting["restores"]) == (1, 0) and agents(stage, "robot1", "robot2") == before
-        assert sorted(path.name for path in (stage.place("robot1") / "keys").iterdir()) == ["robot1.secret"]
-        assert not [note for note in first.status()["notes"] if "key" in note]
-        robots.until(lambda: hears_on_its_board(first, "robot2") and hears_on_its_board(second, "robot1"), "frames with items")
-
-
-def hears_on_its_board(robot: RobotMachine, other: str) -> bool:
-    """Whether programs there see that items of another robot come."""
-    with Board(robot.socket.parent / "board", "looks") as opened:
-        return other in opened.living()
 
 
 # --- Invitations that are refused --------------------------------------------------------------------------------------

@@ -177,10 +177,9 @@ class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
 class TeamArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``team``."""
 
-    act: Literal["add", "remove", "rotate"]
+    act: Literal["add", "remove"]
     robot: str
     member: Robot | None = None
-    public_key: str = ""
 
 
 class TakenTeam(msgspec.Struct):

@@ -338,17 +338,13 @@ class ReplicationLink:
         self._owners = _owners(keys)
         self._arrivals.expect(self._hosts())
         for peer, link in list(self.links.items()):
-            there = (peers.get(peer), keys.peers.get(peer), keys.public)
-            if there != (before.get(peer), former.peers.get(peer), former.public):
-                del self.links[peer]
+            if (peers.get(peer), keys.peers.get(peer)) != (before.get(peer), former.peers.get(peer)):
+                self.links.pop(peer, None)
                 await link.close()
                 self._mismatch.pop(peer, None)
                 self._callbacks.changed(peer, LinkState.DOWN, "its entry in the team has changed")
         if self._router is None:
             return
-        if keys.secret != former.secret:
-            self._router.curve_secretkey = keys.secret.encode()
-            await self._listen_anew(self._router)  # connections that stand go on under the former key
         for peer in peers:
             if peer not in self.links:
                 self._connect(peer)

@@ -54,9 +54,6 @@ def team(room: argparse.ArgumentParser) -> None:
     remove.add_argument("name", metavar="ROBOT", help="the member")
     _add_socket(remove)
     remove.set_defaults(function="failover.cli.verbs.team:remove")
-    rotate = add_act(acts, "rotate", shared, "give this robot another key", ROTATE_DESCRIPTION)
-    _add_socket(rotate)
-    rotate.set_defaults(function="failover.cli.verbs.team:rotate")
     enrol = add_act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_DESCRIPTION)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
@@ -132,13 +129,6 @@ REMOVE_DESCRIPTION: Final = """
     votes, and its agent ends. A robot that runs components must hand them over first. One that is lost can be taken out, too.
 
       failover team remove r3
-    """
-
-ROTATE_DESCRIPTION: Final = """
-    Make another key pair for this robot, and have all members take its public half. A majority must agree. Heartbeats go on, and
-    connections for snapshots are made anew. The former key opens nothing any more. Use it when the key may have become known.
-
-      failover team rotate
     """
 
 ENROL_DESCRIPTION: Final = """

@@ -85,22 +85,6 @@ def change_by_agent(arguments: argparse.Namespace, act: str, robot: str, member:
         return control.ask("team", act=act, robot=robot, **told)
 
 
-def rotate(arguments: argparse.Namespace) -> int:
-    """Give this robot another key, which all members know before it is used."""
-    directory = Path(arguments.directory)
-    robot = agent_service.own_name(directory)
-    public, secret = key_pairs.new_pair()
-    proposed = team.propose_secret_key(directory, robot, secret)
-    try:
-        with connect(arguments) as control:
-            answer = control.ask("team", act="rotate", robot=robot, public_key=public)
-    finally:
-        proposed.unlink(missing_ok=True)  # it is the robot's own key now, or was not taken
-    later = f"; {', '.join(answer['waiting'])} will hear of it when they are back" if answer["waiting"] else ""
-    sentence = f"{robot} has the key {public[:8]}… now; the former one opens nothing any more{later}"
-    return _tell(arguments, {**answer, "robot": robot, "public_key": public}, sentence)
-
-
 def remove(arguments: argparse.Namespace) -> int:
     """Take a member out: its frames, its replication link and its votes count at no robot any more."""
     answer = change_by_agent(arguments, "remove", arguments.name)

@@ -141,7 +141,6 @@ def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixtur
 
 def test_without_an_agent_no_member_leaves(capsys: pytest.CaptureFixture[str]) -> None:
     assert told(capsys, "team", "remove", "r", "--socket", "nowhere") == main.NO_AGENT
-    assert told(capsys, "team", "rotate", "--directory", "directory", "--socket", "nowhere") == main.FAILED  # no keys are there
 
 
 @pytest.mark.parametrize("at", ["nowhere", "directory", "junk"])

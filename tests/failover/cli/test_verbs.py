@@ -365,7 +365,7 @@ def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> Non
         ),
         ("protect 1 --connections cary", "'cary' is none of reset, carry, refuse; did you mean 'carry'?"),
         ("stop x --signal TREM", "did you mean 'TERM'?"),
-        ("team shwo", "'shwo' is none of create, invite, join, list, remove, rotate, enrol, show; did you mean 'show'?"),
+        ("team shwo", "'shwo' is none of create, invite, join, list, remove, enrol, show; did you mean 'show'?"),
         ("team enrol x 192.0.2.1 --role servr", "'servr' is none of robot, server, witness; did you mean 'server'?"),
         ("completion zhs", "'zhs' is none of bash, zsh, tcsh; did you mean 'zsh'?"),
         ("logs x --stream 3", "3 is none of 1, 2"),
