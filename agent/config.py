@@ -329,9 +329,18 @@ class Settings:
         """All members but this one, by name."""
         return {name: robot for name, robot in self.team.robots.items() if name != self.config.robot}
 
-    def with_robots(self, robots: Mapping[str, Robot], change: int = 0) -> Settings:
+    @property
+    def former(self) -> dict[str, Robot]:
+        """Members that were taken out, by name: they may connect, and are told so."""
+        return self.team.former
+
+    def with_robots(self, robots: Mapping[str, Robot]) -> Settings:
         """The same agent in a team of these members."""
-        return replace(self, team=replace(self.team, robots=dict(robots), change=change))
+        return replace(self, team=replace(self.team, robots=dict(robots)))
+
+    def with_team(self, team: Team) -> Settings:
+        """The same agent in the team as it is now; the board stays."""
+        return replace(self, team=replace(team, board=self.team.board))
 
     def component(self, name: str) -> ComponentConfig:
         """The operator's settings for a component; the defaults where he gave none."""

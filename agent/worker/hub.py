@@ -49,7 +49,7 @@ from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Link, Links, Medium
 from agent.worker.network.remote_orders import Errands
 from agent.worker.network.replication_link import Keys, LinkState, public_key_of
-from agent.worker.team_changes import TeamChanges, digest
+from agent.worker.team_changes import TEAM_IS, TEAM_TOLD, TeamChanges, digest
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError
 from checkpoint.runtime import allocator
@@ -122,22 +122,25 @@ class Switchboard:
     def connect(self, verbs: Questions) -> None:
         """Have the orders of people and robots carried out by these."""
         self.verbs = verbs
-        orders = {**verbs.errands(), **self.team_changes.errands()}
-        self.errands = Errands(self._connections.say, self.hindrance, orders)
+        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands(), self.team_changes.orders())
 
     def _keys(self) -> Keys:
         settings = self.settings
         if settings.config.insecure:
             return Keys("", "", {})
-        publics = {name: robot.public_key for name, robot in settings.team.robots.items()}
+        publics = {name: robot.public_key for name, robot in (*settings.former.items(), *settings.team.robots.items())}
         return Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
 
     async def take_team(self, team: Team) -> None:
         """Go on with these members: the main loop's frames and rules, and every connection."""
-        self.settings = self.settings.with_robots(team.robots, team.change)
+        self.settings = self.settings.with_team(team)
         await self.prepare_team()
         self._say(TeamIs(dict(team.robots)))
-        await self._connections.change(self.settings, self._keys())
+        try:
+            await self._connections.change(self.settings, self._keys())
+        except LaneError as error:
+            log.critical("%s; the worker process starts anew", error)
+            self._end.set()
 
     # --- what builds on it ---
 
@@ -313,7 +316,8 @@ class Switchboard:
         if state is LinkState.CONNECTED:
             key = self._connections.beat_key(peer)
             self._greet(way, peer, key)
-            self._say(SpeakKey(peer, key))
+            if peer in self.settings.peers:
+                self._say(SpeakKey(peer, key))
             return
         if way == BULK:
             self.link_lost(peer)
@@ -322,6 +326,8 @@ class Switchboard:
 
     def _unread(self, peer: str, why: str) -> None:
         """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""
+        if peer in self.settings.former:
+            return
         now_s = asyncio.get_running_loop().time()
         sign = (peer, why if peer else "")
         if len(self._signs) > SIGNS_MAX:
@@ -346,6 +352,9 @@ class Switchboard:
         return self._connections.hindrance(peer)
 
     def _hear(self, way: int, peer: str, message: Bulk) -> None:
+        if peer not in self.settings.peers:
+            self._hear_former(peer, message)
+            return
         match message:
             case Hello():
                 self._greeted(way, peer, message)
@@ -353,7 +362,7 @@ class Switchboard:
                 self._connections.refuse(way, peer, reason)
             case _ if peer in self._incompatible:
                 return
-            case Errand(verb=verb) if verb not in QUESTIONS and self.votes_only(peer):
+            case Errand(verb=verb) if verb not in (*QUESTIONS, *TEAM_TOLD) and self.votes_only(peer):
                 self._connections.say(
                     peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders")
                 )
@@ -363,6 +372,18 @@ class Switchboard:
                 self.errands.done(peer, message)
             case _ if way == BULK:
                 self.hear_of_a_snapshot(peer, message)
+
+    def _hear_former(self, peer: str, message: Bulk) -> None:
+        """A robot that was taken out, and has perhaps not heard of it; what it says counts for nothing else."""
+        if peer not in self.settings.former:
+            return
+        match message:
+            case Hello(team=team, change=change, members=members) if team == self.settings.team.team:
+                self.team_changes.heard(peer, change, members)
+            case Errand(verb=verb) if verb == TEAM_IS:
+                self.errands.received(peer, message)
+            case ErrandDone():
+                self.errands.done(peer, message)
 
     def _greeted(self, way: int, peer: str, hello: Hello) -> None:
         reason = ""

@@ -143,6 +143,7 @@ class Node:
         if isinstance(event, Tick):
             self._note_promise(turn)
         for component in touched:
+            lease.forget_former(component, turn)
             _review(component, turn)
         changed = begins or bool(touched)
         persist = self._persist() if changed else None

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from failover.core.events import TeamChanged
-from failover.core.types import MS, ComponentSpec, Config, Launch, Rule
+from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, WhenAlone
 from tests.simulation.invariants import Broken, Invariants, seen_at
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
@@ -88,6 +88,61 @@ def test_a_member_that_was_taken_out_is_no_standby_any_more_and_its_place_is_giv
     world.run(world.now_ns + 3_000 * MS)
     assert world.acting(PART) == ["robot1"]
     assert seen_at(world, "robot1", PART).standby == next(name for name in rest if name != "robot1")
+
+
+def test_under_pair_a_robot_that_was_taken_out_while_it_acted_is_waited_for_until_its_lease_is_over() -> None:
+    """From three to two the rule may go over to pair, where no majority would have to be found first."""
+    names = ("robot1", "robot2", "robot3")
+    world = World(5, elective(3, (SPEC,)), (Invariants(safe={PART}),))
+    for name in names:
+        world.power_on(name)
+    world.run(2_000 * MS)
+    assert world.acting(PART) == ["robot1"]
+    world.network.cuts |= {pair for name in names[1:] for pair in (("robot1", name), (name, "robot1"))}
+    for name in names[1:]:
+        take(world, name, names[1:], Rule.PAIR)
+    for _ in range(600):
+        world.run(world.now_ns + 1 * MS)
+        assert len(world.acting(PART)) <= 1
+    world.run(world.now_ns + 2_000 * MS)
+    (acting,) = world.acting(PART)
+    assert acting in names[1:]
+
+
+def test_with_freeze_a_program_goes_on_once_its_lost_standby_is_taken_out() -> None:
+    frozen = replace(SPEC, rules=replace(SPEC.rules, when_alone=WhenAlone.FREEZE))
+    names = ("robot1", "robot2")
+    world = World(6, [in_team(config, names, Rule.PAIR) for config in pair((frozen,), names)], (Invariants(safe={PART}),))
+    for name in names:
+        world.power_on(name)
+    world.run(2_000 * MS)
+    assert world.acting(PART) == ["robot1"]
+    world.power_off("robot2")
+    world.run(world.now_ns + 2_000 * MS)
+    assert world.acting(PART) == []
+    take(world, "robot1", names[:1], Rule.PAIR)
+    world.run(world.now_ns + 2_000 * MS)
+    assert world.acting(PART) == ["robot1"]
+
+
+def test_a_member_one_change_behind_lets_nothing_act_twice_whatever_part_it_is_cut_off_with() -> None:
+    for seed in range(8):
+        world = World(
+            seed, [in_team(config, FIVE[:4], Rule.MAJORITY) for config in elective(5, (SPEC,))], (Invariants({PART}, True),)
+        )
+        for name in FIVE[:4]:
+            world.power_on(name)
+        world.run(1_500 * MS)
+        (acting,) = world.acting(PART)
+        behind = FIVE[seed % 4]
+        for name in (*FIVE[:4], FIVE[4]):
+            if name != behind:
+                take(world, name, FIVE)
+        world.power_on(FIVE[4])
+        side = {behind, *[name for name in FIVE if name != behind][: seed % 3]}
+        world.network.cuts |= {pair for one in side for other in set(FIVE) - side for pair in ((one, other), (other, one))}
+        world.run(world.now_ns + 3_000 * MS)
+        assert len(world.acting(PART)) <= 1, f"seed {seed}: {acting} before, {side} are apart"
 
 
 def test_a_robot_keeps_its_place_while_others_come_and_go() -> None:

@@ -183,7 +183,7 @@ class TeamArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class TakenTeam(msgspec.Struct):
-    """A team as one robot tells another.
+    """A team as one robot tells another. See `failover.config.team.Team`.
 
     Attributes:
         proposer, have: where a grant is asked: by whom, and the change that it has now.
@@ -194,3 +194,5 @@ class TakenTeam(msgspec.Struct):
     robots: dict[str, Robot]
     proposer: str = ""
     have: int = 0
+    next_seat: int = 0
+    former: dict[str, Robot] = {}

@@ -156,7 +156,8 @@ class AllConnections:
 
 
 def _bulks(settings: Settings) -> dict[str, str]:
-    return {peer: robot.bulk for peer, robot in settings.peers.items()}
+    """A robot that was taken out is connected to as well: it may not have heard of it."""
+    return {peer: robot.bulk for peer, robot in (*settings.former.items(), *settings.peers.items())}
 
 
 def further_links(settings: Settings) -> list[tuple[str, dict[str, str]]]:

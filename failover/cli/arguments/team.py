@@ -104,7 +104,7 @@ CREATE_DESCRIPTION: Final = """
 INVITE_DESCRIPTION: Final = """
     Print one line, to be typed on the robot that shall join, and wait until it has joined. The line holds a secret: it works
     once, for that robot's name, until its time is over or the command ends. The agents of the team take the new member at once,
-    and none of them is restarted. A majority of the team must agree, so their agents must run.
+    and none of them is restarted. Every member must agree, so their agents must run.
 
       failover team invite r2
       failover team invite hall --for 1h
@@ -125,7 +125,7 @@ LIST_DESCRIPTION: Final = """
     """
 
 REMOVE_DESCRIPTION: Final = """
-    Take a member out. A majority of the others must agree. From then on no robot takes its heartbeats, its connections or its
+    Take a member out. Every other one must agree. From then on no robot takes its heartbeats, its connections or its
     votes, and its agent ends. A robot that runs components must hand them over first. One that is lost can be taken out, too.
 
       failover team remove r3

@@ -426,7 +426,9 @@ def test_a_team_is_created_enrolled_into_and_shown(tmp_path: Path) -> None:
     place = ["--directory", str(tmp_path)]
     assert failover("team", "create", "lab", "--empty", *place).returncode == 0
     assert failover("team", "enrol", "robot1", "10.0.0.1", "10.1.0.1:9", "--public-key", KEY, *place).returncode == 0
-    assert failover("team", "enrol", "robot2", "fe80::1", "--public-key", KEY, *place).returncode == 0
+    ran = failover("team", "enrol", "robot2", "fe80::1", "--public-key", KEY, *place)
+    assert ran.returncode == 1 and "robot2 and robot1 have the same public key" in ran.stderr
+    assert failover("team", "enrol", "robot2", "fe80::1", "--public-key", "b" * 40, *place).returncode == 0
     shown = json.loads(failover("team", "show", "--json", *place).stdout)
     assert shown["team"] == "lab"
     assert shown["robots"]["robot1"] == {
