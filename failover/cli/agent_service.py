@@ -81,7 +81,13 @@ def start(directory: Path) -> str:
     if directory.absolute() != SYSTEM_DIRECTORY or not RUNS_SYSTEMD.is_dir():
         return NOT_STARTED
     for words in (["enable"], ["reset-failed"], ["restart"]):
-        ran = subprocess.run(["systemctl", *words, SERVICE], capture_output=True, text=True, check=False, timeout=UNIT_PATIENCE_S)
+        command = ["systemctl", *words, SERVICE]
+        try:
+            ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=UNIT_PATIENCE_S)
+        except (subprocess.TimeoutExpired, OSError) as error:
+            raise TeamFileError(
+                f"{' '.join(command)} did not end well: {error}; the team stands; give that command again"
+            ) from error
         if ran.returncode and words != ["reset-failed"]:
             said = (ran.stderr.strip() or ran.stdout.strip() or "nothing").splitlines()[-1]
             raise TeamFileError(f"systemctl {words[0]} {SERVICE} failed: {said}; failover-agent check names a mistake")

@@ -105,15 +105,15 @@ class GrowingStage(SwitchStage):
             try:
                 assert invites.stdout is not None and invites.stderr is not None
                 told = invites.stdout.readline()
-                assert told.startswith("failover team join "), told + invites.stderr.read()
-                yield told.removeprefix("failover team join ").strip().strip("'"), invites
+                assert f"{name}@" in told, told + invites.stderr.read()
+                yield told.strip(), invites
             finally:
                 invites.kill()
 
     def brought(self, by: str, name: str, *words: str) -> None:
         """Bring a machine into the team, and start its agent."""
-        with self.invited(by, name) as (line, invites):
-            ran = self.typed(name, "join", line, *self.own_addresses(name), *words)
+        with self.invited(by, name, *words) as (line, invites):
+            ran = self.typed(name, "join", line, *self.own_addresses(name))
             assert ran.returncode == 0, ran.stderr
             _, said = invites.communicate(timeout=robots.PATIENCE_S)
             assert invites.returncode == 0 and f"{name} belongs to the team now" in said, said

@@ -84,7 +84,7 @@ def join(first: Machine, second: Machine) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as invites:
         try:
             assert invites.stdout is not None
-            second.run(*invites.stdout.readline().split())
+            second.run("failover", "team", "join", invites.stdout.readline().strip())
             _, said = invites.communicate(timeout=robots.PATIENCE_S)
             assert invites.returncode == 0, said
         finally:

@@ -35,6 +35,7 @@ def team(room: argparse.ArgumentParser) -> None:
     create.set_defaults(function="failover.cli.verbs.team:create")
     invite = add_act(acts, "invite", shared, "print the line by which another robot joins", INVITE_DESCRIPTION)
     invite.add_argument("name", metavar="ROBOT", help="the name that it will have")
+    invite.add_argument("--role", choices=ROLES, default="robot", help="what it does in the team (default: %(default)s)")
     invite.add_argument(
         "--for", dest="span", metavar="SPAN", default="10min", help="how long the line holds (default: %(default)s)"
     )
@@ -43,8 +44,9 @@ def team(room: argparse.ArgumentParser) -> None:
     _add_socket(invite)
     invite.set_defaults(function="failover.cli.verbs.team_invitations:invite")
     join = add_act(acts, "join", shared, "make this machine a member, by a line of failover team invite", JOIN_DESCRIPTION)
-    join.add_argument("line", metavar="LINE", help="as failover team invite printed it")
-    join.add_argument("--role", choices=ROLES, default="robot", help="what it does in the team (default: %(default)s)")
+    join.add_argument(
+        "line", metavar="LINE", nargs="?", default="-", help="as failover team invite printed it (default: asked for)"
+    )
     _add_own_addresses(join)
     join.set_defaults(function="failover.cli.verbs.team_invitations:join")
     listing = add_act(acts, "list", shared, "the members, and which of them live", LIST_DESCRIPTION)
@@ -102,20 +104,21 @@ CREATE_DESCRIPTION: Final = """
     """
 
 INVITE_DESCRIPTION: Final = """
-    Print one line, to be typed on the robot that shall join, and wait until it has joined. The line holds a secret: it works
-    once, for that robot's name, until its time is over or the command ends. The agents of the team take the new member at once,
-    and none of them is restarted. Every member must agree, so their agents must run.
+    Print one line, to be given to failover team join on the robot that shall join, and wait until it has joined. The line holds
+    a secret: it works once, for that robot's name and role, until its time is over or the command ends. The agents of the team
+    take the new member at once, and none of them is restarted. Every member must agree, so their agents must run.
 
       failover team invite r2
-      failover team invite hall --for 1h
+      failover team invite hall --role server --for 1h
     """
 
 JOIN_DESCRIPTION: Final = """
-    Type the line of failover team invite here. This machine makes its keys itself, and the secret one stays here. It gets the
-    team file, and rights.toml and programs.toml where the team has them; its service is enabled and started where systemd runs.
+    Asks for the line of failover team invite, or reads it from standard input. As an argument, other users of this machine can
+    see it. This machine makes its keys itself, and the secret one stays here. It gets the team file, and rights.toml and
+    programs.toml where the team has them; its service is enabled and started where systemd runs.
 
-      failover team join r2@192.168.7.11:7423/3ljz
-      failover team join r2@192.168.7.11:7423/3ljz --role witness
+      failover team join
+      failover team join --address 192.168.7.12 --address 10.0.0.12
     """
 
 LIST_DESCRIPTION: Final = """

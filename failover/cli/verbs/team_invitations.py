@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import secrets
-import shlex
 import socket
 import sys
 import time
@@ -19,7 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import msgspec
+from msgspec.structs import replace
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_whole
 from failover.cli import agent_service, key_pairs
 from failover.cli.agent_service import own_name
@@ -29,8 +30,9 @@ from failover.config import addresses, members, team
 from failover.config.invitation import SECRET_SIZE, Invitation, read
 from failover.config.quantities import span_ms
 from failover.config.team import Robot, Team
+from failover.core.messaging.envelope import MESSAGE_SIZE_MAX
 from failover.core.wire.messages import VERSION
-from failover.errors import DriverError, FailoverError, InvitationError, NoAgentError, TeamFileError
+from failover.errors import DriverError, FailoverError, InvitationError, LostAgentError, NoAgentError, TeamFileError
 
 if TYPE_CHECKING:
     from failover.drivers.sockets import OneTimeListener as Listener
@@ -47,8 +49,11 @@ CONFIRM_MS: Final = 30_000
 POLL_MS: Final = 500
 FAREWELL_MS: Final = 2_000
 
-FILES: Final = (team.TEAM_FILE, "rights.toml", "programs.toml")
-"""What is the same at every robot, and goes to one that joins."""
+FURTHER_FILES: Final = ("rights.toml", "programs.toml")
+"""What is the same at every robot, and goes to one that joins, beside the team file."""
+
+FILES_SIZE_MAX: Final = MESSAGE_SIZE_MAX // 2
+"""Bytes of them; the team file has room beside them."""
 
 
 class Wish(msgspec.Struct, frozen=True):
@@ -85,14 +90,17 @@ def invite(arguments: argparse.Namespace) -> int:
         raise TeamFileError(f"{robot} belongs to team {before.team} already; failover team remove {robot} takes it out")
     host = arguments.address or team.split_address(before.robots[me].bulk, me)[0]
     team.check_robot("the invitation", robot, Robot((f"{host}:1",), f"{host}:1"))
-    with _listening(robot, host, arguments.port) as (invitation, listener):
-        command = f"failover team join {shlex.quote(invitation.line)}"
+    with _listening(Invitation(robot, host, arguments.port, secrets.token_bytes(SECRET_SIZE), arguments.role)) as (
+        invitation,
+        listener,
+    ):
         if arguments.json:
-            render.as_json({"robot": robot, "line": invitation.line, "command": command, "span_ms": span})
+            render.as_json({"robot": robot, "line": invitation.line, "command": "failover team join", "span_ms": span})
         else:
-            print(command)
+            print(invitation.line)
             print(
-                f"type that on {robot}; it holds once, for {arguments.span} while this command runs; Ctrl-C ends it",
+                f"on {robot}: failover team join, which asks for that line; it holds once, for {arguments.span} while this "
+                "command runs; Ctrl-C ends it",
                 file=sys.stderr,
             )
         sys.stdout.flush()
@@ -100,16 +108,15 @@ def invite(arguments: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _listening(robot: str, host: str, port: int) -> Iterator[tuple[Invitation, Listener]]:
+def _listening(draft: Invitation) -> Iterator[tuple[Invitation, Listener]]:
     from failover.drivers.sockets import OneTimeListener  # here: ZeroMQ
 
-    draft = Invitation(robot, host, port, secrets.token_bytes(SECRET_SIZE))
     try:
-        listener = OneTimeListener(host, port, robot, draft.inviting_secret(), draft.joining_secret())
+        listener = OneTimeListener(draft.host, draft.port, draft.robot, draft.inviting_secret(), draft.joining_secret())
     except DriverError as error:
         raise InvitationError(f"cannot invite: {error}; another invitation is open, or --port names another port") from error
     try:
-        yield Invitation(robot, host, listener.port, draft.secret), listener
+        yield replace(draft, port=listener.port), listener
     finally:
         listener.close()
 
@@ -126,7 +133,7 @@ def _await_it(arguments: argparse.Namespace, listener: Listener, robot: str, spa
         if welcome.refusal:
             print(f"failover: {robot} was refused: {welcome.refusal}", file=sys.stderr)
             continue
-        confirmed = _is_confirmed(listener)
+        confirmed = _is_confirmed(listener, whose)
         print(f"{robot} belongs to the team now" if confirmed else _unconfirmed(robot), file=sys.stderr)
         return 0 if confirmed else 1
     strangers = f"; {listener.refused} connections did not know its secret" if listener.refused else ""
@@ -135,10 +142,12 @@ def _await_it(arguments: argparse.Namespace, listener: Listener, robot: str, spa
     )
 
 
-def _is_confirmed(listener: Listener) -> bool:
+def _is_confirmed(listener: Listener, whose: bytes) -> bool:
+    """Whether the robot that was admitted says so, on the same connection."""
     until = time.monotonic() + CONFIRM_MS / 1_000
     while (left := until - time.monotonic()) > 0:
-        if listener.next(round(left * 1_000)) is not None:
+        came = listener.next(round(left * 1_000))
+        if came is not None and came == (whose, b""):
             return True
     return False
 
@@ -159,12 +168,28 @@ def _welcome(arguments: argparse.Namespace, robot: str, content: bytes) -> Welco
             raise InvitationError("it has another release of failover; install the same one on both")
         if wish.robot != robot:
             raise InvitationError(f"the invitation is for {robot}, and it calls itself {wish.robot}")
+        if wish.member.role != arguments.role:
+            raise InvitationError(f"the invitation is for a {arguments.role}, and {robot} would be a {wish.member.role}")
+        further = _further_files(directory)
         _admit(arguments, directory, robot, wish.member)
-    except msgspec.MsgspecError:
+    except UNDECODABLE:
         return Welcome("its message is not understood; install the same release of failover on both")
     except (FailoverError, OSError) as error:
         return Welcome(str(error))
-    return Welcome(files={name: (directory / name).read_bytes() for name in FILES if (directory / name).exists()})
+    return Welcome(files=further | {team.TEAM_FILE: (directory / team.TEAM_FILE).read_bytes()})
+
+
+def _further_files(directory: Path) -> dict[str, bytes]:
+    """The other files that go along, looked at before the team changes.
+
+    Raises:
+        InvitationError: they are too large for a message.
+    """
+    files = {name: (directory / name).read_bytes() for name in FURTHER_FILES if (directory / name).exists()}
+    size = sum(map(len, files.values()))
+    if size > FILES_SIZE_MAX:
+        raise InvitationError(f"{', '.join(files)} have {size} bytes, and {FILES_SIZE_MAX} can travel; copy the team by hand")
+    return files
 
 
 def _admit(arguments: argparse.Namespace, directory: Path, robot: str, member: Robot) -> None:
@@ -176,6 +201,10 @@ def _admit(arguments: argparse.Namespace, directory: Path, robot: str, member: R
         if len(before.robots) > 1:
             raise TeamFileError(f"the agent of the inviting robot must run, to ask the other members: {error}") from error
         team.write(directory, members.joined(before, robot, member))
+    except LostAgentError:
+        present = team.read(directory).robots.get(robot)
+        if present is None or present.public_key != member.public_key:
+            raise
 
 
 # --- join ------------------------------------------------------------------------------------------------------------
@@ -183,13 +212,14 @@ def _admit(arguments: argparse.Namespace, directory: Path, robot: str, member: R
 
 def join(arguments: argparse.Namespace) -> int:
     """Make this machine a member, by the line that another robot has printed."""
-    directory, invitation = Path(arguments.directory), read(arguments.line)
+    directory, invitation = Path(arguments.directory), read(_line(arguments.line))
     robot = invitation.robot
     agent_service.check_name(directory, robot)
     _check_that_it_is_free(directory, robot)
+    _set_stray_key_aside(directory, robot)
     found = arguments.address or [addresses.address_towards(invitation.host, invitation.port)]
     public, secret = key_pairs.new_pair()
-    member = member_of(robot, found, arguments.bulk, arguments.role, public)
+    member = member_of(robot, found, arguments.bulk, invitation.role, public)
     with _way(invitation) as way:
         way.send(msgspec.msgpack.encode(Wish(VERSION, robot, member)))
         answer = way.await_message(ANSWER_MS)
@@ -198,7 +228,7 @@ def join(arguments: argparse.Namespace) -> int:
                 f"{invitation.host} did not answer; failover team list there tells whether {robot} was taken in: if it was, "
                 f"failover team remove {robot} there, then invite it again"
             )
-        welcome = msgspec.msgpack.decode(answer, type=Welcome)
+        welcome = _understood(answer, invitation)
         if welcome.refusal:
             raise InvitationError(f"{invitation.host} refused: {welcome.refusal}")
         joined = _write(directory, robot, secret, welcome.files)
@@ -211,6 +241,37 @@ def join(arguments: argparse.Namespace) -> int:
     else:
         print(f"this machine is {robot} of team {joined.team}, with {', '.join(sorted(set(joined.robots) - {robot}))}; {told}")
     return 0
+
+
+def _line(given: str) -> str:
+    """The invitation's line: asked for, so that its secret stands in no list of processes and in no shell's history.
+
+    Raises:
+        InvitationError: nothing came.
+    """
+    if given != "-":
+        print(
+            "failover: the line's secret was on the command line, where other users of this machine may have seen it; without "
+            "LINE, failover team join asks for it",
+            file=sys.stderr,
+        )
+        return given
+    if sys.stdin.isatty():
+        print("the line of failover team invite: ", end="", file=sys.stderr, flush=True)
+    line = sys.stdin.readline().strip()
+    if not line:
+        raise InvitationError("no line came on standard input: paste the one that failover team invite printed")
+    return line
+
+
+def _understood(answer: bytes, invitation: Invitation) -> Welcome:
+    try:
+        return msgspec.msgpack.decode(answer, type=Welcome)
+    except UNDECODABLE as error:
+        raise InvitationError(
+            f"the answer of {invitation.host} is not understood: {error}; install the same release of failover on both, and "
+            f"there: failover team remove {invitation.robot}"
+        ) from error
 
 
 def _check_that_it_is_free(directory: Path, robot: str) -> None:
@@ -226,6 +287,20 @@ def _check_that_it_is_free(directory: Path, robot: str) -> None:
         me = own_name(directory)
         if me in present.robots:
             raise TeamFileError(f"this machine is {me} of team {present.team}; the invitation is for {robot}")
+
+
+def _set_stray_key_aside(directory: Path, robot: str) -> None:
+    """A key without a team that has this robot: of a join that broke off, or of a team that it has left.
+
+    Raises:
+        TeamFileError: it cannot be moved; nothing was asked yet.
+    """
+    key = team.secret_key_path(directory, robot)
+    try:
+        if key.exists():
+            key.replace(key.with_suffix(".former"))
+    except OSError as error:
+        raise TeamFileError(f"cannot set the former key {key} aside: {error.strerror}; move it away") from error
 
 
 class _Way:
@@ -288,10 +363,8 @@ def _write(directory: Path, robot: str, secret: str, files: dict[str, bytes]) ->
     written: list[Path] = []
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        if (directory / team.TEAM_FILE).exists():
-            team.forget_secret_key(directory, robot)  # of a team that it has left
         written.append(team.write_secret_key(directory, robot, secret))
-        for name in FILES:
+        for name in (*FURTHER_FILES, team.TEAM_FILE):  # with the last one, it has joined
             if name in files:
                 write_whole(directory / name, files[name], mode=0o666, lasts="name")
                 written.append(directory / name)

@@ -12,7 +12,14 @@ GIVEN = Invitation("r2", "192.168.7.11", 7423, bytes(range(SECRET_SIZE)))
 
 
 @pytest.mark.parametrize(
-    "given", [GIVEN, replace(GIVEN, host="fd00::1"), replace(GIVEN, robot="机器人@2"), replace(GIVEN, port=1)]
+    "given",
+    [
+        GIVEN,
+        replace(GIVEN, host="fd00::1"),
+        replace(GIVEN, robot="机器人@2"),
+        replace(GIVEN, port=1),
+        replace(GIVEN, role="witness"),
+    ],
 )
 def test_a_line_is_read_as_it_was_printed(given: Invitation) -> None:
     assert read(given.line) == given
@@ -30,8 +37,8 @@ def test_every_other_line_is_refused_in_a_sentence() -> None:
             read(other)
 
 
-def test_another_name_or_secret_makes_other_keys() -> None:
-    others = [GIVEN, replace(GIVEN, robot="r3"), replace(GIVEN, secret=bytes(SECRET_SIZE))]
+def test_another_name_role_or_secret_makes_other_keys() -> None:
+    others = [GIVEN, replace(GIVEN, robot="r3"), replace(GIVEN, role="server"), replace(GIVEN, secret=bytes(SECRET_SIZE))]
     keys = [key for one in others for key in (one.inviting_secret(), one.joining_secret())]
-    assert len(set(keys)) == 6
+    assert len(set(keys)) == 8
     assert replace(GIVEN, host="10.0.0.1", port=1).inviting_secret() == GIVEN.inviting_secret()
