@@ -331,7 +331,7 @@ class TeamChanges:
         members = digest(after.robots)
         if self._is_known(after):
             return {"change": self._lines.settings.team.change}
-        is_granted = self._grants.covers(peer, members, clock.now_ns()) and after.change == self._lines.settings.team.change + 1
+        is_granted = self._grants.covers(peer, members) and after.change == self._lines.settings.team.change + 1
         if not is_granted:
             await self._check_with_the_others(peer, after.change, members)
         async with self._taking:

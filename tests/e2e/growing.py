@@ -87,14 +87,15 @@ class GrowingStage(SwitchStage):
             file.write(board)
         self.switch_on(name)
 
-    def switch_on(self, name: str) -> None:
-        """Start the agent of a machine; after a power cut, the machine as well."""
+    def switch_on(self, name: str, *, answers: bool = True) -> None:
+        """Start the agent of a machine; after a power cut, the machine as well. ``answers``: wait until it does."""
         if self.machine(name).process.poll() is not None:
             self.robots[self.names.index(name)] = self.start_robot(name)
             if self.means.own_network:
                 raise NotImplementedError("its cable is gone")
         self.machine(name).switch_on()
-        robots.until(lambda: robots.answers(self.machine(name)), f"{name} to answer")
+        if answers:
+            robots.until(lambda: robots.answers(self.machine(name)), f"{name} to answer")
 
     @contextmanager
     def invited(self, by: str, name: str, *words: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:

@@ -89,9 +89,10 @@ def test_no_team_changes_while_a_member_is_away_and_one_that_is_lost_is_taken_ou
         assert ran.returncode == 0, ran.stderr
         stage.brought("robot1", "robot4", "--role", "witness")
         together(stage, "robot1", "robot2", "robot4")
-        stage.switch_on("robot3")
+        stage.switch_on("robot3", answers=False)
         robots.until(lambda: "robot3" not in stage.members("robot3").robots, "robot3 to hear that it is out")
         robots.until(lambda: not robots.answers(stage.machine("robot3")), "its agent to end")
+        assert "robot3 was taken out of team lab" in stage.machine("robot3").log.read_text()
 
 
 def state_at(stage: GrowingStage, at: str, of: str) -> str:

@@ -212,7 +212,7 @@ def _admit(arguments: argparse.Namespace, directory: Path, robot: str, member: R
 
 def join(arguments: argparse.Namespace) -> int:
     """Make this machine a member, by the line that another robot has printed."""
-    directory, invitation = Path(arguments.directory), read(_line(arguments.line))
+    directory, invitation = Path(arguments.directory), read(_line(arguments.line, is_quiet=arguments.json))
     robot = invitation.robot
     agent_service.check_name(directory, robot)
     _check_that_it_is_free(directory, robot)
@@ -243,12 +243,14 @@ def join(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _line(given: str) -> str:
+def _line(given: str, *, is_quiet: bool = False) -> str:
     """The invitation's line: asked for, so that its secret stands in no list of processes and in no shell's history.
 
     Raises:
         InvitationError: nothing came.
     """
+    if given != "-" and is_quiet:
+        return given
     if given != "-":
         print(
             "failover: the line's secret was on the command line, where other users of this machine may have seen it; without "

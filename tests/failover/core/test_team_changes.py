@@ -28,10 +28,10 @@ def test_who_gives_up_frees_its_own_grant_alone() -> None:
     grants = Grants()
     assert grants.ask(3, 3, "r1", 0, 7) == ""
     grants.done("r2")
-    assert grants.covers("r1", 7, 1) and not grants.covers("r1", 8, 1) and not grants.covers("r2", 7, 1)
-    assert not grants.covers("r1", 7, GRANT_NS)
-    grants.done("r1")
-    assert not grants.covers("r1", 7, 1)
+    assert grants.covers("r1", 7) and not grants.covers("r1", 8) and not grants.covers("r2", 7)
+    assert grants.ask(3, 3, "r2", GRANT_NS, 8) == "" and not grants.covers("r1", 7)
+    grants.done("r2")
+    assert not grants.covers("r2", 8)
 
 
 @pytest.mark.parametrize(("have", "wanted"), [(4, 3), (3, 4)])

@@ -65,10 +65,10 @@ def test_files_that_cannot_travel_are_told_before_the_team_changes(place: Path) 
 def test_another_role_than_the_invitations_and_bytes_that_are_no_message_are_refused(place: Path) -> None:
     witness = Robot(MEMBER.beats, MEMBER.bulk, "witness", MEMBER.public_key)
     assert "is for a robot" in welcomed(place, team_invitations.Wish(VERSION, "r2", witness)).refusal
-    for bad in (b"", b"\xc1", b"\x91" * 100_000):
+    for bad in (b"", b"\xc1", b"\x81\xa5robot\xa1\xff", b"\x81\xa1x" + b"\x91" * 100_000):
         assert "not understood" in welcomed(place, bad).refusal
     with pytest.raises(InvitationError, match="is not understood"):
-        team_invitations._understood(b"\x91" * 100_000, GIVEN)
+        team_invitations._understood(b"\x81\xa1x" + b"\x91" * 100_000, GIVEN)
 
 
 def test_only_the_robot_that_was_admitted_confirms() -> None:
