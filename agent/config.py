@@ -331,6 +331,19 @@ class Settings:
         """All members but this one, by name."""
         return {name: robot for name, robot in self.team.robots.items() if name != self.config.robot}
 
+    @property
+    def former(self) -> dict[str, Robot]:
+        """Members that were taken out, by name: they may connect, and are told so."""
+        return self.team.former
+
+    def with_robots(self, robots: Mapping[str, Robot]) -> Settings:
+        """The same agent in a team of these members."""
+        return replace(self, team=replace(self.team, robots=dict(robots)))
+
+    def with_team(self, team: Team) -> Settings:
+        """The same agent in the team as it is now; the board stays."""
+        return replace(self, team=replace(team, board=self.team.board))
+
     def component(self, name: str) -> ComponentConfig:
         """The operator's settings for a component; the defaults where he gave none."""
         return self.config.components.get(name, ComponentConfig())
@@ -358,6 +371,20 @@ def load(path: Path) -> Settings:
     _check_components(path, config, members)
     _check_tasks(path, config, members)
     return Settings(path, config, members, secret)
+
+
+def check_team(settings: Settings, team: Team) -> None:
+    """Whether this robot's configuration fits a team in which it may soon be.
+
+    Raises:
+        ConfigError: it would not start in it; names the line.
+    """
+    path, config = settings.path, settings.config
+    if config.robot not in team.robots:
+        return
+    _check_keys(path, config, team)
+    _check_rule(path, config, team)
+    _check_components(path, config, team)
 
 
 def _check_keys(path: Path, config: Config, members: Team) -> None:

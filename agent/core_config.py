@@ -29,6 +29,16 @@ def node_config(settings: Settings) -> types.Config:
     Raises:
         RulesError: the values contradict each other.
     """
+    components = tuple(declared(settings, name, task) for name, task in settings.config.tasks.items())
+    return replace(team_config(settings), components=components)
+
+
+def team_config(settings: Settings) -> types.Config:
+    """The same without the components that are declared: what a change of the team changes. It asks the system nothing.
+
+    Raises:
+        RulesError: the values contradict each other; `agent.config.check_team` finds that before.
+    """
     config = settings.config
     return types.Config(
         robot=config.robot,
@@ -40,7 +50,7 @@ def node_config(settings: Settings) -> types.Config:
         witnesses=_members(settings, "witness"),
         patience_ms=config.patience_s * 1_000,
         boot_patience_ms=config.boot_patience_s * 1_000,
-        components=tuple(declared(settings, name, task) for name, task in config.tasks.items()),
+        seat=settings.me.seat,
     )
 
 

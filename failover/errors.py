@@ -41,6 +41,10 @@ class TeamFileError(FailoverError):
     """The team directory or a key in it cannot be used."""
 
 
+class InvitationError(FailoverError):
+    """An invitation to a team cannot be used: it is none, it is over, or the other side refused it; nothing is left behind."""
+
+
 class RulesError(FailoverError):
     """A setting contradicts another one or leaves its range; the message names the setting and the cure."""
 

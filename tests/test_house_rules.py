@@ -272,6 +272,7 @@ DATACLASSES = {
     "failover/recording/mcap_file.py": "the mcap library's records are some",
     "failover/kept_state/period.py": "a field that is not shown",
     "failover/config/board.py": "read from TOML by its fields",
+    "failover/config/members.py": "changes what is read from TOML",
     "failover/config/page.py": "read from TOML by its fields",
     "failover/config/programs.py": "read from TOML by its fields",
     "failover/config/rights.py": "read from TOML by its fields",

@@ -104,7 +104,7 @@ class BeatLane:
         self._only = [(fileno, select.EPOLLIN) for fileno in self._sockets] if len(self._sockets) == 1 else []
         self._names: dict[int, str] = {}
         self._told: dict[bytes, str] = {}
-        self._ways = {name: _ways(self._links, robot) for name, robot in peers.items()}
+        self.know(peers)
         self._group = group_of(team)
         self._ports = tuple(int(link.getsockname()[1]) for link in self._links)
         self._collecting: dict[tuple[Cast, int], socket.socket] = {}
@@ -113,6 +113,10 @@ class BeatLane:
         self._casts: dict[str, int] = {}
         self._joined: dict[int, int] = {}
         self.unsent = 0
+
+    def know(self, peers: Mapping[str, Robot]) -> None:
+        """From now on these are the others."""
+        self._ways = {name: _ways(self._links, robot) for name, robot in peers.items()}
 
     def fileno(self) -> int:
         """Readable while datagrams wait."""

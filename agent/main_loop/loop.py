@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from agent.config import Settings
-from agent.core_config import node_config
+from agent.core_config import node_config, team_config
 from agent.errors import AgentError
 from agent.main_loop import messages, starvation, vote_record
 from agent.main_loop.beat_sockets import NOT_CAST, TURN_LIMIT, BeatLane
@@ -35,8 +35,10 @@ from agent.main_loop.messages import (
     HearKey,
     Inventory,
     Life,
+    LinkNow,
     LinksAre,
     SpeakKey,
+    TeamIs,
     Told,
     ToMainLoop,
     ToWorker,
@@ -48,12 +50,14 @@ from agent.main_loop.worker_process import WorkerProcess
 from agent.system import clock, syscalls, timers
 from agent.system.sd_notify import Notifier, watchdog_period_ns
 from checkpoint.keeper.messages import ChannelClosedError, ChannelError
+from failover.config.team import Robot
 from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
-from failover.core.events import Event, Received, Tick
+from failover.core.events import Event, Received, TeamChanged, Tick
 from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
 from failover.core.frames.lanes import FrameLanes, medium_of
+from failover.core.frames.roster import Roster
 from failover.core.node import Node
 from failover.core.wire.messages import Beat
 from failover.errors import FailoverError
@@ -118,13 +122,10 @@ class MainLoop:
         self._record_file = record_file
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers, settings.team.team)
-        round_us = settings.config.beat_ms * 1_000
         has_board, members = bool(settings.team.board.items), settings.team.roster()
-        boot = record_file.record.boot
-        self._frames = FrameLanes(
-            lambda medium: FrameLane(self._me, settings.team.team, members, boot, round_us, medium, bounds_ways=has_board)
-        )
+        self._frames = FrameLanes(self._lanes_for(members))
         self._media = Media(settings, self._beats, self._frames, members)
+        self._links: tuple[LinkNow, ...] = ()
         self._beat: Beat | None = None
         self._has_board = has_board and settings.me.role == "robot"
         self._board: BoardLink | None = None
@@ -162,6 +163,11 @@ class MainLoop:
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
         self._remembered = 0
+
+    def _lanes_for(self, members: Roster) -> Callable[[int], FrameLane]:
+        settings, boot = self._settings, self._record_file.record.boot
+        round_us, has_board = settings.config.beat_ms * 1_000, bool(settings.team.board.items)
+        return lambda medium: FrameLane(self._me, settings.team.team, members, boot, round_us, medium, bounds_ways=has_board)
 
     def run(self) -> int:
         """Beat until SIGTERM or SIGINT. Components live on.
@@ -446,11 +452,31 @@ class MainLoop:
             case HearKey(peer, key):
                 self._frames.hear(peer, key)
             case LinksAre(links):
+                self._links = links
                 self._media.take(links, clock.now_ns())
+            case TeamIs(robots):
+                self._take_team(robots)
             case Alive():
                 pass
             case _:
                 self._worker.send(self._told(message))
+
+    def _take_team(self, robots: dict[str, Robot]) -> None:
+        """Between two turns: send to these members, hear these, and decide with these."""
+        if robots == self._settings.team.robots or self._me not in robots:
+            return
+        settings = self._settings = self._settings.with_robots(robots)
+        members = settings.team.roster()
+        self._beats.know(settings.peers)
+        self._frames.change(members, self._lanes_for(members))
+        self._media = Media(settings, self._beats, self._frames, members)
+        self._media.take(self._links, clock.now_ns())
+        self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
+        self._unlike.intersection_update(robots)
+        if self._board is not None:
+            self._open_board()  # the worker has made the files of those that came
+        self._step(TeamChanged(team_config(settings)))
+        log.info("the team is %s now", ", ".join(sorted(robots)))
 
     def _take_inventory(self, inventory: Inventory) -> None:
         """The node is born with what was found; a node that lives already is told what the old worker took with it."""

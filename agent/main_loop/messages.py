@@ -10,6 +10,7 @@ from typing import Any, Final, Literal, get_args
 import msgspec
 
 from agent.errors import AgentError
+from failover.config.team import Robot
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.event_log.decisions import Line
@@ -48,7 +49,7 @@ ACTS: Final[dict[str, Any]] = {
     )
 }
 EVENTS: Final[dict[str, Any]] = {
-    kind.__name__: kind for kind in get_args(events.Event) if kind not in (events.Tick, events.Received)
+    kind.__name__: kind for kind in get_args(events.Event) if kind not in (events.Tick, events.Received, events.TeamChanged)
 }
 
 _encoder = msgspec.msgpack.Encoder()
@@ -120,6 +121,12 @@ class LinksAre(msgspec.Struct, frozen=True, tag=True):
     """Worker to main loop, at each change: this robot's links, in the order of its beat addresses."""
 
     links: tuple[LinkNow, ...]
+
+
+class TeamIs(msgspec.Struct, frozen=True, tag=True):
+    """Worker to main loop, before its inventory and at each change: the members, as team.toml has them now."""
+
+    robots: dict[str, Robot]
 
 
 class Ask(msgspec.Struct, frozen=True, tag=True):
@@ -195,7 +202,7 @@ class Farewell(msgspec.Struct, frozen=True, tag=True):
 
 
 ToWorker = Order | Life | Told | Farewell
-ToMainLoop = Happened | Inventory | SpeakKey | HearKey | LinksAre | Alive | Ask
+ToMainLoop = Happened | Inventory | SpeakKey | HearKey | LinksAre | TeamIs | Alive | Ask
 
 
 def order(act: Act) -> Order:

@@ -39,11 +39,15 @@ class Arrivals:
             team: the hosts of the other members, one for each of them; names are known by address once their member has come.
         """
         self._port = port
-        self._room = Counter(map(plain, team))
+        self.expect(team)
         self._addresses: dict[int, str] = {}
         self._held: Counter[str] = Counter()
         self.turned_away = 0
         self.last = ""
+
+    def expect(self, team: Iterable[str]) -> None:
+        """From now on these are the hosts of the other members."""
+        self._room = Counter(map(plain, team))
 
     def is_of_member(self, address: str) -> None:
         """A member has proved itself from there."""

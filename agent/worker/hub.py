@@ -33,10 +33,12 @@ from agent.main_loop.messages import (
     LinksAre,
     Order,
     SpeakKey,
+    TeamIs,
     Told,
     ToWorker,
 )
 from agent.system import syscalls
+from agent.system.crash import end_worker_on_mistake
 from agent.system.log_setup import set_up_log
 from agent.system.systemd_units import starter
 from agent.worker.control.queries import QUESTIONS, Questions
@@ -47,10 +49,12 @@ from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Link, Links, Medium
 from agent.worker.network.remote_orders import Errands
 from agent.worker.network.replication_link import Keys, LinkState, public_key_of
+from agent.worker.team_changes import TEAM_IS, TEAM_TOLD, TeamChanges, digest
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError
 from checkpoint.runtime import allocator
 from failover.client.control import SOCKET_NAME
+from failover.config.team import Team
 from failover.core import acts, events
 from failover.core.events import Event
 from failover.core.frames.frame import KEY_SIZE_MIN
@@ -105,22 +109,38 @@ class Switchboard:
         self._incompatible: dict[str, str] = {}
         self._own_troubles: list[str] = []
         self._signs: dict[tuple[str, str], float] = {}
-        keys = Keys("", "", {})
-        if not config.insecure:
-            publics = {name: robot.public_key for name, robot in settings.team.robots.items()}
-            keys = Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
-            if keys.public != settings.me.public_key:
-                self._own_troubles.append(UNFIT_KEY)
+        keys = self._keys()
+        if keys.present and keys.public != settings.me.public_key:
+            self._own_troubles.append(UNFIT_KEY)
         facts = Facts(frozenset(config.wireless))
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
         self._wires = Wires(self._links, self._links_changed)
         self._connections = AllConnections(settings, keys, self._hear, self._way_changed, self._links, self._unread)
         self._replication_link = self._connections.bulk
+        self.team_changes = TeamChanges(self)
 
     def connect(self, verbs: Questions) -> None:
         """Have the orders of people and robots carried out by these."""
         self.verbs = verbs
-        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands())
+        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands(), self.team_changes.orders())
+
+    def _keys(self) -> Keys:
+        settings = self.settings
+        if settings.config.insecure:
+            return Keys("", "", {})
+        publics = {name: robot.public_key for name, robot in (*settings.former.items(), *settings.team.robots.items())}
+        return Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
+
+    async def take_team(self, team: Team) -> None:
+        """Go on with these members: the main loop's frames and rules, and every connection."""
+        self.settings = self.settings.with_team(team)
+        await self.prepare_team()
+        self._say(TeamIs(dict(team.robots)))
+        try:
+            await self._connections.change(self.settings, self._keys())
+        except LaneError as error:
+            log.critical("%s; the worker process starts anew", error)
+            self._end.set()
 
     # --- what builds on it ---
 
@@ -135,6 +155,9 @@ class Switchboard:
     @abstractmethod
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
+
+    async def prepare_team(self) -> None:
+        """The team has changed: have ready what the main loop opens for each member."""
 
     async def stop_work(self) -> None:
         """Give up what is under way, while the connections still stand."""
@@ -166,15 +189,17 @@ class Switchboard:
         await self._begin()
         self._wires.watch()
         self._connections.open()
-        server = ControlServer(
-            self._runtime / SOCKET_NAME, self.settings.config.group, self.verbs.gated(), self.settings.config.page_user
-        )
+        verbs = {**self.verbs.gated(), "team": self.team_changes.verb}
+        server = ControlServer(self._runtime / SOCKET_NAME, self.settings.config.group, verbs, self.settings.config.page_user)
         await server.open()
+        updating = asyncio.create_task(self.team_changes.bring_up_to_date())
+        updating.add_done_callback(end_worker_on_mistake)
         syscalls.give_back()  # what the start has left
         try:
             await self._end.wait()
         finally:
             loop.remove_reader(self._main_loop.fileno())
+            updating.cancel()
             await server.close()
             self.gate.close()
             self._wires.close()
@@ -189,7 +214,9 @@ class Switchboard:
 
     async def _begin(self) -> None:
         """Say what was found: the core is born with that."""
-        self._say(await self.prepare())
+        inventory = await self.prepare()
+        self._say(TeamIs(dict(self.settings.team.robots)))
+        self._say(inventory)
         early, self._early = self._early or [], None
         for event in early:
             self.tell(event)
@@ -289,7 +316,8 @@ class Switchboard:
         if state is LinkState.CONNECTED:
             key = self._connections.beat_key(peer)
             self._greet(way, peer, key)
-            self._say(SpeakKey(peer, key))
+            if peer in self.settings.peers:
+                self._say(SpeakKey(peer, key))
             return
         if way == BULK:
             self.link_lost(peer)
@@ -298,6 +326,8 @@ class Switchboard:
 
     def _unread(self, peer: str, why: str) -> None:
         """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""
+        if peer in self.settings.former:
+            return
         now_s = asyncio.get_running_loop().time()
         sign = (peer, why if peer else "")
         if len(self._signs) > SIGNS_MAX:
@@ -322,6 +352,9 @@ class Switchboard:
         return self._connections.hindrance(peer)
 
     def _hear(self, way: int, peer: str, message: Bulk) -> None:
+        if peer not in self.settings.peers:
+            self._hear_former(peer, message)
+            return
         match message:
             case Hello():
                 self._greeted(way, peer, message)
@@ -329,7 +362,7 @@ class Switchboard:
                 self._connections.refuse(way, peer, reason)
             case _ if peer in self._incompatible:
                 return
-            case Errand(verb=verb) if verb not in QUESTIONS and self.votes_only(peer):
+            case Errand(verb=verb) if verb not in (*QUESTIONS, *TEAM_TOLD) and self.votes_only(peer):
                 self._connections.say(
                     peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders")
                 )
@@ -339,6 +372,18 @@ class Switchboard:
                 self.errands.done(peer, message)
             case _ if way == BULK:
                 self.hear_of_a_snapshot(peer, message)
+
+    def _hear_former(self, peer: str, message: Bulk) -> None:
+        """A robot that was taken out, and has perhaps not heard of it; what it says counts for nothing else."""
+        if peer not in self.settings.former:
+            return
+        match message:
+            case Hello(team=team, change=change, members=members) if team == self.settings.team.team:
+                self.team_changes.heard(peer, change, members)
+            case Errand(verb=verb) if verb == TEAM_IS:
+                self.errands.received(peer, message)
+            case ErrandDone():
+                self.errands.done(peer, message)
 
     def _greeted(self, way: int, peer: str, hello: Hello) -> None:
         reason = ""
@@ -357,14 +402,16 @@ class Switchboard:
             log.warning("%s", reason)
             return
         self._incompatible.pop(peer, None)
+        self.team_changes.heard(peer, hello.change, hello.members)
         self._say(HearKey(peer, hello.beat_key))
         if self._connections.is_new_key(way, peer, hello.beat_key) and self._connections.present_key(peer):
             # A robot that lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
             self._greet(way, peer, self._connections.present_key(peer), again=True)
 
     def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
-        config = self.settings.config
-        self._connections.answer(way, peer, Hello(VERSION, self.settings.team.team, config.robot, self._life.boot, key, again))
+        config, team = self.settings.config, self.settings.team
+        hello = Hello(VERSION, team.team, config.robot, self._life.boot, key, again, team.change, digest(team.robots))
+        self._connections.answer(way, peer, hello)
 
     def votes_only(self, peer: str) -> bool:
         """Whether nothing that this peer says may start, end or overwrite anything."""
@@ -375,6 +422,7 @@ class Switchboard:
         return [
             *self._own_troubles,
             *self._incompatible.values(),
+            *self.team_changes.conflicts.values(),
             *self._replication_link.troubles(),
             *self._connections.troubles,
             *self._links.notes(),

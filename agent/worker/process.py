@@ -49,6 +49,7 @@ from checkpoint.keeper.messages import Channel
 from checkpoint.model import Snapshot
 from checkpoint.runtime import allocator
 from checkpoint.snapshot.required_files import Need, names_of_contents, needs
+from checkpoint.store import lost_copies
 from checkpoint.store.content_store import FOLDER as CONTENTS_FOLDER
 from checkpoint.store.store import Store, open_store
 from checkpoint.store.xor_cache_budget import PageBudget
@@ -142,6 +143,11 @@ class Worker(Switchboard):
         if found:
             self._process_pool.begin()
         return Inventory(_held(store), found)
+
+    async def prepare_team(self) -> None:
+        """See `agent.worker.hub.Switchboard.prepare_team`: a file of the board for each member."""
+        if self._board_place is not None:
+            await self._provide_board()
 
     async def _provide_board(self) -> None:
         if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):
@@ -440,10 +446,18 @@ class Worker(Switchboard):
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        notices = [*self.notices(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        notices = [*self.notices(), *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
         ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory())
         return team_view(self.settings, self._life, told, ours)
+
+    def _lost(self) -> list[str]:
+        """Two copies of a component ran, and no person has looked yet at the state of the one that lost."""
+        with contextlib.suppress(OSError):
+            directory = Path(self.settings.config.state_directory) / lost_copies.FOLDER
+            copies = [one for one in lost_copies.found(directory) if not one.seen]
+            return [LOST.format(one.component, one.epoch) for one in copies[:NOTICES_SHOWN]]
+        return []
 
     def _memory(self) -> Memory:
         keepers = {one.component.keeper.pid for one in self.supervisors.values() if one.component is not None}
@@ -453,6 +467,11 @@ class Worker(Switchboard):
             sum(map(memory_limits.held, ours)), sum(memory_limits.held(pid) for pid in keepers if pid), budget.held, budget.limit
         )
 
+
+LOST: Final = (
+    "another robot ran {0} too, or instead, and the copy of this robot, of epoch {1}, lost: failover lost inspect {0} shows its "
+    "state and ends this note"
+)
 
 NOTICES_SHOWN: Final = 10
 """Of the store's latest findings."""

@@ -289,16 +289,33 @@ VERBS: Final = (
         "failover.cli.verbs.components:prefer",
     ),
     Verb(
+        "lost",
+        "where two copies of a component ran: the state of the one that lost",
+        """
+        Two robots alone that were cut from each other may both have run a component. When they meet again one copy stays, and
+        the state of the other one is kept at its robot. failover status tells of it until a person has looked. These acts need
+        root, and no agent.
+
+          failover lost list
+          failover lost inspect mapper
+          failover lost restore mapper
+          failover lost remove mapper
+        """,
+        "failover.cli.arguments.lost:lost",
+        "failover.cli.verbs.lost:listed",
+    ),
+    Verb(
         "team",
         "the robots of the team, and their keys",
         """
-        Begin a team, enrol robots, list them. The team file is the same on every robot and holds nothing secret; a robot's secret
-        key stays on that robot alone. failover team ACT --help explains an act.
+        Begin a team, bring robots into it, take them out, list them. No agent is restarted for that. The team file is the same on
+        every robot and holds nothing secret; a robot's secret key stays on that robot alone. failover team ACT --help explains
+        an act.
 
-          failover team create lab
-          failover team enrol robot1 192.168.7.11
-          failover team enrol robot2 192.168.7.12 10.0.0.12 --bulk 192.168.7.12
-          failover team show
+          failover team create lab                             # on the first robot
+          failover team invite robot2                          # there: prints a line
+          failover team join robot2@192.168.7.11:7423/3ljz     # on robot2: that line, whole
+          failover team list
         """,
         "failover.cli.arguments.team:team",
         "failover.cli.verbs.team:show",

@@ -33,6 +33,8 @@ verb           arguments                                                result, 
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*, ``to`` "": the target expected          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
+``team``       ``act`` *must*: add or remove, ``robot`` *must*,         ``{team, robots, change, waiting}``: members that take it
+               ``member``: {beats, bulk, role, public_key}              when they are back; for root
 ``promote``    ``name`` *must*, ``robot`` = newest checkpoint's,         ``{name, to, epoch, promoted, sentence, risks}``; unless
                ``sure`` false                                           ``sure`` nothing is done, and they tell what would be
 =============  =======================================================  ========================================================

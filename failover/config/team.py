@@ -23,6 +23,7 @@ from checkpoint.store.whole_file import write_whole
 from failover.config import strict_toml
 from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
 from failover.core.frames.roster import Roster, roster
+from failover.core.team_changes import seats
 from failover.core.wire import names
 from failover.errors import NameFormatError, TeamFileError
 
@@ -40,6 +41,11 @@ DEFAULT_BULK_PORT: Final = 7421
 ROBOT_LIMIT: Final = 64
 """Robots of one team: each beats to each, so the traffic grows with the square."""
 
+FORMER_LIMIT: Final = 16
+"""Members taken out that are remembered."""
+
+CHANGE_MAX: Final = 1 << 40
+
 _ODD = re.compile(r"[:\"\\.]")
 """Not in a robot's name: it is the name of a file, a word of TOML, and stands before addresses."""
 
@@ -53,21 +59,32 @@ class Robot:
         beats: "host:port" for each of its links; beats go to all of them.
         bulk: "host:port" on the wired link, for snapshots.
         public_key: Z85, or "" in a team without keys.
+        seat: its number in the team, which stays while members come and go; -1: by the order of names.
     """
 
     beats: tuple[str, ...]
     bulk: str
     role: Role = "robot"
     public_key: str = ""
+    seat: int = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Team:
-    """The members, by name, and the items of their board."""
+    """The members, by name, and the items of their board.
+
+    Attributes:
+        change: how often failover has changed the members.
+        next_seat: above the seat that was given last.
+        former: members that were taken out, the newest last: should one of them come back, it is told so, and ends.
+    """
 
     team: str
     robots: dict[str, Robot] = field(default_factory=dict)
     board: BoardConfig = field(default_factory=BoardConfig)
+    change: int = 0
+    next_seat: int = 0
+    former: dict[str, Robot] = field(default_factory=dict)
 
     def items(self) -> Board:
         """The board's declarations, checked when the file was read.
@@ -92,13 +109,41 @@ def read(directory: Path) -> Team:
     if not path.exists():
         raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or copy it here from another robot")
     team = strict_toml.read(path, Team)
-    if len(team.robots) > ROBOT_LIMIT:
-        raise TeamFileError(f"{path}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
-    for name, robot in team.robots.items():
-        check_robot(str(path), name, robot)
+    check_team(str(path), team)
     if team.board.items:
         board_of(team.board, lambda keys: strict_toml.place_of(path, keys))
     return team
+
+
+def check_team(where: str, team: Team) -> None:
+    """Refuse members that cannot be a team.
+
+    Raises:
+        TeamFileError: says which and why.
+    """
+    if len(team.robots) > ROBOT_LIMIT:
+        raise TeamFileError(f"{where}: {len(team.robots)} robots are over the limit of {ROBOT_LIMIT}")
+    for name, robot in (*team.robots.items(), *team.former.items()):
+        check_robot(where, name, robot)
+    if len(team.former) > FORMER_LIMIT or not 0 <= team.change <= CHANGE_MAX or not 0 <= team.next_seat < ROBOT_LIMIT:
+        raise TeamFileError(f"{where}: change, next_seat or former cannot be right; copy the file from another robot of the team")
+    _check_keys_differ(where, team)
+    given = sorted(robot.seat for robot in team.robots.values())
+    if given and given[-1] >= 0 and (given[0] < 0 or len(set(given)) < len(given) or given[-1] >= ROBOT_LIMIT):
+        raise TeamFileError(
+            f"{where}: each member has a seat of its own from 0 to {ROBOT_LIMIT - 1}, or none has one; copy the file from a "
+            "robot where it is whole"
+        )
+
+
+def _check_keys_differ(where: str, team: Team) -> None:
+    owners: dict[str, str] = {}
+    for name, robot in team.robots.items():
+        if robot.public_key and owners.setdefault(robot.public_key, name) != name:
+            raise TeamFileError(
+                f"{where}: {name} and {owners[robot.public_key]} have the same public key: each could speak for the other; give "
+                f"one of them its own: failover team enrol {name} HOST --replace"
+            )
 
 
 def check_robot(where: str, name: str, robot: Robot) -> None:
@@ -139,7 +184,8 @@ def split_address(address: str, where: str) -> tuple[str, int]:
         TeamFileError: it is neither.
     """
     host, separator, port = address.rpartition(":")
-    if not separator or not host or not port.isdigit() or not 0 < int(port) < 1 << 16:
+    is_host = bool(separator and host) and host.isprintable() and not set(host) & set(' "\\')
+    if not is_host or not port.isdecimal() or not port.isascii() or not 0 < int(port) < 1 << 16:
         raise TeamFileError(f"{where}: {address!r} is no address; write host:port")
     return host.strip("[]"), int(port)
 
@@ -153,7 +199,10 @@ def write(directory: Path, team: Team) -> None:
     """Write the team file whole: aside, then renamed. The operator's lines below ``[board]`` stay as they are."""
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / TEAM_FILE
-    write_whole(path, (_as_toml(team) + _board_text(path, team.board)).encode(), mode=0o666, lasts="process")
+    mode = path.stat().st_mode & 0o777 if path.exists() else None
+    write_whole(path, (_as_toml(team) + _board_text(path, team.board)).encode(), mode=0o666, lasts="name")
+    if mode is not None:
+        path.chmod(mode)  # an agent's umask is another one than a person's, and programs read the file
 
 
 def _board_text(path: Path, board: BoardConfig) -> str:
@@ -169,9 +218,24 @@ def _board_text(path: Path, board: BoardConfig) -> str:
 
 
 def enrol(team: Team, name: str, robot: Robot) -> Team:
-    """The team with one more robot, or with that robot's entry replaced."""
+    """The team with one more robot, or with that robot's entry replaced, which keeps its seat."""
     check_robot("the new robot", name, robot)
-    return replace(team, robots={**team.robots, name: robot})
+    if len(team.robots) >= ROBOT_LIMIT and name not in team.robots:
+        raise TeamFileError(f"team {team.team} has {ROBOT_LIMIT} members, and no more find a place")
+    taken = {other: member.seat for other, member in team.robots.items()}
+    mark = team.next_seat
+    if robot.seat < 0 and any(seat >= 0 for seat in taken.values()):
+        robot = replace(robot, seat=seats(taken | {name: taken.get(name, -1)}, [*taken, name], mark)[name])
+        mark = mark if robot.seat == taken.get(name) else (robot.seat + 1) % ROBOT_LIMIT
+    places = {robot.public_key, robot.bulk, *robot.beats} - {""}
+    former = {
+        other: one
+        for other, one in team.former.items()
+        if other != name and places.isdisjoint({one.public_key, one.bulk, *one.beats})
+    }
+    enrolled = replace(team, robots={**team.robots, name: robot}, next_seat=mark, former=former)
+    _check_keys_differ("the new robot", enrolled)
+    return enrolled
 
 
 def secret_key_path(directory: Path, robot: str) -> Path:
@@ -197,6 +261,8 @@ def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
         raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
     with open(descriptor, "w") as file:
         file.write(secret + "\n")
+        file.flush()
+        os.fsync(descriptor)
     return path
 
 
@@ -230,8 +296,18 @@ def forget_secret_key(directory: Path, robot: str) -> None:
 
 def _as_toml(team: Team) -> str:
     lines = ["# The team: the same file on every robot. Nothing in it is secret.", f'team = "{team.team}"']
+    lines += [f"change = {team.change}"] if team.change else []
+    lines += [f"next_seat = {team.next_seat}"] if team.next_seat else []
     for name, robot in sorted(team.robots.items()):
-        beats = ", ".join(f'"{address}"' for address in robot.beats)
-        lines += ["", f'[robots."{name}"]', f'role = "{robot.role}"', f"beats = [{beats}]", f'bulk = "{robot.bulk}"']
-        lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
+        lines += _table_of("robots", name, robot)
+    for name, robot in team.former.items():
+        lines += _table_of("former", name, robot)
     return "\n".join(lines) + "\n"
+
+
+def _table_of(kind: str, name: str, robot: Robot) -> list[str]:
+    beats = ", ".join(f'"{address}"' for address in robot.beats)
+    lines = ["", f'[{kind}."{name}"]', f'role = "{robot.role}"', f"beats = [{beats}]", f'bulk = "{robot.bulk}"']
+    lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
+    lines += [f"seat = {robot.seat}"] if robot.seat >= 0 else []
+    return lines

@@ -77,11 +77,15 @@ class Speaker:
     def __init__(self, me: str, boot: int, rule: Rule = Rule.PAIR, members: int = 2) -> None:
         self._me = me
         self._boot = boot
-        self._rule = RULES.index(rule)
-        self._size_max = beat_size_max(members)
+        self.speak_for(rule, members)
         self.counter = 0
         self._settled = 0
         self._said: dict[str, tuple[Entry, int]] = {}
+
+    def speak_for(self, rule: Rule, members: int) -> None:
+        """From now on in a team of so many, by this rule."""
+        self._rule = RULES.index(rule)
+        self._size_max = beat_size_max(members)
 
     def pressing(self, entries: dict[str, Entry]) -> bool:
         """Whether something has changed that should not wait for the next beat."""

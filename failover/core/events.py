@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec import Struct
 
 from checkpoint.model import Position
-from failover.core.types import ComponentSpec
+from failover.core.types import ComponentSpec, Config
 from failover.core.wire.messages import Beat
 
 
@@ -39,6 +39,15 @@ class Unread(Struct, frozen=True):
 
     robot: str
     why: str = ""
+
+
+class TeamChanged(Struct, frozen=True):
+    """One member has joined the team or left it, or has other keys: this robot's configuration from now on, without components.
+
+    A member that joins counts as silent until it is heard: no takeover waits for it.
+    """
+
+    config: Config
 
 
 class Started(Struct, frozen=True):
@@ -334,6 +343,7 @@ Event = (
     Tick
     | Received
     | Unread
+    | TeamChanged
     | Started
     | Captured
     | Unchanged

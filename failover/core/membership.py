@@ -156,15 +156,32 @@ class Membership:
     """The team, as one robot hears it."""
 
     def __init__(self, config: Config, boot: int, now_ns: int) -> None:
-        self._config = config
         self._own = (config.robot, boot)
         self._born_ns = now_ns
+        self._configure(config)
+        self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
+        self._stranger_ns = 0
+        self._former_until_ns: dict[str, int] = {}
+        self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
+        for peer in self.peers.values():
+            self._count_loyalty(peer)
+
+    def _configure(self, config: Config) -> None:
+        self._config = config
         self._loyalty_ns, self._grace_ns = config.loyalty_ns, config.grace_ns
         self._elects = config.by_majority
         self._rule = RULES.index(config.rule)
-        self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
-        self._stranger_ns = 0
-        self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
+
+    def change(self, config: Config, now_ns: int) -> None:
+        """Go on with these peers. A new one is dead until it is heard; a former one is dead once its last lease is over.
+
+        A new member cannot act on anything that this robot told it, so no grace is due to it, and no takeover waits for it.
+        """
+        self._configure(config)
+        before_ns = now_ns - self._grace_ns
+        left = {robot: peer.loyal_until_ns for robot, peer in self.peers.items() if robot not in config.peers}
+        self._former_until_ns = {robot: at for robot, at in (self._former_until_ns | left).items() if at > now_ns}
+        self.peers = {robot: self.peers.get(robot) or Peer(robot, before_ns) for robot in config.peers}
         for peer in self.peers.values():
             self._count_loyalty(peer)
 
@@ -212,6 +229,7 @@ class Membership:
             peer.unread_ns = min(peer.unread_ns + late_ns, now_ns) if peer.unread_ns else 0
             self._count_loyalty(peer)
         self._stranger_ns = min(self._stranger_ns + late_ns, now_ns) if self._stranger_ns else 0
+        self._former_until_ns = {robot: at_ns + late_ns for robot, at_ns in self._former_until_ns.items()}
         self._born_ns += late_ns
 
     def loyal_until_ns(self, robot: str) -> int:
@@ -249,7 +267,9 @@ class Membership:
 
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""
-        return robot not in self.peers or now_ns >= self.loyal_until_ns(robot)
+        if robot not in self.peers:
+            return now_ns >= self._former_until_ns.get(robot, 0)
+        return now_ns >= self.loyal_until_ns(robot)
 
     def alive(self, robot: str, now_ns: int) -> bool:
         """Heard in this life of ours, and not silent for too long."""
@@ -273,8 +293,8 @@ class Membership:
 
     def gone(self, robot: str, now_ns: int) -> bool:
         """Dead, or so deaf to us that nothing we ever told it lets it act any more."""
-        if self.dead(robot, now_ns):
-            return True
+        if robot not in self.peers or self.dead(robot, now_ns):
+            return self.dead(robot, now_ns)
         peer = self.peers[robot]
         return self._deaf(peer, now_ns) and now_ns >= peer.told_ns + self._loyalty_ns
 

@@ -39,6 +39,7 @@ from failover.core.events import (
     Stopped,
     Stored,
     StoreFailed,
+    TeamChanged,
     Tick,
     Unchanged,
     UnderWay,
@@ -128,15 +129,21 @@ class Node:
         if late_ns > LATE_NS:
             self._team.forgive(late_ns, now_ns)
         self._watch.late(late_ns, self._config.loyalty_ns, now_ns)
+        before = self._config.peers
+        if isinstance(event, TeamChanged):
+            self._change_team(event.config, now_ns)
         turn = self._turn(now_ns)
         self._watch.look(turn, event)
         begins = not self._begun
         if begins:
             self._begin(turn)
         touched = self._take(event, turn)
+        if isinstance(event, TeamChanged):
+            _say_who_belongs(turn, before)
         if isinstance(event, Tick):
             self._note_promise(turn)
         for component in touched:
+            lease.forget_former(component, turn)
             _review(component, turn)
         changed = begins or bool(touched)
         persist = self._persist() if changed else None
@@ -223,6 +230,14 @@ class Node:
                 component.held = [position for position in one.positions if self._may_resume(component, position)]
                 standby.remember(component, self._config)
 
+    def _change_team(self, config: Config, now_ns: int) -> None:
+        """Between two turns: who is a peer, how many are a majority. Leases that were granted and votes that were given stay."""
+        self._config = config
+        self._team.change(config, now_ns)
+        self._speaker.speak_for(config.rule, len(config.peers) + 1)
+        for component in self._components.values():
+            component.elects = config.by_majority
+
     def _may_resume(self, component: Component, position: Position) -> bool:
         """Not from a line that lost; nor, where the program that was started anew is still there, from the one before it."""
         is_older = (position.generation, position.sequence) <= component.ended
@@ -249,7 +264,7 @@ class Node:
 
     def _take(self, event: Event, turn: Turn) -> list[Component]:
         """Take the event in; returns the components that it may have changed."""
-        if isinstance(event, Tick):
+        if isinstance(event, Tick | TeamChanged):
             return list(self._components.values())
         if isinstance(event, Received):
             return self._hear(event, turn)
@@ -350,6 +365,14 @@ class Node:
         for component in self._components.values():
             instants += _instants(component)
         return max(min(instants), self._now_ns + REST_NS)
+
+
+def _say_who_belongs(turn: Turn, before: tuple[str, ...]) -> None:
+    joined, left = sorted(set(turn.config.peers) - set(before)), sorted(set(before) - set(turn.config.peers))
+    news = [f"{robot} joins the team" for robot in joined] + [f"{robot} leaves the team" for robot in left]
+    together = len(turn.config.peers) + 1
+    how = f"{turn.config.quorum} are a majority" if turn.config.by_majority else "by rule = pair"
+    turn.say_of_robot(f"{'; '.join(news) or 'an entry of the team changes'}: now {together} {how}")
 
 
 def _as_declared(spec: ComponentSpec, said: Rules) -> ComponentSpec:

@@ -13,6 +13,7 @@ import functools
 from msgspec import Struct, field
 
 from checkpoint.model import Position
+from failover.core.wire.names import weight
 from failover.errors import RulesError
 
 MS = 1_000_000
@@ -287,6 +288,8 @@ class Config(Struct, frozen=True, dict=True):
         archive_ms: between two whole checkpoints for a server that does not keep up with the deltas.
         boot_patience_ms: under pair, how long after its own start a robot waits for the robots that ran a component last, or that
             may have taken it over since, before it claims the component without having heard them.
+        seat: this robot's number in the team, which no other member has, and which stays while members come and go; -1: by the
+            order of names.
     """
 
     robot: str
@@ -308,6 +311,7 @@ class Config(Struct, frozen=True, dict=True):
     patience_ms: int = 30_000
     archive_ms: int = 10_000
     boot_patience_ms: int = 0
+    seat: int = -1
 
     def __post_init__(self) -> None:
         if not 1 <= self.beat_ms <= BEAT_MS_MAX:
@@ -333,6 +337,11 @@ class Config(Struct, frozen=True, dict=True):
     def by_majority(self) -> bool:
         """Whether primaries are elected."""
         return self.rule is Rule.MAJORITY
+
+    @functools.cached_property
+    def place(self) -> int:
+        """By which this robot's generations are unlike any other's."""
+        return self.seat if self.seat >= 0 else sorted((self.robot, *self.peers), key=weight).index(self.robot)
 
     @functools.cached_property
     def quorum(self) -> int:

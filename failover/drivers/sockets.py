@@ -29,6 +29,13 @@ RETRANSMIT_LIMIT_MS: Final = 3_000
 
 HANDSHAKE_LIMIT_MS: Final = 5_000
 
+ONE_TIME_LIMIT_MS: Final = 30_000
+"""The handshake of an invitation: it happens once, on machines that may be starting, and a failure costs a person's time."""
+
+HANDSHAKE_FAILED: Final = (
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+
 ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
 ZAP_DOMAIN: Final = b"failover"
 
@@ -204,6 +211,99 @@ class TeamWay:
     def close(self, linger_ms: int = 0) -> None:
         """Let it go, after so many ms in which what was sent may leave."""
         self._context.destroy(linger=linger_ms)
+
+
+class OneTimeListener:
+    """Takes messages of the owner of one key, by CURVE: for an invitation (`failover.config.invitation`)."""
+
+    def __init__(self, host: str, port: int, robot: str, secret: bytes, admitted: bytes) -> None:
+        """
+        Args:
+            secret, admitted: secret CURVE keys of 32 bytes: ours, and that of the one side which may connect.
+
+        Raises:
+            DriverError: the address cannot be had.
+        """
+        self._context = context()
+        self._socket = _limited(self._context.socket(zmq.ROUTER))
+        self._socket.setsockopt(zmq.HANDSHAKE_IVL, ONE_TIME_LIMIT_MS)
+        self._socket.curve_server = True
+        self._socket.curve_secretkey = z85.encode(secret)
+        self._socket.zap_domain = ZAP_DOMAIN
+        self._gate = Gate(self._context, {robot: _public(admitted).decode()})
+        try:
+            _bound(self._socket, f"tcp://{bracketed(host)}:{port or '*'}")
+        except DriverError:
+            self.close()
+            raise
+        self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+
+    @property
+    def refused(self) -> int:
+        """How many handshakes proved no knowledge of the admitted key."""
+        return self._gate.refused
+
+    def next(self, timeout_ms: int) -> tuple[bytes, bytes] | None:
+        """(whose, content) of the next message; None: nothing came, or a stranger was refused."""
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._gate.socket, zmq.POLLIN)
+        poller.poll(max(timeout_ms, 0))
+        self._gate.serve()
+        found = receive(self._socket)
+        return found[:2] if found is not None else None
+
+    def answer(self, whose: bytes, content: bytes) -> bool:
+        """Send to one who has sent; False: it is gone."""
+        return answer(self._socket, whose, content)
+
+    def close(self) -> None:
+        """Listen no more."""
+        close(self._context)
+
+
+class OneTimeWay:
+    """A way to a `OneTimeListener`."""
+
+    def __init__(self, host: str, port: int, secret: bytes, listener: bytes) -> None:
+        """
+        Args:
+            secret, listener: secret CURVE keys of 32 bytes: ours, and that of the other side.
+        """
+        self._context = context()
+        self._socket = _limited(self._context.socket(zmq.DEALER))
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        self._socket.setsockopt(zmq.HANDSHAKE_IVL, ONE_TIME_LIMIT_MS)
+        self._socket.curve_publickey = _public(secret)
+        self._socket.curve_secretkey = z85.encode(secret)
+        self._socket.curve_serverkey = _public(listener)
+        self._monitor = self._socket.get_monitor_socket(HANDSHAKE_FAILED)
+        self._socket.connect(f"tcp://{bracketed(host)}:{port}")
+
+    def await_open(self, timeout_ms: int) -> bool:
+        """Whether the handshake succeeds in the time; False at once where the other side refuses it."""
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLOUT)
+        poller.register(self._monitor, zmq.POLLIN)
+        return bool(dict(poller.poll(timeout_ms)).get(self._socket, 0) & zmq.POLLOUT)
+
+    def send(self, content: bytes) -> bool:
+        """Send; False: there is no connection."""
+        return send(self._socket, content)
+
+    def await_message(self, timeout_ms: int) -> bytes | None:
+        """What comes; None: nothing in the time."""
+        return self._socket.recv() if self._socket.poll(timeout_ms, zmq.POLLIN) else None
+
+    def close(self, linger_ms: int = 0) -> None:
+        """Let it go, after so many ms in which what was sent may leave."""
+        self._socket.disable_monitor()
+        self._monitor.close(0)
+        self._context.destroy(linger=linger_ms)
+
+
+def _public(secret: bytes) -> bytes:
+    return zmq.curve_public(z85.encode(secret))
 
 
 class Gate:

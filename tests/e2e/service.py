@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -30,7 +29,7 @@ def install(machine: Machine) -> None:
 
 def make_team(machine: Machine, **addresses: str) -> None:
     """Begin a team there, with a key for each robot."""
-    machine.run("failover", "team", "create", "lab")
+    machine.run("failover", "team", "create", "lab", "--empty")
     for robot, address in addresses.items():
         machine.run("failover", "team", "enrol", robot, address)
 
@@ -73,12 +72,23 @@ def two_robots(
         lay_cable(first, second)
         for machine in (first, second):
             install(machine)
-        make_team(first, **ADDRESSES)
-        shutil.copytree(first.root / "etc/failover/team", second.root / "etc/failover/team", dirs_exist_ok=True)
-        for machine in (first, second):
-            machine.run("systemctl", "enable", "--now", SERVICE)
+        first.run("failover", "team", "create", "lab")
+        join(first, second)
         robots.until(lambda: connected(first) and connected(second), "the robots to hear each other")
         yield first, second
+
+
+def join(first: Machine, second: Machine) -> None:
+    """Bring a machine into the other one's team, as the guide says."""
+    command = [*first.inside(), "failover", "team", "invite", second.name]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as invites:
+        try:
+            assert invites.stdout is not None
+            second.run("failover", "team", "join", invites.stdout.readline().strip())
+            _, said = invites.communicate(timeout=robots.PATIENCE_S)
+            assert invites.returncode == 0, said
+        finally:
+            invites.kill()
 
 
 def lay_cable(first: Machine, second: Machine) -> None:

@@ -63,8 +63,14 @@ def told(machine: Machine, field: str) -> str:
     return machine.run("dpkg-query", "--show", f"--showformat=${{{field}}}", "failover").stdout
 
 
+def is_enabled(machine: Machine) -> bool:
+    """Whether the service starts with the machine."""
+    return machine.run("systemctl", "is-enabled", SERVICE, check=False).stdout.strip() == "enabled"
+
+
 def test_two_clean_machines_protect_a_program_by_the_package(tmp_path: Path) -> None:
     with two_robots(tmp_path, install, Path(SYSTEM)) as (first, second):
+        assert is_enabled(first) and is_enabled(second), "create and join have enabled the service"
         protected(first, "cut")
         first.end()
         expect_it_to_go_on_at(second, "cut")

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from agent.worker.network.replication_link import new_keys
+from failover.cli import main
 from failover.config import team
 from failover.config.team import Team
 from failover.core.membership import UNREAD_NS
@@ -192,8 +193,16 @@ def test_after_its_patience_it_goes_on_and_at_reunion_the_copy_that_never_stoppe
         robots.cable(first, "up")
         expect_nothing_lost(pair, program)
         assert list((first.directory / "state" / "lost").glob("*.snapshot")), "what robot1's copy had become is kept aside"
+        assert tells_of_the_lost_copy(first)
+        assert main.main(["lost", "inspect", "count", "--state", str(first.directory / "state")]) == 0
+        assert not tells_of_the_lost_copy(first), "a person has looked"
         told = robots.failover(second, "why", "count").stdout
         assert "robot2 keeps its copy, which never stopped acting" in told, told
+
+
+def tells_of_the_lost_copy(robot: RobotMachine) -> bool:
+    """Whether its status has a note of it."""
+    return any("failover lost inspect" in note for note in robot.status()["notes"])
 
 
 @pytest.mark.compiler

@@ -11,7 +11,6 @@ from msgspec import Struct
 
 from agent.system import clock
 from agent.system.threads import to_its_end
-from agent.worker.components import lost_copies
 from agent.worker.components.component import Captured, Component
 from agent.worker.components.context import Surroundings
 from agent.worker.components.statistics import Figures
@@ -19,6 +18,7 @@ from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Unchanged, close_all, content_of
 from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
+from checkpoint.store import lost_copies
 from checkpoint.store.store import Store
 from failover.core import acts, events
 
@@ -81,7 +81,7 @@ class Snapshots(Struct, frozen=True):
             content = content_of(captured.snapshot)
         finally:
             os.close(captured.snapshot)
-        directory = self.around.places.logs.parent / "lost"
+        directory = self.around.places.logs.parent / lost_copies.FOLDER
         path = await asyncio.to_thread(lost_copies.keep, directory, self.name, act.epoch, content)
         log.warning("%s: the copy that lost is kept for inspection in %s: %s", self.name, path, act.reason)
         return path

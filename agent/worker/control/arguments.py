@@ -9,6 +9,7 @@ import msgspec
 from agent.errors import RefusedError
 from checkpoint.arch import EVERY_LEVEL
 from failover.config.choices import misfit
+from failover.config.team import Robot
 
 SIGNAL_MAX: Final = 64
 """The last real-time signal. Source: signal(7)."""
@@ -195,3 +196,27 @@ class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     stream: int
     offset: Offset
+
+
+class TeamArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``team``."""
+
+    act: Literal["add", "remove"]
+    robot: str
+    member: Robot | None = None
+
+
+class TakenTeam(msgspec.Struct):
+    """A team as one robot tells another. See `failover.config.team.Team`.
+
+    Attributes:
+        proposer, have: where a grant is asked: by whom, and the change that it has now.
+    """
+
+    team: str
+    change: int
+    robots: dict[str, Robot]
+    proposer: str = ""
+    have: int = 0
+    next_seat: int = 0
+    former: dict[str, Robot] = {}

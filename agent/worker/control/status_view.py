@@ -21,7 +21,7 @@ from agent.worker.network.replication_link import LinkState, PeerConnection
 from checkpoint.device_rules import merged, missing
 from checkpoint.engine import COOPERATIVE, PTRACE
 from failover.core.frames.terms import SlotsView
-from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State
+from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State, StatusView
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
     from agent.worker.components.statistics import Commits, Figures, Memory
@@ -101,7 +101,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "notes": notes,
         "links": ours.interfaces,
         "media": [_medium(one) for one in told.media],
-        "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in (view.peers if view else ())],
+        "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in _members(view, settings)],
         "components": [
             _component(one, ours.supervisors.get(one.name), settings, ours.store) for one in (view.components if view else ())
         ],
@@ -125,6 +125,11 @@ def _descriptors(pid: int) -> int | None:
         return len(os.listdir(f"/proc/{pid}/fd"))
     except OSError:
         return None
+
+
+def _members(view: StatusView | None, settings: Settings) -> list[PeerView]:
+    """The peers, without those of which one process has heard already that they left."""
+    return [peer for peer in view.peers if peer.robot in settings.team.robots] if view else []
 
 
 def _medium(view: MediumView) -> dict[str, Any]:

@@ -50,14 +50,21 @@ class AllConnections:
         self._beat_keys: dict[str, bytes] = {}
         self._their_keys: dict[tuple[int, str], bytes] = {}
         self._all: list[ReplicationLink] = []
-        name = settings.config.robot
-        bulks = {peer: robot.bulk for peer, robot in settings.peers.items()}
-        tell = Callbacks(functools.partial(heard, BULK), functools.partial(changed, BULK), unread)
-        self.bulk = ReplicationLink(name, settings.me.bulk, bulks, keys, tell, links)
+        self._name, self._tell = settings.config.robot, (heard, changed, unread)
+        self._further: dict[str, ReplicationLink] = {}
+        self.bulk = ReplicationLink(self._name, settings.me.bulk, _bulks(settings), keys, self._callbacks(BULK), links)
         self._all.append(self.bulk)
-        for way, (bind, peers) in enumerate(further_links(settings), start=1):
-            tell = Callbacks(functools.partial(heard, way), functools.partial(changed, way), unread)
-            self._all.append(ReplicationLink(name, bind, peers, keys, tell))
+        for bind, peers in further_links(settings):
+            self._add(bind, peers, keys)
+
+    def _callbacks(self, way: int) -> Callbacks:
+        heard, changed, unread = self._tell
+        return Callbacks(functools.partial(heard, way), functools.partial(changed, way), unread)
+
+    def _add(self, bind: str, peers: dict[str, str], keys: Keys) -> ReplicationLink:
+        link = self._further[bind] = ReplicationLink(self._name, bind, peers, keys, self._callbacks(len(self._all)))
+        self._all.append(link)
+        return link
 
     def open(self) -> None:
         """Listen on every link. A further link that cannot be had is done without, and said.
@@ -65,14 +72,32 @@ class AllConnections:
         Raises:
             LaneError: the replication link's address cannot be had.
         """
-        for way, link in enumerate(self._all):
-            try:
-                link.open()
-            except LaneError as error:
-                if way == BULK:
-                    raise
-                self.troubles.append(f"orders cannot use a further link: {error}")
-                log.warning("%s", self.troubles[-1])
+        self.bulk.open()
+        for link in self._further.values():
+            self._open_further(link)
+
+    def _open_further(self, link: ReplicationLink) -> None:
+        try:
+            link.open()
+        except LaneError as error:
+            self.troubles.append(f"orders cannot use a further link: {error}")
+            log.warning("%s", self.troubles[-1])
+
+    async def change(self, settings: Settings, keys: Keys) -> None:
+        """Go on with these members.
+
+        Raises:
+            LaneError: the replication link's address cannot be had any more.
+        """
+        former = set(self._beat_keys) - set(settings.peers)
+        self._beat_keys = {peer: key for peer, key in self._beat_keys.items() if peer not in former}
+        self._their_keys = {ways: key for ways, key in self._their_keys.items() if ways[1] not in former}
+        await self.bulk.change(_bulks(settings), keys)
+        there = dict(further_links(settings))
+        for bind, link in self._further.items():
+            await link.change(there.pop(bind, {}), keys)
+        for bind, peers in there.items():
+            self._open_further(self._add(bind, peers, keys))
 
     async def close(self) -> None:
         """Close every connection."""
@@ -90,7 +115,8 @@ class AllConnections:
 
     def refuse(self, way: int, peer: str, reason: str) -> None:
         """Talk no further with this peer there until it connects anew."""
-        self._all[way].links[peer].refuse(reason)
+        if peer in self._all[way].links:
+            self._all[way].links[peer].refuse(reason)
 
     def carried_words(self, way: int, peer: str, state: LinkState) -> bool:
         """Called at each change of a connection: whether words to the peer took this way until now, and may be lost with it."""
@@ -127,6 +153,11 @@ class AllConnections:
         known = self._their_keys.get((way, peer))
         self._their_keys[way, peer] = key
         return known != key
+
+
+def _bulks(settings: Settings) -> dict[str, str]:
+    """A robot that was taken out is connected to as well: it may not have heard of it."""
+    return {peer: robot.bulk for peer, robot in (*settings.former.items(), *settings.peers.items())}
 
 
 def further_links(settings: Settings) -> list[tuple[str, dict[str, str]]]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 import msgspec
@@ -33,11 +34,20 @@ CONTENT_MAX: Final = CHUNK_SIZE_MAX
 Order = Callable[[dict[str, Any], int], Awaitable[dict[str, Any]]]
 """Carries one verb out on this robot: its arguments, the uid of the user who gave it → its result."""
 
+OrderOfPeer = Callable[[str, dict[str, Any]], Awaitable[dict[str, Any]]]
+"""The same for one that counts as the robot's own, whoever its user is: the robot that gives it, its arguments → its result."""
+
 
 class Errands:
     """Both ends: orders sent from here, and orders that came from others. Lives in the worker's loop."""
 
-    def __init__(self, say: Callable[[str, Bulk], object], hindrance: Callable[[str], str], orders: dict[str, Order]) -> None:
+    def __init__(
+        self,
+        say: Callable[[str, Bulk], object],
+        hindrance: Callable[[str], str],
+        orders: dict[str, Order],
+        of_peers: Mapping[str, OrderOfPeer] = MappingProxyType({}),
+    ) -> None:
         """
         Args:
             hindrance: why nothing can be said to a peer now; "" when it can.
@@ -46,6 +56,7 @@ class Errands:
         self._say = say
         self._hindrance = hindrance
         self._orders = orders
+        self._of_peers = of_peers
         self._numbers = itertools.count(1)
         self._waiting: dict[tuple[str, int], asyncio.Future[ErrandDone]] = {}
         self._under_way: dict[str, set[asyncio.Task[None]]] = {}
@@ -115,10 +126,7 @@ class Errands:
 
     async def _carry_out(self, peer: str, message: Errand) -> None:
         try:
-            order = self._orders.get(message.verb)
-            if order is None:
-                raise RefusedError(f"no order {message.verb!r} can be given from another robot")
-            done = ErrandDone(message.number, msgspec.msgpack.encode(await order(_arguments(message), message.by)))
+            done = ErrandDone(message.number, msgspec.msgpack.encode(await self._result(peer, message)))
         except RefusedError as refusal:
             done = ErrandDone(message.number, b"", str(refusal), refusal.kind, tuple(refusal.reasons))
         except (*TROUBLE, FailoverError) as trouble:
@@ -126,6 +134,13 @@ class Errands:
         if len(done.content) > CONTENT_MAX:
             done = ErrandDone(message.number, b"", f"its answer of {len(done.content)} bytes is too long to travel; ask there")
         self._say(peer, done)
+
+    async def _result(self, peer: str, message: Errand) -> dict[str, Any]:
+        if message.verb in self._of_peers:
+            return await self._of_peers[message.verb](peer, _arguments(message))
+        if message.verb not in self._orders:
+            raise RefusedError(f"no order {message.verb!r} can be given from another robot")
+        return await self._orders[message.verb](_arguments(message), message.by)
 
 
 def _arguments(message: Errand) -> dict[str, Any]:

@@ -329,6 +329,26 @@ class ReplicationLink:
         self._mismatch: dict[str, str] = {}
         self._misunderstood: Counter[str] = Counter()
         self._arrivals = Arrivals(split_address(bind, "bulk address")[1], self._hosts())
+        self._owners = _owners(keys)
+
+    async def change(self, peers: Mapping[str, str], keys: Keys) -> None:
+        """Go on with these peers: who has left is refused from now on, who has come is connected to."""
+        before, self._peers = self._peers, peers
+        former, self._keys = self._keys, keys
+        self._owners = _owners(keys)
+        self._arrivals.expect(self._hosts())
+        for peer, link in list(self.links.items()):
+            if (peers.get(peer), keys.peers.get(peer)) != (before.get(peer), former.peers.get(peer)):
+                self.links.pop(peer, None)
+                await link.close()
+                self._mismatch.pop(peer, None)
+                self._callbacks.changed(peer, LinkState.DOWN, "its entry in the team has changed")
+        if self._router is None:
+            return
+        for peer in peers:
+            if peer not in self.links:
+                self._connect(peer)
+        await self.hold_to_devices()
 
     def open(self) -> None:
         """Listen, and begin to connect to all peers.
@@ -393,10 +413,11 @@ class ReplicationLink:
         if self._router is not None and wanted not in (None, self._listening):
             await self._listen_anew(self._router)
         for peer, link in list(self.links.items()):
-            if self._device_to(peer) not in (None, link.device):
+            if peer in self._peers and self._device_to(peer) not in (None, link.device):
                 await link.close()
                 self._callbacks.changed(peer, LinkState.CONNECTING, "its interface is another one now")
-                self._connect(peer)
+                if peer in self._peers:
+                    self._connect(peer)
 
     async def _listen_anew(self, router: zmq.asyncio.Socket) -> None:
         """ZeroMQ lets an address go some time after it was told to."""
@@ -420,10 +441,12 @@ class ReplicationLink:
 
     def say(self, peer: str, message: Bulk) -> bool:
         """Queue a small message to a peer; False: it is not connected, the message was dropped."""
-        return self.links[peer].say(message)
+        return peer in self.links and self.links[peer].say(message)
 
     async def ship(self, peer: str, chunk: Chunk) -> None:
         """Send one chunk; see `PeerConnection.ship`."""
+        if peer not in self.links:
+            raise LaneError(f"{peer} has left the team")
         await self.links[peer].ship(chunk)
 
     def troubles(self) -> list[str]:
@@ -490,11 +513,10 @@ class ReplicationLink:
 
     async def _admit(self, gate: zmq.asyncio.Socket) -> None:
         """Answer ZeroMQ's question which peer may connect: the owners of the team's keys, by name."""
-        owners = {z85.decode(key.encode()): name for name, key in self._keys.peers.items() if key}
         try:
             while True:
                 version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
-                owner = owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
+                owner = self._owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
                 if owner is None:
                     self._refuse(address.decode(errors="replace"), credentials)
                 else:
@@ -524,6 +546,11 @@ class ReplicationLink:
         if stranger != self._stranger:
             log.warning("refused a key that is not in team.toml on the replication link: %s", stranger)
         self._stranger = stranger
+
+
+def _owners(keys: Keys) -> dict[bytes, str]:
+    """Public key → whose it is."""
+    return {z85.decode(key.encode()): name for name, key in keys.peers.items() if key}
 
 
 def _limits(socket: zmq.asyncio.Socket) -> None:

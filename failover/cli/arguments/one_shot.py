@@ -41,6 +41,11 @@ def capture(room: argparse.ArgumentParser) -> None:
 def restore(room: argparse.ArgumentParser) -> None:
     """Of ``failover restore``."""
     room.add_argument("file", metavar="FILE", help="a snapshot made by failover capture")
+    add_restore_options(room)
+
+
+def add_restore_options(room: argparse.ArgumentParser) -> None:
+    """How a program is started from a snapshot's file."""
     room.add_argument("--wait", action="store_true", help="stay until the program ends, and pass on its exit status")
     room.add_argument(
         "--trust",

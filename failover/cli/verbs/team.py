@@ -1,30 +1,96 @@
-"""team create, enrol, show: the members of the team, and the key by which each robot is known."""
+"""team create, enrol, remove, list, show: the members of the team, and the key by which each robot is known."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import socket
-import tomllib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from failover.cli import key_pairs
+import msgspec
+
+from failover.cli import agent_service, key_pairs
+from failover.cli.connection import connect
 from failover.cli.output import render
-from failover.config import team
-from failover.config.team import DEFAULT_BEAT_PORT, DEFAULT_BULK_PORT, Robot, Team
-from failover.errors import TeamFileError
+from failover.config import addresses, team
+from failover.config.team import DEFAULT_BEAT_PORT, DEFAULT_BULK_PORT, Robot, Role, Team
+from failover.errors import NoAgentError, TeamFileError
 
 
 def create(arguments: argparse.Namespace) -> int:
-    """Begin a team: a directory with a team file that has no member yet."""
+    """Begin a team with this machine as its first robot; or, ``--empty``, with no member yet."""
     directory = Path(arguments.directory)
     path = directory / team.TEAM_FILE
     if path.exists():
-        raise TeamFileError(f"{path} exists; remove it to begin anew, or enrol robots into it with failover team enrol")
-    _write(directory, Team(arguments.name))
-    return _tell(
-        arguments, {"team": arguments.name, "file": str(path)}, f"{path}: team {arguments.name}; next: failover team enrol"
-    )
+        raise TeamFileError(
+            f"{path} exists: this machine has a team; failover team invite brings another robot into it, and to begin anew, "
+            f"remove {directory}"
+        )
+    if arguments.empty:
+        _write(directory, Team(arguments.name))
+        told = {"team": arguments.name, "file": str(path)}
+        return _tell(arguments, told, f"{path}: team {arguments.name}; next: failover team enrol")
+    robot = arguments.robot or agent_service.own_name(directory)
+    agent_service.check_name(directory, robot)
+    public, secret = key_pairs.new_pair()
+    member = member_of(robot, arguments.address or [addresses.usual_address()], arguments.bulk, "robot", public)
+    begun = team.enrol(Team(arguments.name), robot, member)
+    team.write_secret_key(directory, robot, secret)
+    try:
+        _write(directory, begun)
+        agent_service.name_robot(directory, robot)
+    except TeamFileError:
+        team.forget_secret_key(directory, robot)
+        path.unlink(missing_ok=True)
+        raise
+    service = agent_service.start(directory) if arguments.start else agent_service.NOT_STARTED
+    answer = {"team": arguments.name, "file": str(path), "robot": robot, "beats": member.beats, "service": service}
+    sentence = f"team {arguments.name}: this machine is {robot} at {member.beats[0]}; {service}; failover team invite ROBOT"
+    return _tell(arguments, answer, sentence)
+
+
+def member_of(name: str, hosts: Sequence[str], bulk: str | None, role: Role, public: str) -> Robot:
+    """This machine as a member at these addresses; ports are the usual ones where they are left out.
+
+    Raises:
+        TeamFileError: an address cannot be right.
+    """
+    beats = tuple(_with_port(host, DEFAULT_BEAT_PORT) for host in hosts)
+    member = Robot(beats, _bulk_of(bulk, beats, hosts), role, public)
+    team.check_robot("this machine", name, member)
+    addresses.check_addresses(name, member, {})
+    addresses.check_own(name, member)
+    return member
+
+
+def _bulk_of(bulk: str | None, beats: Sequence[str], hosts: Sequence[str]) -> str:
+    """Where snapshots come: as said; else at the first host, at the usual port, or one above a port that was named."""
+    if bulk:
+        return _with_port(bulk, DEFAULT_BULK_PORT)
+    host, port = team.split_address(beats[0], "beat address")
+    named = _with_port(hosts[0], DEFAULT_BEAT_PORT) == hosts[0]
+    return _with_port(f"[{host}]" if ":" in host else host, port + 1 if named else DEFAULT_BULK_PORT)
+
+
+def change_by_agent(arguments: argparse.Namespace, act: str, robot: str, member: Robot | None = None) -> dict[str, Any]:
+    """Have this robot's agent change the team, which asks the other members.
+
+    Raises:
+        NoAgentError: none runs.
+        AgentRefusedError: it, or another member, says no.
+    """
+    told = {"member": msgspec.to_builtins(member)} if member is not None else {}
+    with connect(arguments) as control:
+        return control.ask("team", act=act, robot=robot, **told)
+
+
+def remove(arguments: argparse.Namespace) -> int:
+    """Take a member out: its frames, its replication link and its votes count at no robot any more."""
+    answer = change_by_agent(arguments, "remove", arguments.name)
+    later = f"; {', '.join(answer['waiting'])} will hear of it when they are back" if answer["waiting"] else ""
+    sentence = f"{arguments.name} is out of team {answer['team']}; there: systemctl disable --now failover-agent{later}"
+    return _tell(arguments, {**answer, "removed": arguments.name}, sentence)
 
 
 def enrol(arguments: argparse.Namespace) -> int:
@@ -37,6 +103,7 @@ def enrol(arguments: argparse.Namespace) -> int:
         )
     beats = tuple(_with_port(address, DEFAULT_BEAT_PORT) for address in arguments.address)
     bulk = _with_port(arguments.bulk or beats[0].rpartition(":")[0], DEFAULT_BULK_PORT)
+    addresses.check_addresses(arguments.name, Robot(beats, bulk), members.robots)
     public, secret = (arguments.public_key, "") if arguments.public_key else key_pairs.new_pair()
     role = arguments.role or (members.robots[arguments.name].role if arguments.name in members.robots else "robot")
     enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public))
@@ -61,20 +128,30 @@ def _place_of(key: Path, name: str, member: Robot, directory: Path) -> str:
 
 def _is_here(name: str, member: Robot, directory: Path) -> bool:
     """Whether this machine is known to be that member: agent.toml beside the team says so, or one of its addresses is ours."""
-    with contextlib.suppress(OSError, ValueError):
-        if tomllib.loads((directory.resolve().parent / "agent.toml").read_text()).get("robot") == name:
-            return True
-    return any(_is_ours(team.split_address(address, name)[0]) for address in member.beats)
+    if agent_service.said_name(directory.resolve()) == name:
+        return True
+    return any(addresses.is_ours(team.split_address(address, name)[0]) for address in member.beats)
 
 
-def _is_ours(host: str) -> bool:
-    """Whether a number is an address of this machine; a name is not looked up, for that can take its time."""
-    with contextlib.suppress(OSError, ValueError):
-        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.bind(address)
-            return True
-    return False
+def members_now(arguments: argparse.Namespace) -> int:
+    """List the members, and how this robot's agent sees each of them."""
+    directory = Path(arguments.directory)
+    members, me = team.read(directory), agent_service.own_name(directory)
+    status: dict[str, Any] = {}
+    with contextlib.suppress(NoAgentError), connect(arguments) as control:
+        status = control.ask("status")
+    states = {peer["name"]: peer["state"] for peer in status.get("peers", ())} | ({status["robot"]: "here"} if status else {})
+    order = members.roster().names
+    seen = {name: states.get(name, "not known" if status else "no agent here") for name in order}
+    if arguments.json:
+        robots = {name: {**msgspec.to_builtins(members.robots[name]), "state": seen[name]} for name in order}
+        render.as_json({"team": members.team, "change": members.change, "robot": me, "robots": robots})
+        return 0
+    print(f"team {members.team}: {len(order)} members")
+    lines = [(name, members.robots[name].role, seen[name], " ".join(members.robots[name].beats)) for name in order]
+    if lines:
+        render.table(("robot", "role", "state", "addresses"), lines)
+    return 0
 
 
 def show(arguments: argparse.Namespace) -> int:

@@ -43,6 +43,19 @@ def watch(component: Component, turn: Turn) -> None:
         component.stood = component.ordered = False
 
 
+def forget_former(component: Component, turn: Turn) -> None:
+    """A member that was taken out is entrusted with nothing any more, once it cannot act on what it heard.
+
+    Under ``freeze`` the program would stand still for good: taking it out was a person's word that it is lost.
+    """
+    former = [one for one in component.entrusted if one != turn.me and one not in turn.team.peers and turn.dead(one)]
+    if component.holding and former:
+        component.entrusted = tuple(one for one in component.entrusted if one not in former)
+        turn.say(component, f"{', '.join(former)} has left the team, and is entrusted with it no more")
+    if component.holding and component.standby in former:
+        component.standby = ""
+
+
 def may_act(component: Component, turn: Turn) -> bool:
     """Whether a program that is started now may act: by its lease, and by what the robots entrusted with it say."""
     return not on_lease(component, turn) or _may_thaw(component, turn)

@@ -44,7 +44,7 @@ def is_free(component: Component, turn: Turn) -> bool:
         return True
     peer = turn.team.peers.get(primary)
     if peer is None:
-        return turn.team.rested(turn.now_ns)
+        return turn.dead(primary) and turn.team.rested(turn.now_ns)
     if turn.gone(primary):
         return True
     entry = peer.entry(component.name)

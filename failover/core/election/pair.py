@@ -109,6 +109,8 @@ def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> boo
         is_ordered: an operator says so of robots whose packets cannot be authenticated.
     """
     is_doubtful = False
+    if component.primary not in ("", turn.me) and component.primary not in turn.team.peers and not turn.dead(component.primary):
+        return False  # it was taken out of the team, and may act until the lease that it had here is over
     for robot, peer in turn.team.peers.items():
         if turn.gone(robot) or (is_ordered and turn.team.keeps_waiting(robot, turn.now_ns)):
             continue
@@ -216,8 +218,7 @@ def entrust_holder(component: Component, turn: Turn) -> None:
 
 def generation_of(component: Component, turn: Turn) -> int:
     """Of this robot's primacy under the component's epoch."""
-    names = sorted((turn.me, *turn.config.peers), key=weight)
-    return component.epoch * (PEERS_MAX + 1) + names.index(turn.me)
+    return component.epoch * (PEERS_MAX + 1) + turn.config.place
 
 
 def open_line(component: Component, turn: Turn) -> None:

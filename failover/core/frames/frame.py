@@ -435,6 +435,16 @@ class Receiver:
             known = self._senders[tag] = _Sender(sender, rank, range(place, place + 1), _Window())
         known.keys = (key, *[one for one in known.keys if one != key])[:KEYS_PER_SENDER]
 
+    def changed(self, team: str, me: str, roster: Roster) -> Receiver:
+        """The same for another roster: senders that stay keep their keys, and what was seen of them."""
+        other = Receiver(me, team, roster)
+        for sender in self._senders.values():
+            if sender.name in roster.ranks:
+                for key in reversed(sender.keys):
+                    other.accept(sender.name, key)
+                other._senders[name_tag(sender.name)].window = sender.window
+        return other
+
     def open(self, datagram: bytes) -> Part | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes."""
         if not HEADER.size + SEAL_SIZE < len(datagram) <= FRAME_SIZE_MAX:

@@ -92,6 +92,7 @@ class FrameLane:
         self, me: str, team: str, roster: Roster, boot: int, round_us: int, medium: int = 0, *, bounds_ways: bool = True
     ) -> None:
         self._me, self._rank, self._boot, self._medium = me, roster.ranks[me], boot, medium
+        self._team, self._roster = team, roster
         self._round_us, self._bounds_ways = round_us, bounds_ways
         self._others = tuple(name for name in roster.names if name != me)
         self._sealer = Sealer(me, team, roster, boot)
@@ -104,6 +105,22 @@ class FrameLane:
         self._echo_from = 0
         self.assembly = Assembly()
         self.casts: Casts | None = None
+
+    def changed(self, roster: Roster) -> FrameLane:
+        """The same life in another team: parts are counted on, and what is known of members that stay is kept.
+
+        Its `casts` are None: ranks have changed, and who hears casts is found out anew.
+        """
+        other = FrameLane(self._me, self._team, roster, self._boot, self._round_us, self._medium, bounds_ways=self._bounds_ways)
+        other._sealer.counter = self._sealer.counter
+        other._receiver = self._receiver.changed(self._team, self._me, roster)
+        other._keys = {peer: key for peer, key in self._keys.items() if peer in other._others}
+        other._shares = other._shared()
+        other._left, other.assembly = self._left, self.assembly
+        for name, rank in self._roster.ranks.items():
+            if name in other._others:
+                other._peers[roster.ranks[name]] = self._peers[rank]
+        return other
 
     @property
     def is_shared(self) -> bool:

@@ -11,6 +11,7 @@ from typing import Final
 
 from failover.core.frames.frame import KEYS_PER_SENDER, MAGIC, VERSION, Reason, Refused
 from failover.core.frames.lane import FrameLane, Heard
+from failover.core.frames.roster import Roster
 
 MEDIA_MAX: Final = 8
 """Media with slots: more links than a robot has."""
@@ -50,6 +51,13 @@ class FrameLanes:
                 for key in keys:
                     lane.hear(peer, key)
         return self._lanes[medium]
+
+    def change(self, roster: Roster, make: Callable[[int], FrameLane]) -> None:
+        """Go on with these members. Args: make: a new lane of a medium, for them."""
+        self._make = make
+        self._spoken = {peer: key for peer, key in self._spoken.items() if peer in roster.ranks}
+        self._heard = {peer: keys for peer, keys in self._heard.items() if peer in roster.ranks}
+        self._lanes = {medium: lane.changed(roster) for medium, lane in self._lanes.items()}
 
     def speak(self, peer: str, key: bytes) -> None:
         """The peer knows now that we seal with this key."""

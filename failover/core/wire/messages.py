@@ -145,6 +145,7 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
         boot: start count of the sender's agent.
         beat_key: random bytes of this life; the sender's beats to this receiver are sealed with it from now on.
         again: on a connection that stands, because the receiver has begun anew; what is under way on it goes on.
+        change, members: how often failover has changed the sender's team, and a digest of who belongs to it.
     """
 
     version: int
@@ -153,6 +154,8 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
     boot: int
     beat_key: bytes = b""
     again: bool = False
+    change: int = 0
+    members: int = 0
 
 
 class Goodbye(msgspec.Struct, frozen=True, tag="goodbye"):

@@ -9,17 +9,18 @@ from typing import Any
 import pytest
 
 from agent import config as configuration
-from agent.main_loop.messages import Happened, Inventory, ToMainLoop, ToWorker, event_of
+from agent.main_loop.messages import Happened, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
+from agent.worker.team_changes import TEAM_IS
 from agent.worker.witness import Witness
 from checkpoint.keeper.messages import Channel, pair
 from checkpoint.model import Position
-from failover.config import team
+from failover.config import members, team
 from failover.config.team import Robot, Team
 from failover.core.events import Exited
 from failover.core.types import ComponentSpec, Found
-from failover.core.wire.messages import Errand, ErrandDone, Offer, Refuse
+from failover.core.wire.messages import VERSION, Errand, ErrandDone, Goodbye, Hello, Offer, Refuse
 
 OFFER = Offer(7, "/lab/a", 1, Position(64, 1, b"d"), None, 10, b"x", ComponentSpec("/lab/a"))
 
@@ -96,8 +97,61 @@ def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(sett
                 await asyncio.sleep(0)
             speaking.cancel()
             main_loop = Channel(theirs, ToMainLoop)
-            return [main_loop.receive()[0] for _ in range(3)]
+            return [main_loop.receive()[0] for _ in range(4)]
 
-    inventory, *later = asyncio.run(first_words())
+    members, inventory, *later = asyncio.run(first_words())
+    assert members == TeamIs(settings.team.robots)
     assert isinstance(inventory, Inventory) and inventory.found == (found,)
     assert [event_of(message) for message in later if isinstance(message, Happened)] == [end, end]
+
+
+# --- Robots that are no members any more ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shrunk(settings: configuration.Settings) -> configuration.Settings:
+    """The same, after robot2 was taken out."""
+    return settings.with_team(members.left(settings.team, "robot2", "robot1"))
+
+
+@pytest.mark.parametrize("message", [OFFER, Errand(3, "stop", b"\x80", 0), Errand(3, "team_taken", b"\x80", 0), Goodbye("x")])
+def test_nothing_that_a_former_member_or_a_stranger_says_counts(
+    shrunk: configuration.Settings, message: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may have been under way when the team changed."""
+    assert heard(shrunk, "robot2", message, monkeypatch) == []
+    assert heard(shrunk, "nobody", message, monkeypatch) == []
+
+
+def test_a_former_member_may_ask_which_team_there_is(shrunk: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    question = Errand(3, TEAM_IS, b"\x80", 0)
+    assert heard(shrunk, "robot2", question, monkeypatch) == [question]
+    assert heard(shrunk, "nobody", question, monkeypatch) == []
+
+
+def test_a_former_member_that_greets_is_told(shrunk: configuration.Settings) -> None:
+    async def greet() -> dict[str, int]:
+        ours, theirs = pair()
+        with ours, theirs:
+            worker = Worker(shrunk, Channel(ours, ToWorker))
+            worker._hear(BULK, "robot2", Hello(VERSION, "another", "robot2", 1, b"k" * 32))
+            assert not worker.team_changes._behind
+            worker._hear(BULK, "robot2", Hello(VERSION, "lab", "robot2", 1, b"k" * 32))
+            return worker.team_changes._behind
+
+    assert asyncio.run(greet()) == {"robot2": 0}
+
+
+def test_a_former_member_is_admitted_and_connected_to(shrunk: configuration.Settings) -> None:
+    async def known() -> tuple[set[str], set[str]]:
+        ours, theirs = pair()
+        with ours, theirs:
+            worker = Worker(shrunk, Channel(ours, ToWorker))
+            return set(worker._replication_link._peers), set(worker.settings.peers)
+
+    assert asyncio.run(known()) == ({"gate", "robot2"}, {"gate"})
+
+
+def test_a_witness_may_pass_a_change_of_the_team_on(settings: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    order = Errand(3, "team_taken", b"\x80", 0)
+    assert heard(settings, "gate", order, monkeypatch) == [order]

@@ -26,7 +26,10 @@ UNDER_AN_AGENT = {
 }
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")
-TEAMS = (["show"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"], ["create", "x", "--directory", "/proc/1/team"])
+TEAMS = (
+    *(["show"], ["list"], ["invite", "r"], ["join", "junk"], ["enrol", "a/b", "h"], ["enrol", "r", "h:99999"]),
+    *(["create", "x", "--directory", "/proc/1/team"], ["create", "x", "--empty", "--directory", "/proc/1/team"]),
+)
 BOARDS = (
     [],
     ["get", "ball"],
@@ -74,6 +77,7 @@ PAGES = (
 USAGE = (
     *(["bogus"], [], ["status", "--bogus"], ["status", "--every-ms", "x"], ["completion", "x"], ["team"]),
     ["stop", "x", "--signal", "?"],
+    *(["team", "invite", "x", "--port", port] for port in ("-1", "65536", "x")),
     *(["board", "record", "x", *rest] for rest in (["--rate", "0"], ["--rate", "2000"], ["--for", "soon"], ["--max-size", "9"])),
     *(["board", "serve", "--foxglove", port] for port in ("-1", "65536", "x")),
     *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
@@ -101,7 +105,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        with_acts = verb in (("team",), ("board",), ("task",), ("rights",), ("program",))
+        with_acts = verb in (("team",), ("board",), ("task",), ("rights",), ("program",), ("lost",))
         statuses.append(main.main([*argv, *asked] if with_acts else [*verb, *asked, *rest]))
         said = capsys.readouterr()
         if asked:
@@ -140,6 +144,10 @@ def test_with_a_process_that_cannot_be_captured(capsys: pytest.CaptureFixture[st
 def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     directory = [] if "--directory" in act else ["--directory", "directory"]
     assert told(capsys, "team", *act, *directory) == main.FAILED
+
+
+def test_without_an_agent_no_member_leaves(capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "team", "remove", "r", "--socket", "nowhere") == main.NO_AGENT
 
 
 @pytest.mark.parametrize("at", ["nowhere", "directory", "junk"])
@@ -202,6 +210,12 @@ def test_with_a_page_that_may_not_be_served(options: list[str], capsys: pytest.C
     assert told(capsys, "page", *options) == main.FAILED
 
 
+@pytest.mark.parametrize("act", ["inspect", "restore", "remove"])
+def test_with_copies_that_lost_and_are_not_there(act: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for at in ("nowhere", "directory", "junk"):
+        assert told(capsys, "lost", act, "mapper", "--state", at) == main.FAILED
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -212,6 +226,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"page", "ps", "task", "trace", "wait-activation", "rights", "program"}
+    without |= {"page", "ps", "task", "trace", "wait-activation", "rights", "program", "lost"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}

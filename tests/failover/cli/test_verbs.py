@@ -365,7 +365,7 @@ def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> Non
         ),
         ("protect 1 --connections cary", "'cary' is none of reset, carry, refuse; did you mean 'carry'?"),
         ("stop x --signal TREM", "did you mean 'TERM'?"),
-        ("team shwo", "'shwo' is none of create, enrol, show; did you mean 'show'?"),
+        ("team shwo", "'shwo' is none of create, invite, join, list, remove, enrol, show; did you mean 'show'?"),
         ("team enrol x 192.0.2.1 --role servr", "'servr' is none of robot, server, witness; did you mean 'server'?"),
         ("completion zhs", "'zhs' is none of bash, zsh, tcsh; did you mean 'zsh'?"),
         ("logs x --stream 3", "3 is none of 1, 2"),
@@ -424,9 +424,11 @@ KEY = "a" * 40
 
 def test_a_team_is_created_enrolled_into_and_shown(tmp_path: Path) -> None:
     place = ["--directory", str(tmp_path)]
-    assert failover("team", "create", "lab", *place).returncode == 0
+    assert failover("team", "create", "lab", "--empty", *place).returncode == 0
     assert failover("team", "enrol", "robot1", "10.0.0.1", "10.1.0.1:9", "--public-key", KEY, *place).returncode == 0
-    assert failover("team", "enrol", "robot2", "fe80::1", "--public-key", KEY, *place).returncode == 0
+    ran = failover("team", "enrol", "robot2", "fe80::1", "--public-key", KEY, *place)
+    assert ran.returncode == 1 and "robot2 and robot1 have the same public key" in ran.stderr
+    assert failover("team", "enrol", "robot2", "fe80::1", "--public-key", "b" * 40, *place).returncode == 0
     shown = json.loads(failover("team", "show", "--json", *place).stdout)
     assert shown["team"] == "lab"
     assert shown["robots"]["robot1"] == {
@@ -437,7 +439,7 @@ def test_a_team_is_created_enrolled_into_and_shown(tmp_path: Path) -> None:
 
 def test_servers_and_witnesses_are_enrolled_and_stay_what_they_are(tmp_path: Path) -> None:
     place = ["--directory", str(tmp_path), "--json"]
-    failover("team", "create", "lab", *place)
+    failover("team", "create", "lab", "--empty", *place)
     ran = failover("team", "enrol", "hall", "10.0.0.1", "--role", "server", "--public-key", KEY, *place)
     assert json.loads(ran.stdout)["role"] == "server"
     assert failover("team", "enrol", "gate", "10.0.0.2", "--role", "witness", *place).returncode == 0
@@ -455,11 +457,13 @@ def enrolled(place: Path, name: str, address: str) -> str:
 
 def test_a_robot_that_is_enrolled_on_itself_is_told_to_keep_its_key(tmp_path: Path) -> None:
     place = tmp_path / "team"
-    failover("team", "create", "lab", "--directory", str(place))
+    failover("team", "create", "lab", "--empty", "--directory", str(place))
+    alone = tmp_path / "alone"
+    failover("team", "create", "lab", "--empty", "--directory", str(alone))
     (tmp_path / "agent.toml").write_text('robot = "r1"\n')
-    by_name, by_address = enrolled(place, "r1", "192.0.2.11"), enrolled(place, "r2", "127.0.0.1:7420")
-    for said, key in ((by_name, "r1.secret"), (by_address, "r2.secret")):
-        assert "its secret key stays here" in said and str(place / "keys" / key) in said and "remove" not in said
+    by_name, by_address = enrolled(place, "r1", "192.0.2.11"), enrolled(alone, "r2", "127.0.0.1:7420")
+    for said, key in ((by_name, place / "keys" / "r1.secret"), (by_address, alone / "keys" / "r2.secret")):
+        assert "its secret key stays here" in said and str(key) in said and "remove" not in said
     for name, address in (("r3", "192.0.2.13"), ("r4", "robot4.example")):
         said = enrolled(place, name, address)
         assert f"if this machine is not {name}, copy {place / 'keys' / name}.secret to {name} alone, then remove it here" in said
@@ -467,10 +471,10 @@ def test_a_robot_that_is_enrolled_on_itself_is_told_to_keep_its_key(tmp_path: Pa
 
 def test_nothing_advises_to_delete_a_key_that_is_there(tmp_path: Path) -> None:
     place = ["--directory", str(tmp_path)]
-    failover("team", "create", "lab", *place)
+    failover("team", "create", "lab", "--empty", *place)
     enrolled(tmp_path, "r1", "127.0.0.1")
     (tmp_path / "team.toml").unlink()
-    failover("team", "create", "lab", *place)
+    failover("team", "create", "lab", "--empty", *place)
     ran = failover("team", "enrol", "r1", "127.0.0.1", *place)
     assert ran.returncode == 1 and "r1.secret exists" in ran.stderr and "emove it" not in ran.stderr
 
@@ -489,11 +493,20 @@ def test_without_a_team_file_the_way_to_one_is_named(tmp_path: Path) -> None:
         (["enrol", "two words", "10.0.0.9", "--public-key", KEY], "cannot name a robot"),
         (["enrol", "robot2", "10.0.0.9", "--public-key", "short"], "not 40"),
         (["enrol", "robot2", "10.0.0.9:x", "--public-key", KEY], "no address"),
+        (["enrol", "robot2", "127.0.0.1", "--public-key", KEY], "robot2 has a loopback address, at which robot1 cannot reach it"),
+        (["enrol", "robot2", "239.77.1.1", "--public-key", KEY], "239.77.1.1 is a multicast address"),
+        (["enrol", "robot2", "0.0.0.0", "--public-key", KEY], "0.0.0.0 is the address of no interface"),
+        (["enrol", "robot2", "255.255.255.255", "--public-key", KEY], "is the broadcast address"),
+        (["enrol", "robot2", "10.0.0.1", "--public-key", KEY], "robot1 has the beat address 10.0.0.1:7420 already"),
+        (["enrol", "robot2", "10.0.0.9", "10.0.0.9", "--public-key", KEY], "10.0.0.9:7420 stands twice"),
+        (["invite", "robot2"], "is no member of"),
+        (["invite", "robot1"], "is no member of"),
+        (["join", "robot2@10.0.0.1:7423/abc"], "copy the line that failover team invite printed"),
     ],
 )
 def test_a_mistake_with_the_team_is_named_and_changes_nothing(tmp_path: Path, words: list[str], sentence: str) -> None:
     place = ["--directory", str(tmp_path)]
-    failover("team", "create", "lab", *place)
+    failover("team", "create", "lab", "--empty", *place)
     failover("team", "enrol", "robot1", "10.0.0.1", "--public-key", KEY, *place)
     before = (tmp_path / "team.toml").read_text()
     ran = failover("team", *words, *place)

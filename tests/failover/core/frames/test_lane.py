@@ -162,3 +162,27 @@ def test_in_a_large_team_all_are_echoed_in_turn() -> None:
         assert heard.part.slots is not None
         echoed |= {rank for rank, _, _ in heard.part.slots.echo}
     assert echoed == set(range(30)) - {team.ranks["robot1"]}
+
+
+def said(by: FrameLane, counter: int) -> bytes:
+    ((sealed,), _) = by.seal(Beat("robot" + str(by._rank + 1), 1, counter, 0), (), counter * MS)
+    return sealed.datagrams[0]
+
+
+def test_members_join_and_leave_in_the_midst_of_a_life() -> None:
+    three = roster(["robot1", "robot2", "robot3"])
+    first, second = lane("robot1"), lane("robot2")
+    before = said(first, 1)
+    assert isinstance(second.open(before, 0), Heard)
+    first = first.changed(three)
+    heard = second.open(said(first, 2), 0)
+    assert isinstance(heard, Heard) and not heard.part.alike, (
+        "its heartbeats are read by a member that has not heard of the change"
+    )
+    assert heard.part.counter == 2, "its parts are counted on"
+    second = second.changed(three)
+    heard = second.open(said(first, 3), 0)
+    assert isinstance(heard, Heard) and heard.part.alike
+    assert second.open(before, 0) == Refused(Reason.REPLAYED, "robot1", 1), "what was seen is remembered"
+    second = second.changed(roster(["robot2", "robot3"]))
+    assert second.open(said(first, 4), 0) == Refused(Reason.UNKNOWN_KEY), "one that was taken out is not heard any more"

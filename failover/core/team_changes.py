@@ -1,0 +1,100 @@
+"""Changes of the team while it works: one member at a time, each granted by every member that the team has.
+
+A robot that wants to change the team asks all members for a *grant*. A member gives one to one robot at a time, and only if both
+have made the same number of changes. With all grants the robot writes the next change, and tells it to all; a member that cannot
+be reached in between takes it when it is back. Only the grant of a member that is to leave, and that no member sees alive, is
+not needed.
+
+What follows: no member is ever two changes behind, for the next change needs its grant, and it grants one only if it has all
+earlier ones. So two teams that are in use at a time differ by one member, and any majority of one has a member in common with any
+majority of the other. That member's vote and that member's echo count once. Two different changes with one number cannot both be
+granted, for each robot that asks needs the other one's grant. Source: Ongaro, Consensus: Bridging Theory and Practice, section
+4.2 (changes by one server); a majority of grants, as there, would let a member fall behind by two.
+
+Two robots that are alone (rule = pair) promise less: where each takes the other one for dead, each may take the other one out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Final
+
+from msgspec import Struct
+
+from failover.core.types import MS, PEERS_MAX
+
+GRANT_NS: Final = 60_000 * MS
+"""A grant holds for so long; no clock of a robot that was given one can be so far off that half of it seems longer."""
+
+SEATS: Final = PEERS_MAX + 1
+"""A generation has room for so many (`failover.core.types`)."""
+
+USE_NS: Final = GRANT_NS // 2
+"""So long after its question the robot may still write the change."""
+
+
+class Grants(Struct):
+    """The grant that one member has given last.
+
+    Attributes:
+        proposer: to whom; until_ns: of this member's clock; ``members``: digest of the team that was granted.
+    """
+
+    proposer: str = ""
+    until_ns: int = 0
+    members: int = 0
+
+    def ask(self, have: int, wanted: int, proposer: str, now_ns: int, members: int = 0) -> str:
+        """Give the grant for one change more than ``wanted``, or say why not.
+
+        Args:
+            have: changes that this member knows of; ``wanted``: that the proposer knows of.
+
+        Returns:
+            "" if it is given; else a sentence's end.
+        """
+        if wanted != have:
+            return f"it has change {have} of the team, and {proposer} has {wanted}: try again when both have the same"
+        if self.proposer not in ("", proposer) and now_ns < self.until_ns:
+            return f"{self.proposer} changes the team now: try again in {(self.until_ns - now_ns) / (1_000 * MS):.0f} s"
+        self.proposer, self.until_ns, self.members = proposer, now_ns + GRANT_NS, members
+        return ""
+
+    def covers(self, proposer: str, members: int) -> bool:
+        """Whether that robot was given the grant for that very team last; it may tell of it late, after a power cut."""
+        return (self.proposer, self.members) == (proposer, members)
+
+    def done(self, proposer: str) -> None:
+        """That robot has made its change, or has given it up. A grant to another one stays."""
+        if proposer == self.proposer:
+            self.proposer, self.until_ns, self.members = "", 0, 0
+
+
+def step(before: Mapping[str, object], after: Mapping[str, object]) -> str:
+    """The one member by which two teams differ; "" if they differ by none, or by more."""
+    changed = [name for name in {*before, *after} if before.get(name) != after.get(name)]
+    return changed[0] if len(changed) == 1 else ""
+
+
+def missing(team: Collection[str], granted: Collection[str], removed: str = "", *, lives: bool = True) -> list[str]:
+    """Which members must grant a change still; none: it is granted.
+
+    Args:
+        team: all members before the change; ``granted``: those that grant it, the proposer among them.
+        removed: the member that is to leave; ``lives``: a member sees it alive.
+    """
+    return sorted(member for member in team if member not in granted and (lives or member != removed))
+
+
+def seats(members: Mapping[str, int], order: Collection[str], mark: int = 0) -> dict[str, int]:
+    """A seat for each member: those that have one keep it, and the others get the next free ones, in that order.
+
+    Args:
+        members: name → seat, -1 for none yet.
+        mark: the seat above the one that was given last. A seat that became free below it is given again only when all above are
+            used up: snapshots of the robot that had it may still be there.
+    """
+    taken = {seat for seat in members.values() if seat >= 0}
+    around = (*range(mark, SEATS), *range(min(mark, SEATS)))
+    free = (seat for seat in around if seat not in taken)
+    return {name: members[name] if members[name] >= 0 else next(free) for name in order}

@@ -1,0 +1,442 @@
+"""Changes of the team at several members at once: lost answers, rivals, clients that go, one robot's word.
+
+The members are real but for the lines between them: files, settings and grants are theirs. What a line loses is told by the test.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from msgspec.structs import replace as changed
+
+from agent import config as configuration
+from agent.errors import RefusedError
+from agent.main_loop.messages import Told
+from agent.worker import team_changes
+from agent.worker.team_changes import TeamChanges, told_of
+from failover.config import members, team
+from failover.config.team import Robot, Role, Team
+from failover.core import acts, events
+from failover.core.types import ComponentView, PeerView, Protection, State, StatusView
+
+JOINING = Robot(("127.0.0.1:7490",), "127.0.0.1:7491")
+
+
+def robot(number: int, role: Role = "robot") -> Robot:
+    return Robot((f"127.0.0.1:74{number}0",), f"127.0.0.1:74{number}1", role)
+
+
+class Member:
+    """One robot: the lines of `TeamChanges` as the test wants them."""
+
+    def __init__(self, town: Town, name: str, place: Path) -> None:
+        self.town, self.name = town, name
+        team.write(place / "team", town.team)
+        path = place / "agent.toml"
+        places = "".join(f'{part}_directory = "{place / part}"\n' for part in ("team", "state", "runtime"))
+        path.write_text(f'robot = "{name}"\ninsecure = true\n{places}')
+        self.settings = configuration.load(path)
+        self.place = place / "team"
+        self.runs: list[ComponentView] = []
+        self.stopped: list[str] = []
+        self.taken: list[Team] = []
+        self.errands: Any = self
+        self.changes = TeamChanges(self)
+
+    @property
+    def on_disk(self) -> list[str]:
+        return sorted(team.read(self.place).robots)
+
+    async def ask(self, what: Any) -> Told:
+        peers = tuple(
+            PeerView(peer, "dead" if self.town.is_cut(self.name, peer) else "alive", 1, 10**12, True, 0)
+            for peer in self.settings.peers
+        )
+        return Told(1, 0, status=StatusView(self.name, 1, "pair", "", True, peers, tuple(self.runs)))
+
+    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer:
+        order = make(1)
+        assert isinstance(order, events.Stop)
+        self.stopped.append(order.component)
+        return acts.Answer(1, True, "")
+
+    def hindrance(self, peer: str) -> str:
+        return "it is away" if self.town.is_cut(self.name, peer) else ""
+
+    async def take_team(self, after: Team) -> None:
+        await asyncio.sleep(0)
+        self.taken.append(after)
+        self.settings = self.settings.with_team(after)
+
+    async def send(self, peer: str, verb: str, arguments: dict[str, Any], by: int = 0, patience_s: float = 0) -> dict[str, Any]:
+        """As `Errands.send`."""
+        if self.hindrance(peer):
+            raise RefusedError("cannot ask it")
+        await self.town.before(self.name, peer, verb)
+        answer = await self.town.members[peer].changes.orders()[verb](self.name, arguments)
+        await self.town.after(self.name, peer, verb)
+        return answer
+
+    async def change(self, act: str, name: str, member: Robot | None = None) -> dict[str, Any]:
+        """As a person gives the command there."""
+        said: Any = SimpleNamespace(caller=SimpleNamespace(uid=0))
+        arguments: dict[str, Any] = {"act": act, "robot": name}
+        return await self.changes.verb(said, arguments | ({"member": member} if member else {}))
+
+
+async def _nothing(_one: str, _other: str, _verb: str) -> None:
+    await asyncio.sleep(0)
+
+
+class Town:
+    """The members, and who cannot reach whom."""
+
+    def __init__(self, place: Path, *names: str, roles: dict[str, Role] | None = None) -> None:
+        self.team = Team("lab", {name: robot(number, (roles or {}).get(name, "robot")) for number, name in enumerate(names, 1)})
+        self.team = replace(members.joined(self.team, "z", robot(8)), change=0)
+        self.team = replace(self.team, robots={name: one for name, one in self.team.robots.items() if name != "z"})
+        self.cuts: set[frozenset[str]] = set()
+        self.before: Callable[[str, str, str], Awaitable[None]] = _nothing
+        self.after: Callable[[str, str, str], Awaitable[None]] = _nothing
+        self.members = {name: Member(self, name, place / name) for name in names}
+
+    def is_cut(self, one: str, other: str) -> bool:
+        return not {one, other} <= set(self.members) or frozenset((one, other)) in self.cuts
+
+    def cut_off(self, name: str) -> None:
+        self.cuts |= {frozenset((name, other)) for other in self.members if other != name}
+
+    def loses(self, verb: str, to: str) -> Callable[[str, str, str], Awaitable[None]]:
+        async def lose(_one: str, other: str, what: str) -> None:
+            if (what, other) == (verb, to):
+                raise RefusedError("lost")
+
+        return lose
+
+    def __getitem__(self, name: str) -> Member:
+        return self.members[name]
+
+
+def view(name: str, primary: str, standby: str = "", state: State = State.PRIMARY) -> ComponentView:
+    return ComponentView(name, state, 1, primary, standby, Protection.PROTECTED, 0, 0, (), "")
+
+
+@pytest.fixture(autouse=True)
+def ended(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Agents that would have ended."""
+    ends: list[str] = []
+    monkeypatch.setattr(team_changes, "end_agent", lambda: ends.append("an agent"))
+    monkeypatch.setattr(team_changes, "LEAVE_S", 0)
+    return ends
+
+
+def test_all_take_a_change_that_all_grant(tmp_path: Path) -> None:
+    town = Town(tmp_path, "a", "b", "c")
+    answer = asyncio.run(town["a"].change("add", "d", JOINING))
+    assert answer == {"team": "lab", "robots": ["a", "b", "c", "d"], "change": 1, "waiting": []}
+    assert all(member.on_disk == ["a", "b", "c", "d"] and len(member.taken) == 1 for member in town.members.values())
+
+
+def test_a_member_that_is_away_prevents_a_change_of_the_others(tmp_path: Path) -> None:
+    """Else it would fall behind by two, and its old majority have no member in common with the new one."""
+    town = Town(tmp_path, "a", "b", "c")
+    town.cut_off("c")
+    with pytest.raises(RefusedError, match="c cannot be reached; nothing has changed"):
+        asyncio.run(town["a"].change("add", "d", JOINING))
+    assert town["a"].on_disk == town["b"].on_disk == ["a", "b", "c"]
+
+
+def test_a_member_one_change_behind_is_told_before_it_is_asked_for_the_next(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c", "d")
+        town.cut_off("d")
+        town.before = town.loses("team_taken", "c")
+        assert (await town["a"].change("remove", "d"))["waiting"] == ["c"]
+        with pytest.raises(RefusedError, match="c: it has change 0 of the team, and a has 1"):
+            await town["a"].change("add", "e", robot(7))
+        town.before = _nothing
+        assert (await town["a"].change("add", "e", robot(7)))["waiting"] == []
+        assert town["c"].on_disk == ["a", "b", "c", "e"]
+
+    asyncio.run(live())
+
+
+def test_of_two_that_change_the_team_at_once_at_most_one_does(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        await asyncio.gather(
+            town["a"].change("add", "d", JOINING), town["b"].change("add", "e", robot(7)), return_exceptions=True
+        )
+        assert len({tuple(member.on_disk) for member in town.members.values()}) == 1
+        await town["c"].change("add", "d", JOINING)  # no grant is left over
+        assert all("d" in member.on_disk for member in town.members.values())
+
+    asyncio.run(live())
+
+
+def test_a_command_that_fails_at_a_robot_leaves_the_grant_that_it_gave_to_another(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+
+        async def meanwhile(one: str, other: str, verb: str) -> None:
+            if (one, other, verb) == ("a", "c", "team_grant"):
+                for wrong in ("nobody", "b"):
+                    with pytest.raises(RefusedError):
+                        await town["b"].change("remove", wrong)
+                assert town["b"].changes._grants.proposer == "a"
+
+        town.after = meanwhile
+        assert (await town["a"].change("add", "d", JOINING))["waiting"] == []
+
+    asyncio.run(live())
+
+
+def test_a_member_frees_its_own_grant_alone(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        grants = town["b"].changes._grants
+        assert grants.ask(0, 0, "a", 1) == ""
+        await town["b"].changes.orders()["team_let_go"]("c", {})
+        assert grants.proposer == "a"
+        await town["b"].changes.orders()["team_let_go"]("a", {})
+        assert grants.proposer == ""
+
+    asyncio.run(live())
+
+
+def test_a_lost_grant_frees_the_others_and_nothing_changes(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        town.after = town.loses("team_grant", "c")
+        with pytest.raises(RefusedError, match="c cannot be reached"):
+            await town["a"].change("add", "d", JOINING)
+        town.after = _nothing
+        assert {member.changes._grants.proposer for member in town.members.values()} == {""}
+        await town["b"].change("add", "d", JOINING)
+
+    asyncio.run(live())
+
+
+def test_a_file_that_cannot_be_written_frees_every_grant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError(30, "Read-only file system")
+
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b")
+        with monkeypatch.context() as patch:
+            patch.setattr(team, "write", fail)
+            with pytest.raises(RefusedError, match="Read-only"):
+                await town["a"].change("add", "d", JOINING)
+        assert town["b"].changes._grants.proposer == ""
+        assert (await town["b"].change("add", "d", JOINING))["waiting"] == []
+
+    asyncio.run(live())
+
+
+def test_a_change_goes_on_when_its_client_hangs_up(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        asked = asyncio.Event()
+
+        async def notice(_one: str, _other: str, verb: str) -> None:
+            if verb == "team_taken":
+                asked.set()
+                await asyncio.sleep(0.01)
+
+        town.before = notice
+        client = asyncio.create_task(town["a"].change("add", "d", JOINING))
+        await asked.wait()
+        client.cancel()
+        await asyncio.gather(*town["a"].changes._work, return_exceptions=True)
+        assert all(member.on_disk == ["a", "b", "c", "d"] for member in town.members.values())
+        assert not town["a"].changes._busy.locked()
+
+    asyncio.run(live())
+
+
+def test_an_older_change_that_comes_late_overwrites_no_newer_one(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b")
+        first = members.joined(town.team, "d", JOINING)
+        second = members.joined(first, "e", robot(7))
+        town["a"].settings = town["a"].settings.with_team(first)
+        new = asyncio.create_task(town["b"].changes.orders()["team_taken"]("a", told_of(second)))
+        old = asyncio.create_task(town["b"].changes.orders()["team_taken"]("a", told_of(first)))
+        await asyncio.gather(old, new, return_exceptions=True)
+        assert (town["b"].settings.team.change, town["b"].on_disk) == (2, ["a", "b", "d", "e"])
+        assert [one.change for one in town["b"].taken] == [2]
+
+    asyncio.run(live())
+
+
+# --- What one robot says ----------------------------------------------------------------------------------------------
+
+
+def test_one_robots_word_dissolves_no_team(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        for change in (1, 7, 1 << 39):
+            alone = replace(town.team, robots={"c": town.team.robots["c"]}, change=change)
+            with pytest.raises(RefusedError, match="a does not have change"):
+                await town["b"].changes.orders()["team_taken"]("c", told_of(alone))
+        assert town["b"].on_disk == ["a", "b", "c"] and not town["b"].taken
+
+    asyncio.run(live())
+
+
+def test_a_number_beyond_all_is_refused(tmp_path: Path) -> None:
+    town = Town(tmp_path, "a", "b")
+    beyond = replace(members.joined(town.team, "d", JOINING), change=1 << 63)
+    with pytest.raises(RefusedError, match="cannot be right"):
+        asyncio.run(town["b"].changes.orders()["team_taken"]("a", told_of(beyond)))
+
+
+def test_a_robot_that_is_reached_by_too_few_believes_nothing(tmp_path: Path) -> None:
+    town = Town(tmp_path, "a", "b", "c", "d", "e")
+    town.cut_off("b")
+    town.cuts.discard(frozenset(("a", "b")))
+    told = told_of(members.joined(town.team, "f", robot(7)))
+    with pytest.raises(RefusedError, match="too few other members"):
+        asyncio.run(town["b"].changes.orders()["team_taken"]("a", told))
+
+
+def test_a_grant_is_for_one_team_and_one_robot(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        asked = told_of(members.joined(town.team, "d", JOINING)) | {"proposer": "a", "have": 0}
+        orders = town["b"].changes.orders()
+        assert "other members" in (await orders["team_grant"]("c", asked))["refusal"], "in another robot's name"
+        assert (await orders["team_grant"]("a", asked))["refusal"] == ""
+        other = told_of(members.joined(town.team, "e", robot(7)))
+        with pytest.raises(RefusedError, match="does not have change 1"):
+            await orders["team_taken"]("a", other)
+        await orders["team_taken"]("a", asked)
+        assert town["b"].on_disk == ["a", "b", "c", "d"]
+
+    asyncio.run(live())
+
+
+def test_a_witness_passes_a_change_on_and_is_not_believed_alone(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "w", roles={"w": "witness"})
+        after = members.joined(town.team, "d", JOINING)
+        told = town["b"].changes.orders()["team_taken"]
+        town.cut_off("a")
+        with pytest.raises(RefusedError, match="only w tells"):
+            await told("w", told_of(after))
+        town.cuts.clear()
+        town["a"].settings = town["a"].settings.with_team(after)
+        await told("w", told_of(after))
+        assert town["b"].on_disk == ["a", "b", "d", "w"]
+
+    asyncio.run(live())
+
+
+# --- Members that leave -----------------------------------------------------------------------------------------------
+
+
+def test_a_member_that_lives_is_asked_and_ends(tmp_path: Path, ended: list[str]) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        assert (await town["a"].change("remove", "c"))["waiting"] == []
+        await asyncio.sleep(0.01)
+        assert all(member.on_disk == ["a", "b"] for member in town.members.values()) and ended
+
+    asyncio.run(live())
+
+
+def test_two_that_take_each_other_out_at_once_do_not_both_leave(tmp_path: Path, ended: list[str]) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b")
+        await asyncio.gather(town["a"].change("remove", "b"), town["b"].change("remove", "a"), return_exceptions=True)
+        await asyncio.sleep(0.01)
+        assert len(ended) <= 1
+        assert any(name in town[name].on_disk for name in "ab")
+
+    asyncio.run(live())
+
+
+def test_a_member_that_one_of_the_others_hears_is_not_taken_out_as_lost(tmp_path: Path) -> None:
+    """Also where it runs nothing: from three to two the rule goes over to pair, and it would act for ever."""
+    town = Town(tmp_path, "a", "b", "c")
+    town.cuts.add(frozenset(("a", "c")))
+    with pytest.raises(RefusedError, match="c lives, as b sees"):
+        asyncio.run(town["a"].change("remove", "c"))
+    town["b"].runs = [view("/x", "c")]
+    with pytest.raises(RefusedError, match="b: c runs /x"):
+        asyncio.run(town["a"].change("remove", "c"))
+
+
+def test_a_robot_that_was_lost_hears_that_it_is_out_stops_its_copy_and_ends(tmp_path: Path, ended: list[str]) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        town.cut_off("c")
+        await town["a"].change("remove", "c")
+        assert list(team.read(town["a"].place).former) == ["c"]
+        town["c"].runs = [view("/x", "c")]
+        town.cuts.clear()
+        town["a"].changes.heard("c", 0, 0)  # it greets
+        await town["a"].changes._tell_who_is_behind()
+        await asyncio.sleep(0.01)
+        assert town["c"].stopped == ["/x"] and ended and town["c"].on_disk == ["a", "b"]
+
+    asyncio.run(live())
+
+
+def test_a_lost_answer_of_the_one_that_leaves_ends_nothing_half_way(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c")
+        town.before = town.loses("team_taken", "c")
+        await town["a"].change("remove", "c")
+        assert town["a"].on_disk == town["b"].on_disk == ["a", "b"]
+        assert "c" in town["a"].changes._behind, "it is told when it can be"
+
+    asyncio.run(live())
+
+
+@pytest.mark.parametrize(
+    ("shown", "is_away", "said"),
+    [
+        (view("/x", "c"), False, "c runs /x"),
+        (view("/x", "a", "c"), False, "holds the newest checkpoint of /x"),
+        (view("/x", "c"), True, "alone may hold the newest checkpoint of /x"),
+    ],
+)
+def test_the_only_holder_of_a_newest_checkpoint_is_not_taken_out(
+    tmp_path: Path, shown: ComponentView, is_away: bool, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    town = Town(tmp_path, "a", "b", "c")
+    town["a"].runs = [shown]
+    if is_away:
+        town.cut_off("c")
+
+    async def seen(_what: Any) -> Told:
+        peers = (PeerView("b", "alive", 1, 0, True, 0), PeerView("c", "dead" if is_away else "alive", 1, 10**9, True, 0))
+        return Told(1, 0, status=StatusView("a", 1, "majority", "", True, peers, (shown,)))
+
+    monkeypatch.setattr(town["a"], "ask", seen)
+    with pytest.raises(RefusedError, match=said):
+        asyncio.run(town["a"].change("remove", "c"))
+    town["a"].runs = [changed(shown, state=State.FINISHED)]
+
+
+def test_a_robot_that_was_not_heard_since_the_start_may_be_starting_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    town = Town(tmp_path, "a", "b")
+    town.cut_off("b")
+    silent_ns = 10**9
+
+    async def seen(_what: Any) -> Told:
+        return Told(1, 0, status=StatusView("a", 1, "pair", "", True, (PeerView("b", "unheard", 0, silent_ns, False, 0),), ()))
+
+    monkeypatch.setattr(town["a"], "ask", seen)
+    with pytest.raises(RefusedError, match="b lives and cannot be told"):
+        asyncio.run(town["a"].change("remove", "b"))
+    silent_ns = team_changes.UNHEARD_NS
+    asyncio.run(town["a"].change("remove", "b"))
+    assert town["a"].on_disk == ["a"]
