@@ -33,13 +33,12 @@ class Meter:
     def of(self, pid: int) -> Use | None:
         """Of the program with this pid; None where it has ended, or is another user's whom we may not look at."""
         with contextlib.suppress(psutil.Error):
-            first = psutil.Process(pid)
-            born, now = first.create_time(), time.time()
+            first, now = psutil.Process(pid), time.time()
             shares, memory, count = 0.0, 0, 0
             for process in (first, *first.children(recursive=True)):
                 for share, size in self._looked_at(process, now):
                     shares, memory, count = shares + share, memory + size, count + 1
-            self._seen = {key: seen for key, seen in self._seen.items() if key[1] >= born or psutil.pid_exists(key[0])}
+            self._seen = {key: seen for key, seen in self._seen.items() if psutil.pid_exists(key[0])}
             return Use(shares, memory, count) if count else None
         return None
 
