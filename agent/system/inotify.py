@@ -12,6 +12,8 @@ import ctypes
 import os
 from typing import Final
 
+from agent.system.timers import check
+
 IN_ATTRIB: Final = 0x4
 IN_CLOEXEC: Final = os.O_CLOEXEC
 IN_NONBLOCK: Final = os.O_NONBLOCK
@@ -32,9 +34,9 @@ class Touches:
             OSError: the user has too many such descriptors (fs.inotify.max_user_instances), or the kernel has none.
         """
         self._descriptor = int(_libc.inotify_init1(IN_CLOEXEC | IN_NONBLOCK))
-        _check(self._descriptor, "inotify_init1")
+        check(self._descriptor, "inotify_init1")
         try:
-            _check(_libc.inotify_add_watch(self._descriptor, b"/proc/self/fd/%d" % file, IN_ATTRIB), "inotify_add_watch")
+            check(_libc.inotify_add_watch(self._descriptor, b"/proc/self/fd/%d" % file, IN_ATTRIB), "inotify_add_watch")
         except OSError:
             self.close()
             raise
@@ -51,9 +53,3 @@ class Touches:
     def close(self) -> None:
         """Give the descriptor back."""
         os.close(self._descriptor)
-
-
-def _check(result: int, what: str) -> None:
-    if result < 0:
-        number = ctypes.get_errno()
-        raise OSError(number, f"{what}: {os.strerror(number)}")

@@ -33,7 +33,7 @@ class Alarm:
             OSError: no descriptor is left.
         """
         self._descriptor = int(_libc.timerfd_create(time.CLOCK_BOOTTIME, TFD_NONBLOCK | TFD_CLOEXEC))
-        _check(self._descriptor, "timerfd_create")
+        check(self._descriptor, "timerfd_create")
         self._times = _Times()
         self._at_ns: int | None = None
 
@@ -46,7 +46,7 @@ class Alarm:
         if at_ns == self._at_ns:
             return
         self._times[2], self._times[3] = divmod(max(at_ns, 1), NS_PER_S) if at_ns is not None else (0, 0)
-        _check(_libc.timerfd_settime(self._descriptor, TFD_TIMER_ABSTIME, self._times, None), "timerfd_settime")
+        check(_libc.timerfd_settime(self._descriptor, TFD_TIMER_ABSTIME, self._times, None), "timerfd_settime")
         self._at_ns = at_ns
 
     def close(self) -> None:
@@ -54,7 +54,8 @@ class Alarm:
         os.close(self._descriptor)
 
 
-def _check(result: int, what: str) -> None:
+def check(result: int, what: str) -> None:
+    """Raises OSError: a call of the C library has failed; ``what`` names it."""
     if result < 0:
         number = ctypes.get_errno()
         raise OSError(number, f"{what}: {os.strerror(number)}")
