@@ -285,9 +285,7 @@ class TeamChanges:
             after = team_of(asked, before)
             check_team(self._lines.settings, after)
             self._check_that_it_can_be_written()
-        except FailoverError as error:
-            return {"refusal": str(error)}
-        except AgentError as error:  # of what was asked, too
+        except (FailoverError, AgentError) as error:
             return {"refusal": str(error)}
         if asked.have == before.change:
             who = step(_who(before), _who(after))
