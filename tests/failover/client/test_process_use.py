@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ child.kill()
 child.wait()
 """
 PATIENCE_S = 60.0
+TICK_S = 1 / os.sysconf("SC_CLK_TCK")  # the grain of the processor times
 
 
 @contextmanager
@@ -43,9 +45,16 @@ def until(meter: Meter, pid: int, least: float) -> Use:
 def test_a_program_and_its_child_are_counted_together_and_only_since_the_last_look() -> None:
     meter = Meter()
     with two_processes() as pid:
-        use = until(meter, pid, 0.05)
-        assert use.processes == 2
-        assert use.cpu <= 1.5, "the parent waits, and one loop has one core"
+        assert until(meter, pid, 0.05).processes == 2
+        began = time.monotonic()
+        assert meter.of(pid) is not None
+        looked = time.monotonic()
+        time.sleep(0.5)
+        again = time.monotonic()
+        use = meter.of(pid)
+        assert use is not None
+        at_most = time.monotonic() - began + 2 * TICK_S
+        assert use.cpu * (again - looked) <= at_most, "the parent waits, and one loop has one core"
     assert meter.of(pid) is None, "it has ended"
 
 

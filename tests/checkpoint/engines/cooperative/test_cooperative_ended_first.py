@@ -120,7 +120,7 @@ def test_a_program_whose_first_thread_has_ended_is_captured_as_before(program: P
     late = engine.protect(program.pid, ProtectOrder("/lab/r1/late", terms=terms))
     assert str(program.file) in engine.probe(program.pid).command
     try:
-        assert early.unchanged() == before.position
+        assert early.unchanged(0) == before.position
         assert program.commit() == 2
         delta, whole = captured(early, 2), captured(late, 1, base=True)
         assert (delta.parent, commit_in(delta), commit_in(whole)) == (before.position, 2, 2)
