@@ -73,6 +73,8 @@ class Deposit:
         self._turns: dict[str, asyncio.Lock] = {}
         self._stored: dict[tuple[str, Position], tuple[Offer, Snapshot]] = {}
         self._unshown: dict[str, deque[Unshown]] = {}
+        self._shown: dict[str, Position] = {}
+        """Up to where the logs were brought last."""
 
     def admit(self, act: Admit) -> None:
         """From now on take this component's snapshots from this sender alone."""
@@ -145,6 +147,8 @@ class Deposit:
             return
         unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
         unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED, offer.spec.owner))
+        if self._shown.get(act.component) == snapshot.position:  # of another component, which had this name
+            del self._shown[act.component]
         self._kept(offer, snapshot)
 
     async def discard(self, act: Discard) -> None:
@@ -171,6 +175,12 @@ class Deposit:
         Args:
             is_elsewhere: another robot is known to hold it, also where this one took it in.
         """
+        if self._shown.get(component) == position and not is_elsewhere:
+            return  # a takeover need not read the whole chain again
+        self._bring_logs(component, position, is_elsewhere=is_elsewhere)
+        self._shown[component] = position
+
+    def _bring_logs(self, component: str, position: Position, *, is_elsewhere: bool) -> None:
         unshown = self._unshown.setdefault(component, deque())
         directory = log_directory(component, self._places)
         due = [one for one in tuple(unshown) if one.position.generation == position.generation and one.position <= position]

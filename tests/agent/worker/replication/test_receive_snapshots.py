@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
 from msgspec.structs import replace
 
 from agent.guard.output_logs import OutputLogs, logs_of
@@ -256,5 +257,44 @@ def test_output_after_a_restart_has_no_gap_where_the_snapshot_before_was_never_s
         again.deposit.accept(Accept(COMPONENT, 1, third.position))
         await again.deposit.show(Show(COMPONENT, 1, third.position))
         assert again.seen() == b"ready\nline 2\nline 3\n"
+
+    asyncio.run(story())
+
+
+def test_who_goes_on_from_what_was_shown_last_does_not_read_the_chain_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a takeover takes longer with each snapshot of its chain."""
+    made = history(3)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        for one in made:
+            await standing.take(one)
+            standing.deposit.accept(Accept(COMPONENT, 1, one.position))
+            await standing.deposit.show(Show(COMPONENT, 1, one.position))
+        opened: list[Position] = []
+        monkeypatch.setattr(standing.store, "open_chain", lambda *asked: opened.append(asked[-1]) or [])
+        await standing.deposit.settled(COMPONENT, made[-1].position)
+        assert standing.seen() == b"ready\nline 2\nline 3\n" and not opened
+
+    asyncio.run(story())
+
+
+def test_a_namesake_with_the_same_position_has_its_own_output(tmp_path: Path) -> None:
+    (first,) = history(1)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        await standing.take(first)
+        standing.deposit.accept(Accept(COMPONENT, 1, first.position))
+        await standing.deposit.show(Show(COMPONENT, 1, first.position))
+        for stream in (tmp_path / "logs" / folder_name(COMPONENT)).iterdir():  # it was released
+            stream.unlink()
+        standing.store.drop(COMPONENT)
+        await standing.take(first)
+        standing.deposit.accept(Accept(COMPONENT, 1, first.position))
+        await standing.deposit.settled(COMPONENT, first.position)
+        assert standing.seen() == b"ready\n"
 
     asyncio.run(story())
