@@ -62,10 +62,10 @@ class GrowingStage(SwitchStage):
         where = ["--directory", str(self.place(name)), *socket]
         return [*inside, sys.executable, "-m", "failover.cli.main", "team", act, *words, *where]
 
-    def typed(self, name: str, act: str, *words: str) -> subprocess.CompletedProcess[str]:
-        """Give a command there, and wait for its end: in this process, where that makes no difference."""
+    def typed(self, name: str, act: str, *words: str, apart: bool = False) -> subprocess.CompletedProcess[str]:
+        """Give a command there, and wait for its end: in this process, where that makes no difference, unless ``apart``."""
         command = self.words(name, act, *words)
-        if self.means.own_network:
+        if self.means.own_network or apart:
             return subprocess.run(command, capture_output=True, text=True, check=False, timeout=robots.PATIENCE_S)
         said, wrong = io.StringIO(), io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(wrong):
