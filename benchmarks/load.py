@@ -14,6 +14,7 @@ from benchmarks.engine import PERIOD_S, capture
 from benchmarks.figures import Figure, Findings
 from benchmarks.outage import COUNTING, Story, outages
 from benchmarks.running import PROGRAMS, BenchmarkError, running
+from checkpoint.engine import Terms
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper import messages
 from failover.cli.demo.robots import RobotMachine, Stage, means
@@ -29,8 +30,12 @@ FROZEN: Final[dict[str, tuple[Any, ...]]] = {
     "1,000 files open": ("crowded", 1, 1_000),
     "a shell loop with constant children": ("shell",),
     "300 MB written a second": ("writing", 300),
+    "300 MB written a second, a budget of 100 ms": ("writing", 300),
 }
 """The program and its arguments, by case."""
+BUDGETS_MS: Final = {"300 MB written a second, a budget of 100 ms": 100}
+"""`freeze_budget_ms`: a freeze beyond it is given up, and after `freeze_overrun_s` one may take longer."""
+OVERRUN_S: Final = 20
 DELTAS: Final = 200
 QUICK_DELTAS: Final = 40
 DELTAS_S: Final = 60.0
@@ -83,7 +88,9 @@ def _freezes(case: str, program: str, arguments: list[int], count: int, deltas: 
     freezes: list[float] = []
     given_up = 0
     with running(program, *arguments, directory=directory) as measured, busy(count), Keeper.spawn() as keeper:
-        keeper.ask(messages.Protect(measured.pid, "/benchmark"), messages.Protected)
+        budget_ms = BUDGETS_MS.get(case, 0)
+        terms = Terms(freeze_budget_ns=budget_ms * 1_000_000, freeze_overrun_ns=OVERRUN_S * 1_000_000_000)
+        keeper.ask(messages.Protect(measured.pid, "/benchmark", terms=terms), messages.Protected)
         base, until = True, time.monotonic() + DELTAS_S
         for sequence in range(1, deltas + 2):
             if time.monotonic() > until:
@@ -101,6 +108,9 @@ def _freezes(case: str, program: str, arguments: list[int], count: int, deltas: 
     if freezes:
         yield Figure("freeze of a delta", _beside(case, count), "ms", tuple(freezes))
     yield Figure("captures that came to nothing", _beside(case, count), "", (float(given_up),))
+    if budget_ms:
+        beyond = sum(freeze_ms > budget_ms for freeze_ms in freezes)
+        yield Figure("freezes beyond the budget", _beside(case, count), "", (float(beyond),))
 
 
 def _ages(case: str, count: int, span_s: float, directory: Path) -> Iterator[Figure]:
