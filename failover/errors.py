@@ -81,6 +81,10 @@ class RecordingError(FailoverError):
     """A recording of the board cannot be made, read or replayed; the message names the file, and what was kept."""
 
 
+class BridgeError(FailoverError):
+    """Programs of another middleware cannot be reached, or asked for what a bridge has not; the message says what to do."""
+
+
 class ItemError(FailoverError):
     """An item of the board is declared in a way that cannot work; nothing was changed.
 

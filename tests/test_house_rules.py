@@ -68,6 +68,7 @@ DOORS = {
     "psutil": ("failover/client/process_use.py",),
     "rich": ("failover/cli/output/render.py",),
     "shtab": ("failover/cli/completion.py",),
+    "zenoh": ("failover/bridges/zenoh_bridge.py",),
 }
 """Each outside dependency that is not plain arithmetic enters through one file."""
 

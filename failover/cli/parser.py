@@ -501,6 +501,18 @@ VERBS: Final = (
         "failover.cli.verbs.programs:show",
     ),
     Verb(
+        "bridge",
+        "the board and the drivers for programs of another middleware: zenoh",
+        """
+        A process between the team and programs of another middleware, until Ctrl-C. failover bridge zenoh --help explains it.
+
+          failover bridge zenoh
+          failover bridge zenoh --connect tcp/10.0.0.5:7447 --calls
+        """,
+        "failover.cli.arguments.bridges:bridge",
+        "failover.cli.verbs.bridges:zenoh",
+    ),
+    Verb(
         "page",
         "the operators' page: the team live in a browser, orders, metrics for Prometheus",
         """

@@ -65,9 +65,7 @@ def board(room: argparse.ArgumentParser) -> None:
 def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
     """Of ``record``, ``replay`` and ``serve``."""
     some = argparse.ArgumentParser(add_help=False, parents=[of_board])
-    for option, what in (("--items", "of this name: * and ? stand for any characters"), ("--robots", "of this robot, likewise")):
-        help_ = f"only items {what}; may be given again"
-        some.add_argument(option, metavar="PATTERN", action="append", default=[], help=help_)
+    add_choice(some)
     record = add_act(acts, "record", some, "each put of each item, with its age, into an MCAP file", RECORD_DESCRIPTION)
     record.add_argument("file", metavar="FILE", help="the file, team.mcap, which must not exist yet; with --recover, it must")
     record.add_argument("--for", dest="span", metavar="SPAN", type=_span_ms, help="end after 10s, 5min, 2h (default: at Ctrl-C)")
@@ -104,11 +102,23 @@ def _recordings(acts: Any, of_board: argparse.ArgumentParser) -> None:
     replay.set_defaults(function="failover.cli.verbs.board_recordings:replay")
 
 
-def _add_looks(room: argparse.ArgumentParser) -> None:
-    """How the board and the agents are looked at."""
+def add_choice(room: argparse.ArgumentParser) -> None:
+    """Which items."""
+    for option, what in (("--items", "of this name: * and ? stand for any characters"), ("--robots", "of this robot, likewise")):
+        help_ = f"only items {what}; may be given again"
+        room.add_argument(option, metavar="PATTERN", action="append", default=[], help=help_)
+
+
+def add_rate(room: argparse.ArgumentParser) -> None:
+    """How often the board is looked at."""
     room.add_argument(
         "--rate", metavar="HZ", type=_rate, default=100, help="looks at the board in a second, 1 to 1000 (default: %(default)s)"
     )
+
+
+def _add_looks(room: argparse.ArgumentParser) -> None:
+    """How the board and the agents are looked at."""
+    add_rate(room)
     room.add_argument("--no-decisions", dest="decisions", action="store_false", help="leave out the agents' decisions")
     room.add_argument("--socket", metavar="PATH", help="the control socket of the agent that is asked for decisions")
 

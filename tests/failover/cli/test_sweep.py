@@ -42,6 +42,7 @@ BOARDS = (
     ["record", "out.mcap"],
     ["serve", "--foxglove", "0"],
 )
+BRIDGES = ([], ["--listen", "tcp/0.0.0.0:7447"], ["--connect", "somewhere"])
 TASKS = (
     *(["ps"], ["trace", "-o", "out", "--for", "1s"], ["task", "add", "x", "period_ms=9"], ["task", "set", "x", "period_ms=9"]),
     *(["task", "remove", "x"], ["task", "histogram", "x"], ["task", "import", "missing", "--tick-ms", "33"]),
@@ -80,6 +81,7 @@ USAGE = (
     *(["team", "invite", "x", "--port", port] for port in ("-1", "65536", "x")),
     *(["board", "record", "x", *rest] for rest in (["--rate", "0"], ["--rate", "2000"], ["--for", "soon"], ["--max-size", "9"])),
     *(["board", "serve", "--foxglove", port] for port in ("-1", "65536", "x")),
+    *(["bridge", *rest] for rest in ([], ["dds"], ["zenoh", "--rate", "0"])),
     *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
     ["task", "run", "--signal", "BELL", "x", "period_ms=20", "--", "true"],
     *(["board", "fly"], ["board", "get"], ["board", "--every-ms", "0"], ["board", "import", "f", "--robot", "a"]),
@@ -105,7 +107,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        with_acts = verb in (("team",), ("board",), ("task",), ("rights",), ("program",), ("lost",))
+        with_acts = verb in (("team",), ("board",), ("bridge",), ("task",), ("rights",), ("program",), ("lost",))
         statuses.append(main.main([*argv, *asked] if with_acts else [*verb, *asked, *rest]))
         said = capsys.readouterr()
         if asked:
@@ -210,6 +212,11 @@ def test_with_a_page_that_may_not_be_served(options: list[str], capsys: pytest.C
     assert told(capsys, "page", *options) == main.FAILED
 
 
+@pytest.mark.parametrize("options", BRIDGES, ids=" ".join)
+def test_with_a_bridge_that_leads_nowhere(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "bridge", "zenoh", "--board", "nowhere", *options) == main.FAILED
+
+
 @pytest.mark.parametrize("act", ["inspect", "restore", "remove"])
 def test_with_copies_that_lost_and_are_not_there(act: str, capsys: pytest.CaptureFixture[str]) -> None:
     for at in ("nowhere", "directory", "junk"):
@@ -226,6 +233,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"page", "ps", "task", "trace", "wait-activation", "rights", "program", "lost"}
+    without |= {"page", "bridge", "ps", "task", "trace", "wait-activation", "rights", "program", "lost"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
