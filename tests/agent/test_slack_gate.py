@@ -14,6 +14,7 @@ import pytest
 
 from agent import slack_gate
 from agent.slack_gate import SlackGate
+from checkpoint.keeper.messages import Slack
 from failover.boards import SCHEDULE_NAME, directory
 from failover.boards.openings import held_rows, openings_of, rows_of
 from failover.boards.schedule_file import ScheduleFile
@@ -79,7 +80,7 @@ def process(program: str, place: Path, *words: str) -> Iterator[subprocess.Popen
         child.kill()
 
 
-def captured(gate: SlackGate, pid: int, lag_ns: int = LAG_NS, *, stood_still: bool = True) -> slack_gate.Slack | None:
+def captured(gate: SlackGate, pid: int, lag_ns: int = LAG_NS, *, stood_still: bool = True) -> Slack | None:
     gate.begin(lag_ns)
     while not gate.opens((pid,)):
         pass

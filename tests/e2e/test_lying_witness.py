@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from failover.cli.demo.robots import RobotMachine
+from failover.config.team import Role
 from tests.e2e import robots, teams
 from tests.e2e.test_orders import COUNTING
 
-ROLES: dict[str, teams.Role] = {"robot1": "robot", "robot2": "robot", "gate": "witness"}
+ROLES: dict[str, Role] = {"robot1": "robot", "robot2": "robot", "gate": "witness"}
 BEATS = 150
 """That were refused: three seconds of them."""
 

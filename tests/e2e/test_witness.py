@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from failover.cli.demo.robots import RobotMachine
+from failover.config.team import Role
 from tests.e2e import robots, teams
 from tests.e2e.teams import hears_all
 from tests.e2e.test_orders import COUNTING, counted
 
-ROLES: dict[str, teams.Role] = {"robot1": "robot", "robot2": "robot", "gate": "witness"}
+ROLES: dict[str, Role] = {"robot1": "robot", "robot2": "robot", "gate": "witness"}
 NOT_ITS_OWN = (
     "agent.worker.components.supervisor",
     "agent.worker.components.process_pool",

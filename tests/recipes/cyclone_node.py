@@ -14,7 +14,7 @@ from cyclonedds.util import duration
 
 
 @dataclass
-class Number(IdlStruct, typename="Number"):
+class Number(IdlStruct, typename="Number"):  # type: ignore[call-arg]
     value: int
 
 

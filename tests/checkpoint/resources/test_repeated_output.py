@@ -35,7 +35,7 @@ def read_by_cat(how: str, numbers: tuple[str, ...], directory: Path) -> Iterator
     with (directory / "read").open("wb") as read, (directory / "err").open("wb") as err:
         cat = subprocess.Popen(["cat"], stdin=ours, stdout=read)
         streams = {name: theirs if name in numbers else err for name in ("stdout", "stderr")}
-        program = subprocess.Popen([sys.executable, "-c", WRITES], cwd=directory, stdin=subprocess.DEVNULL, **streams)
+        program = subprocess.Popen([sys.executable, "-c", WRITES], cwd=directory, stdin=subprocess.DEVNULL, **streams)  # type: ignore[call-overload]
     ours.close()
     theirs.close()
     try:

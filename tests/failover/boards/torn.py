@@ -216,7 +216,7 @@ def run(
     finally:
         board_item.writer_of = right
     totals = [counters.total(what) for what in range(5)]
-    return Result(counters.words[PUTS], *totals, counters.words[CHANGES], done)
+    return Result(counters.words[PUTS], *totals, counters.words[CHANGES], done)  # type: ignore[call-arg]
 
 
 def main() -> int:

@@ -57,7 +57,7 @@ def test_a_model_takes_defaults_for_what_was_not_stored() -> None:
 
 def test_what_a_model_holds_besides_its_fields_is_refused_by_name() -> None:
     with pytest.raises(KeepError, match=r"kept\.surplus: it was set but is no declared field of Extra"):
-        resumed(Extra, Extra(id=1, surplus=2))
+        resumed(Extra, Extra(id=1, surplus=2))  # type: ignore[call-arg]
 
 
 def test_neither_library_is_imported_by_us() -> None:

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from checkpoint.engines.ptrace.restore import forked_memory
 from checkpoint.model import FileIdentity, PageRun, Snapshot, Vma, VmaKind
+from checkpoint.pages.page_set import Words
 from tests.checkpoint.snapshots import PAGE, START, page, snapshot
 
 NO_PAGES = forked_memory.NO_PAGES
@@ -23,7 +24,7 @@ def with_written(path: str, *written: int) -> Snapshot:
     return replace(snapshot({}), vmas=(mapping,), runs=runs, contents=contents)
 
 
-def numbers(pages: forked_memory.Words) -> list[tuple[int, int]]:
+def numbers(pages: Words) -> list[tuple[int, int]]:
     return [((start - START) // PAGE, (end - START) // PAGE) for start, end in pages.tolist()]
 
 
