@@ -6,6 +6,7 @@ Pure: `checkpoint.store.store` reads and writes the files, this module says what
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 from urllib.parse import quote
 
@@ -46,8 +47,8 @@ class Entry(Struct, frozen=True):
         return self.epoch, self.position.generation, self.position.sequence
 
 
-class Shelf(Struct, frozen=True):
-    """The intact files of one component, in no particular order."""
+class Shelf(Struct, frozen=True, dict=True):
+    """The intact files of one component, in no particular order. The work of every answer is linear in their number."""
 
     component: str
     entries: tuple[Entry, ...] = ()
@@ -63,33 +64,54 @@ class Shelf(Struct, frozen=True):
 
     def positions(self) -> tuple[Position, ...]:
         """The positions that can be restored, oldest first."""
-        return tuple(entry.position for entry in self._restorable())
+        return tuple(entry.position for entry in self._restorable)
 
     def newest(self) -> Position | None:
         """The newest position that can be restored."""
-        return max(self._restorable(), key=lambda entry: entry.order).position if self._restorable() else None
+        return max(self._restorable, key=lambda entry: entry.order).position if self._restorable else None
 
     def chain_to(self, position: Position) -> tuple[Entry, ...]:
         """The files that lead to a position, a base first; empty where the chain is not whole."""
-        return _chain(self._by_position(), position)
+        chain: list[Entry] = []
+        wanted: Position | None = position
+        while wanted is not None:
+            entry = self._by_position.get(wanted)
+            if entry is None:
+                return ()
+            chain.append(entry)
+            wanted = entry.parent
+        return tuple(reversed(chain))
 
     def unneeded_for(self, oldest: Position) -> tuple[Entry, ...]:
         """Files without which ``oldest`` and everything later can still be restored; none if it cannot be restored itself."""
-        floor = self.order_of(oldest)
+        floor, best = self.order_of(oldest), self._by_position
         if floor is None:
             return ()
-        needed = {entry for kept in self._restorable() if kept.order >= floor for entry in self.chain_to(kept.position)}
-        return tuple(entry for entry in self.entries if entry not in needed)
+        needed: set[Position] = set()
+        for kept in self._restorable:
+            wanted = kept.position if kept.order >= floor else None
+            while wanted is not None and wanted not in needed:
+                needed.add(wanted)
+                wanted = best[wanted].parent
+        return tuple(entry for entry in self.entries if entry.position not in needed or best[entry.position] is not entry)
 
     def order_of(self, position: Position) -> tuple[int, int, int] | None:
         """Where a position stands in the order of the files; None if it cannot be restored."""
-        return next((entry.order for entry in self._restorable() if entry.position == position), None)
+        return next((entry.order for entry in self._restorable if entry.position == position), None)
 
-    def _restorable(self) -> list[Entry]:
-        """One file for every position whose chain is whole, oldest first."""
-        best = self._by_position()
-        return sorted((entry for entry in best.values() if _chain(best, entry.position)), key=lambda entry: entry.order)
+    @cached_property
+    def _restorable(self) -> tuple[Entry, ...]:
+        """One file for every position whose chain is whole, oldest first.
 
+        A parent is before its child in every file (``validity``): it is decided before the child.
+        """
+        whole: dict[Position, Entry] = {}
+        for entry in sorted(self._by_position.values(), key=lambda entry: entry.position):
+            if entry.parent is None or entry.parent in whole:
+                whole[entry.position] = entry
+        return tuple(sorted(whole.values(), key=lambda entry: entry.order))
+
+    @cached_property
     def _by_position(self) -> dict[Position, Entry]:
         """The best file for each position: a base before a delta."""
         best: dict[Position, Entry] = {}
@@ -98,19 +120,6 @@ class Shelf(Struct, frozen=True):
             if known is None or (known.parent is not None and entry.parent is None):
                 best[entry.position] = entry
         return best
-
-
-def _chain(best: dict[Position, Entry], position: Position) -> tuple[Entry, ...]:
-    """Follow parents to a base. A parent is before its child in every file (``validity``), so this ends."""
-    chain: list[Entry] = []
-    wanted: Position | None = position
-    while wanted is not None:
-        entry = best.get(wanted)
-        if entry is None:
-            return ()
-        chain.append(entry)
-        wanted = entry.parent
-    return tuple(reversed(chain))
 
 
 def folder_name(component: str) -> str:
