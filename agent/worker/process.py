@@ -394,7 +394,7 @@ class Worker(Switchboard):
         if figures.spec is None:
             self._new_here.set()  # the first one of it: look at once whether it could go on here
         figures.stored(snapshot, offer.size, offer.spec)
-        self.supervisor(offer.component).copy.accepted(snapshot.position)
+        self.supervisor(offer.component).copy.accepted(snapshot)
 
     async def _look_what_is_lacking(self) -> None:
         """Now and then, and when a component is new here: what this robot lacks of what it stands by for, and which files of what

@@ -128,15 +128,18 @@ class Store:
             raise StoreError(f"the store {self._root} does not hold {named} of {component}")
         return found
 
-    def open_chain(self, component: str, position: Position | None = None) -> list[int]:
+    def open_chain(self, component: str, position: Position | None = None, *, beyond: Position | None = None) -> list[int]:
         """Descriptors of the files that lead to a position, a base first; the caller closes them.
 
         They stay readable, also if the store removes or moves the files meanwhile.
+
+        Args:
+            beyond: a position that the caller has: only the files after it; none where the chain does not lead over it.
         """
         opened: list[int] = []
         try:
             with self._lock, disk_trouble(f"open the chain of {component}"):
-                for entry in self.chain_of(component, position):
+                for entry in _after(self.chain_of(component, position), beyond):
                     opened.append(os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
                     if why := why_not_ours(os.fstat(opened[-1])):
                         raise StoreError(
@@ -436,6 +439,13 @@ class Store:
                 self._add(component, entry)
             self._history.read()
         self.contents.mend()
+
+
+def _after(entries: tuple[Entry, ...], beyond: Position | None) -> tuple[Entry, ...]:
+    """The files of a chain after a position, all where none is named."""
+    if beyond is None:
+        return entries
+    return next((entries[index + 1 :] for index, entry in enumerate(entries) if entry.position == beyond), ())
 
 
 def open_store(

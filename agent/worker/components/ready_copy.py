@@ -59,6 +59,7 @@ class ReadyCopy:
         self._figures = figures
         self._ready: Ready | None = None
         self._accepted: Position | None = None
+        self._outline: Snapshot | None = None
         self._news = asyncio.Event()
         self._turn = asyncio.Lock()
         self._work: asyncio.Task[None] | None = None
@@ -73,15 +74,20 @@ class ReadyCopy:
         self.drop()
         self._work = self._task(self._follow(spec, tell))
 
-    def accepted(self, position: Position) -> None:
-        """The core counts another checkpoint as held here. The copy goes no further: the rest of the store may be forgotten."""
-        self._accepted = position
+    def accepted(self, snapshot: Snapshot) -> None:
+        """The core counts another checkpoint as held here. The copy goes no further: the rest of the store may be forgotten.
+
+        Args:
+            snapshot: without its pages.
+        """
+        self._accepted, self._outline = snapshot.position, snapshot if self._work is not None else None
         self._news.set()
 
     def drop(self) -> None:
         """No copy is wanted any more; the one that exists ends; its end is not awaited."""
         work, self._work = self._work, None
         ready, self._ready = self._ready, None
+        self._outline = None
         self._figures.copy = CopyFigures()
         self._around.places.process_pool.relieve(self._name, False)
         if work is not None:
@@ -192,20 +198,30 @@ class ReadyCopy:
         """Apply the snapshots that the store holds beyond it, up to a position; lay it again where that does not continue it."""
         ready = self._ready
         assert ready is not None, "laid before"
-        entries = self._around.store.chain_of(self._name, position)
-        known = [entry.position for entry in entries]
-        if ready.outline.position not in known:
+        newest = self._around.store.chain_of(self._name, position)
+        if all(entry.position != ready.outline.position for entry in newest):
             raise launch.stale(self._name)
-        chain = await asyncio.to_thread(self._around.store.open_chain, self._name, known[-1])
-        deltas = tuple(chain[known.index(ready.outline.position) + 1 :]) if len(chain) == len(known) else ()
+        if newest[-1].position == ready.outline.position:
+            return
+        deltas, outline = await asyncio.to_thread(self._opened, newest[-1].position, ready.outline.position)
         try:
-            if not deltas:
+            if outline is None:
                 return
-            age_ns, outline = clock.age_ns(deltas[-1]), await asyncio.to_thread(format.read_outline, deltas[-1])
-            laid, _ = await ready.component.keeper.ask(messages.Advance(age_ns), deltas)
+            laid, _ = await ready.component.keeper.ask(messages.Advance(clock.age_ns(deltas[-1])), tuple(deltas))
         finally:
-            close_all(tuple(chain))
+            close_all(tuple(deltas))
         self._stands(Ready(ready.component, outline), laid)
+
+    def _opened(self, position: Position, beyond: Position) -> tuple[list[int], Snapshot | None]:
+        """The deltas from one position to another, and the outline of the last, None: the chain has just been folded."""
+        deltas, known = self._around.store.open_chain(self._name, position, beyond=beyond), self._outline
+        try:
+            if not deltas or (known is not None and known.position == position):
+                return deltas, known if deltas else None
+            return deltas, format.read_outline(deltas[-1])
+        except BaseException:
+            close_all(tuple(deltas))
+            raise
 
     def _stands(self, ready: Ready, laid: messages.Laid) -> None:
         self._ready = ready

@@ -21,8 +21,8 @@ import pytest
 from msgspec.structs import replace
 
 from checkpoint.errors import ChainError, FormatError, StoreError
-from checkpoint.keeper.messages import memfd_holding
-from checkpoint.model import Snapshot
+from checkpoint.keeper.messages import close_all, memfd_holding
+from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
 from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
@@ -101,6 +101,37 @@ def test_a_delta_that_continues_nothing_here_asks_for_a_base(tmp_path: Path) -> 
         with pytest.raises(ChainError, match="ask for a base"):
             put(store, third)
         assert store.newest(COMPONENT) == base.position
+
+
+def test_a_snapshot_whose_position_names_another_state_asks_for_a_base(tmp_path: Path) -> None:
+    base, second = history(2)
+    with opened(tmp_path / "store") as store:
+        put(store, base)
+        with pytest.raises(ChainError, match="the state is not that of position"):
+            put(store, replace(second, position=replace(second.position, digest=bytes(16))))
+        put(store, second)
+        assert store.newest(COMPONENT) == second.position
+
+
+def test_only_the_files_after_a_position_that_the_caller_has_are_opened(tmp_path: Path) -> None:
+    made = history(4)
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+
+        def positions(beyond: Position | None) -> list[Position]:
+            descriptors = store.open_chain(COMPONENT, made[3].position, beyond=beyond)
+            try:
+                return [format.read_header(descriptor).position for descriptor in descriptors]
+            finally:
+                close_all(tuple(descriptors))
+
+        assert positions(None) == [one.position for one in made]
+        assert positions(made[1].position) == [made[2].position, made[3].position]
+        assert positions(made[3].position) == []
+        store.fold(COMPONENT, made[2].position)
+        assert positions(made[1].position) == [], "the chain does not lead over it any more"
+        assert positions(made[2].position) == [made[3].position]
 
 
 def test_a_snapshot_that_is_damaged_on_arrival_leaves_no_trace(tmp_path: Path) -> None:
