@@ -276,7 +276,12 @@ def decode_output(packed: bytes | memoryview) -> tuple[OutputPiece, ...]:
 
 def state_digest(snapshot: Snapshot) -> bytes:
     """The digest that a position must have: the first 16 bytes of blake3(page sum ‖ blake3(state bytes))."""
-    return blake3(snapshot.page_sum + blake3(encode_state(snapshot)).digest()).digest(length=STATE_DIGEST_SIZE)
+    return digest_of_state(snapshot.page_sum, encode_state(snapshot))
+
+
+def digest_of_state(page_sum: bytes, packed: bytes | memoryview) -> bytes:
+    """The same, of a state that is encoded already."""
+    return blake3(page_sum + blake3(packed).digest()).digest(length=STATE_DIGEST_SIZE)
 
 
 def _encoded(value: object, what: str) -> bytes:

@@ -11,6 +11,8 @@ import io
 import struct
 from collections.abc import Iterable
 from contextlib import closing
+from threading import local
+from typing import Final
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -21,6 +23,7 @@ from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Flags, Words
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.runtime import parallel
+from checkpoint.runtime.identity_memo import Memo
 from checkpoint.runtime.lazy_numpy import NDArray, np
 from checkpoint.snapshot import canonical_state, compression, layout
 from checkpoint.snapshot.byte_sources import Reader, Source, opened
@@ -36,6 +39,8 @@ _COUNTS = struct.Struct("<QQ")  # of the run table: cleared runs, carried runs
 _RUN_SIZE = 16
 _COUNT = struct.Struct("<Q")  # of its copies, and of its differences
 _COPY_SIZE = 24
+
+_of_thread: Final = local()
 
 
 # Writing
@@ -108,7 +113,7 @@ def _pack_sections(snapshot: Snapshot) -> tuple[tuple[Section, ...], list[bytes]
     """The section table, and the stored bytes of every section."""
     raw = {
         SectionKind.HEADER: canonical_state.encode_header(canonical_state.header_of(snapshot)),
-        SectionKind.STATE: canonical_state.encode_state(snapshot),
+        SectionKind.STATE: encoded_state(snapshot),
         SectionKind.RUNS: _pack_runs(snapshot),
         SectionKind.OUTPUT: canonical_state.encode_output(snapshot.output),
     }
@@ -124,6 +129,16 @@ def _pack_sections(snapshot: Snapshot) -> tuple[tuple[Section, ...], list[bytes]
         stored.append(bytes(body))
         offset += len(body)
     return tuple(sections), stored
+
+
+def encoded_state(snapshot: Snapshot) -> bytes:
+    """As `canonical_state.encode_state`; once for a position's digest and the file, whose states are the very same objects."""
+    if not hasattr(_of_thread, "state"):
+        _of_thread.state = Memo[bytes]()
+    last: Memo[bytes] = _of_thread.state
+    parts = (snapshot.machine, snapshot.clocks, snapshot.process, snapshot.threads, snapshot.vmas, snapshot.resources)
+    others = (snapshot.component, snapshot.engine, snapshot.epoch, snapshot.members, snapshot.zombies)
+    return last.of(*parts, *others, make=lambda: canonical_state.encode_state(snapshot))
 
 
 def _pack_runs(snapshot: Snapshot) -> bytes:
@@ -155,8 +170,16 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
     Raises:
         FormatError: not a whole, unaltered snapshot of a version that we read; says what and where.
     """
+    return decode_with_digest(source, max_contents_size, threads=threads)[0]
+
+
+def decode_with_digest(
+    source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *, threads: int = 1
+) -> tuple[Snapshot, bytes]:
+    """As `decode`; and the digest that the position must have (`canonical_state.state_digest`), of the bytes as read."""
     with opened(source) as reader:
-        preamble, outline = outlined(reader)
+        preamble = _read_preamble(reader)
+        outline, state = _read_outline(reader, preamble)
         check_contents_size(preamble.contents_size, max_contents_size)
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
 
@@ -168,7 +191,8 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
         frames = enumerate(frames_of(reader, preamble))
         for _ in parallel.in_order(read, frames, worth(threads, preamble)):
             pass
-    return replace(outline, contents=contents.toreadonly())
+    digest = canonical_state.digest_of_state(outline.page_sum, state)
+    return replace(outline, contents=contents.toreadonly()), digest
 
 
 def read_header(source: Source) -> Header:
@@ -199,7 +223,9 @@ def read_state(source: Source) -> State:
         FormatError: no state of ours; the rest of the file is not looked at.
     """
     with opened(source) as reader:
-        return _read_state(reader, _read_preamble(reader))
+        preamble = _read_preamble(reader)
+        state = _read_section(reader, preamble, SectionKind.STATE)
+        return canonical_state.decode_state(state, is_tree=preamble.is_tree)
 
 
 def is_of_several_processes(source: Source) -> bool:
@@ -272,7 +298,7 @@ def verified_outline(source: Source) -> Snapshot:
 def outlined(reader: Reader) -> tuple[Preamble, Snapshot]:
     """The preamble of a file, and what `read_outline` answers."""
     preamble = _read_preamble(reader)
-    return preamble, _read_outline(reader, preamble)
+    return preamble, _read_outline(reader, preamble)[0]
 
 
 def _read_preamble(reader: Reader) -> Preamble:
@@ -286,14 +312,11 @@ def _read_header(reader: Reader, preamble: Preamble) -> Header:
     return header
 
 
-def _read_state(reader: Reader, preamble: Preamble) -> State:
-    return canonical_state.decode_state(_read_section(reader, preamble, SectionKind.STATE), is_tree=preamble.is_tree)
-
-
-def _read_outline(reader: Reader, preamble: Preamble) -> Snapshot:
-    """Every section, checked against one another."""
+def _read_outline(reader: Reader, preamble: Preamble) -> tuple[Snapshot, bytes | memoryview]:
+    """Every section, checked against one another; and the bytes of the state."""
     header = _read_header(reader, preamble)
-    decoded = _read_state(reader, preamble)
+    state = _read_section(reader, preamble, SectionKind.STATE)
+    decoded = canonical_state.decode_state(state, is_tree=preamble.is_tree)
     table = _parse_runs(_read_section(reader, preamble, SectionKind.RUNS), preamble)
     output = canonical_state.decode_output(_read_section(reader, preamble, SectionKind.OUTPUT))
     snapshot = Snapshot(
@@ -324,7 +347,7 @@ def _read_outline(reader: Reader, preamble: Preamble) -> Snapshot:
     if canonical_state.header_of(snapshot) != header:
         raise FormatError("header: does not describe the other sections")
     check_snapshot(snapshot, contents_size=preamble.contents_size)
-    return snapshot
+    return snapshot, state
 
 
 def _read_section(reader: Reader, preamble: Preamble, kind: SectionKind) -> bytes | memoryview:

@@ -19,7 +19,7 @@ from checkpoint.model import OutputPiece, PageCopy, Position, Snapshot
 from checkpoint.pages import page_set
 from checkpoint.pages.page_set import PageMap, PageTable
 from checkpoint.runtime.lazy_numpy import np
-from checkpoint.snapshot.canonical_state import state_digest
+from checkpoint.snapshot.canonical_state import digest_of_state, state_digest
 from checkpoint.snapshot.process_tree import every_mapping
 from checkpoint.snapshot.validity import STREAMS, place
 from checkpoint.store.page_origins import Origins
@@ -27,9 +27,14 @@ from checkpoint.store.page_origins import Origins
 __all__ = ["applied", "check_continues", "check_state", "fold", "position_of", "state_digest"]
 
 
-def position_of(snapshot: Snapshot, generation: int, sequence: int) -> Position:
-    """The position that a snapshot with this state and page sum has."""
-    return Position(generation, sequence, state_digest(snapshot))
+def position_of(snapshot: Snapshot, generation: int, sequence: int, packed: bytes = b"") -> Position:
+    """The position that a snapshot with this state and page sum has.
+
+    Args:
+        packed: its encoded state (`canonical_state.encode_state`), where that is at hand.
+    """
+    digest = digest_of_state(snapshot.page_sum, packed) if packed else state_digest(snapshot)
+    return Position(generation, sequence, digest)
 
 
 def check_continues(parent: Position, delta: Snapshot) -> None:
@@ -55,17 +60,18 @@ def applied(table: PageTable, snapshot: Snapshot) -> PageTable:
     return table.apply(snapshot.cleared, snapshot.runs, contents, every_mapping(snapshot), snapshot.copies)
 
 
-def check_state(snapshot: Snapshot, page_sum: bytes) -> None:
+def check_state(snapshot: Snapshot, page_sum: bytes, digest: bytes = b"") -> None:
     """Refuse a snapshot that does not lead to the state that its position names.
 
     Args:
         page_sum: of the whole state with this snapshot applied, as ``PageTable.apply`` or ``fold`` counted it.
+        digest: `state_digest` of it, where that is known.
 
     Raises:
         ChainError: the state is not what the sender had; the cure is a new base.
     """
     check_sum(snapshot, page_sum)
-    _check_digest(snapshot)
+    _check_digest(snapshot, digest)
 
 
 def check_sum(snapshot: Snapshot, page_sum: bytes) -> None:
@@ -75,8 +81,8 @@ def check_sum(snapshot: Snapshot, page_sum: bytes) -> None:
         raise ChainError(f"the pages do not add up to {_named(snapshot)}: {wrong}; ask for a base")
 
 
-def _check_digest(snapshot: Snapshot) -> None:
-    digest = state_digest(snapshot)
+def _check_digest(snapshot: Snapshot, digest: bytes = b"") -> None:
+    digest = digest or state_digest(snapshot)
     if digest != snapshot.position.digest:
         wrong = _unequal(digest, snapshot.position.digest)
         raise ChainError(f"the state is not that of {_named(snapshot)}: {wrong}; ask for a base")

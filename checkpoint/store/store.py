@@ -213,11 +213,11 @@ class Store:
             ChainError: it continues no position that the store holds, or does not lead to the state it names; ask for a base.
             StoreError: the disk does not take it; nothing of it is left.
         """
-        snapshot = format.decode(source) if prove else format.verified_outline(source)
+        snapshot, digest = format.decode_with_digest(source) if prove else (format.verified_outline(source), b"")
         with self._change_of(snapshot.component):
             shelf = self._shelf(snapshot.component)
             self._check_parent(shelf, snapshot)
-            proved = self._proofs.prove(shelf, snapshot) if prove else None
+            proved = self._proofs.prove(shelf, snapshot, digest) if prove else None
             final = self._root / folder_name(snapshot.component) / file_name(header_of(snapshot))
             if all(entry.path != final for entry in shelf.entries):
                 size = self._files.write(final, lambda file: file.copy_from(source), source)

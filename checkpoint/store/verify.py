@@ -50,15 +50,18 @@ class Proofs:
         self._decoded = decoded
         self._proved: dict[str, Proved] = {}
 
-    def prove(self, shelf: Shelf, snapshot: Snapshot) -> Proved:
+    def prove(self, shelf: Shelf, snapshot: Snapshot, digest: bytes) -> Proved:
         """Apply a snapshot to the pages of its parent, which the shelf holds, and compare.
+
+        Args:
+            digest: that its position must have.
 
         Raises:
             ChainError: it leads elsewhere.
         """
         parent = self._unproved(snapshot) if snapshot.parent is None else self._at(shelf, snapshot.parent)
         proved = self._applied(shelf, parent, snapshot)
-        chain.check_state(snapshot, proved.table.page_sum)
+        chain.check_state(snapshot, proved.table.page_sum, digest)
         return proved
 
     def keep(self, component: str, proved: Proved) -> None:

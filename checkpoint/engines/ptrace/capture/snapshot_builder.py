@@ -32,7 +32,7 @@ from checkpoint.resources.open_file import Surroundings
 from checkpoint.resources.process import control_groups
 from checkpoint.resources.survey import look
 from checkpoint.segment.output_counters import Totals
-from checkpoint.snapshot import credentials, process_tree
+from checkpoint.snapshot import credentials, format, process_tree
 from checkpoint.store.base_in_process import UnreadBase
 from checkpoint.store.chain import position_of
 
@@ -146,7 +146,8 @@ class SnapshotBuilder:
         self.frozen_size = taken.frozen_size
         self._budget.note(frozen.freeze_us * NS_PER_US, sum(look.taken.copy_ns for _, look in looks), taken.frozen_size)
         snapshot = self._with_pages(outline, with_parcel(taken, parcel, is_base=parent is None))
-        snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence))
+        packed = format.encoded_state(snapshot)
+        snapshot = replace(snapshot, position=position_of(snapshot, order.generation, order.sequence, packed))
         for process, _ in looks:
             process.settle(snapshot.position)
         if self._carried:
