@@ -222,7 +222,7 @@ class Supervisor:
                     self._is_thaw_owed = False  # a lease that comes meanwhile lets nothing run that is to be handed over
                 component = self._present()
                 await self._occasions.before_capture(act, component.pid)
-                async with under_way.told(self.around.tell, events.UnderWay(self.name, act.epoch)):
+                with under_way.told(self.around.tell, events.UnderWay(self.name, act.epoch)):
                     await self._snapshots.capture(component, act)
             case acts.Acknowledge():
                 if self.component is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from failover.core.events import Event, UnderWay
@@ -13,17 +13,18 @@ EVERY_S: Final = 5.0
 """Far less than `failover.core.types.Config.ship_ms`, after which the core gives up what it hears nothing of."""
 
 
-@contextlib.asynccontextmanager
-async def told(tell: Callable[[Event], None], event: UnderWay) -> AsyncIterator[None]:
-    """Tell the event again and again for as long as the body lasts."""
-    telling = asyncio.create_task(_tell(tell, event))
+@contextlib.contextmanager
+def told(tell: Callable[[Event], None], event: UnderWay) -> Iterator[None]:
+    """Tell the event again and again for as long as the body lasts; most bodies are over before the first time."""
+    loop = asyncio.get_running_loop()
+
+    def again() -> None:
+        nonlocal timer
+        timer = loop.call_later(EVERY_S, again)
+        tell(event)
+
+    timer = loop.call_later(EVERY_S, again)
     try:
         yield
     finally:
-        telling.cancel()
-
-
-async def _tell(tell: Callable[[Event], None], event: UnderWay) -> None:
-    while True:
-        await asyncio.sleep(EVERY_S)
-        tell(event)
+        timer.cancel()

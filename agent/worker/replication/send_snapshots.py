@@ -14,12 +14,12 @@ from agent.worker.replication.send_files import Bringing
 from agent.worker.replication.transfer import Shipper, digest_of
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Position
-from checkpoint.snapshot.required_files import needs
+from checkpoint.snapshot.required_files import Need, needs
 from checkpoint.store.index import Entry
 from checkpoint.store.store import Store
 from failover.core.acts import CancelShip, Ship
 from failover.core.events import Event, ShipEnded, UnderWay
-from failover.core.wire.messages import Offer
+from failover.core.wire.messages import CHUNK_SIZE_MAX, Offer
 
 log = logging.getLogger("failover.dispatch")
 
@@ -75,7 +75,7 @@ class Dispatch:
     async def _ship(self, act: Ship) -> None:
         reason = ""
         try:
-            async with under_way.told(self._tell, UnderWay(act.component, act.epoch, act.position, act.to)):
+            with under_way.told(self._tell, UnderWay(act.component, act.epoch, act.position, act.to)):
                 await self._send(act)
         except (AgentError, CheckpointError) as error:
             reason = str(error)
@@ -89,13 +89,15 @@ class Dispatch:
     async def _send(self, act: Ship) -> None:
         if hindrance := self._hindrance():
             raise LaneError(f"snapshots wait: {hindrance}")
-        entry = await asyncio.to_thread(self._entry, act)
+        entry = self._store.chain_of(act.component, act.position)[-1]
+        if (act.whole or act.parent is None) and entry.parent is not None:  # a base is wanted
+            entry = await asyncio.to_thread(self._folded, act)
         descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
+            needed, digest = await asyncio.to_thread(self._examined, act.component, entry, descriptor)
             if self._bringing is not None:
-                outline = await asyncio.to_thread(self._store.outline, act.component, entry, descriptor)
-                await self._bringing.bring(act.to, act.component, needs(outline, opened=self._brings_data(act.component)))
-            digest = await asyncio.to_thread(digest_of, descriptor, entry.size)
+                await self._bringing.bring(act.to, act.component, needed)
+            digest = digest or await asyncio.to_thread(digest_of, descriptor, entry.size)
             offer = Offer(
                 0, act.component, entry.epoch, entry.position, entry.parent, entry.size, digest, act.spec, act.acknowledged
             )
@@ -103,10 +105,13 @@ class Dispatch:
         finally:
             os.close(descriptor)
 
-    def _entry(self, act: Ship) -> Entry:
-        """The file to send: a base where one is wanted, folded now if need be."""
-        entry = self._store.chain_of(act.component, act.position)[-1]
-        if (act.whole or act.parent is None) and entry.parent is not None:
-            self._store.fold(act.component, act.position)
-            entry = self._store.chain_of(act.component, act.position)[-1]
-        return entry
+    def _folded(self, act: Ship) -> Entry:
+        self._store.fold(act.component, act.position)
+        return self._store.chain_of(act.component, act.position)[-1]
+
+    def _examined(self, component: str, entry: Entry, descriptor: int) -> tuple[tuple[Need, ...], bytes]:
+        """The files that a snapshot needs; and its digest, b"" of a large one: its files may be on their way for long."""
+        digest = digest_of(descriptor, entry.size) if entry.size <= CHUNK_SIZE_MAX else b""
+        if self._bringing is None:
+            return (), digest
+        return needs(self._store.outline(component, entry, descriptor), opened=self._brings_data(component)), digest
