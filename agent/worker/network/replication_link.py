@@ -31,7 +31,7 @@ from agent.system.rtnetlink import allow_absent
 from agent.worker.network.links import Device
 from failover.config.team import for_lookup, split_address
 from failover.core.wire.codec import decode_bulk, encode_bulk
-from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Chunk
+from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Chunk, Offer
 
 QUEUE_LIMIT: Final = 1_024
 """Messages waiting for one peer, chunks not counted: a peer that takes none for so long has lost them anyway."""
@@ -210,21 +210,24 @@ class PeerConnection:
         self._wake.set()
         return True
 
-    async def ship(self, chunk: Chunk) -> None:
-        """Send one chunk after all small messages; returns when ZeroMQ has taken it.
+    async def ship(self, chunk: Chunk | Offer) -> None:
+        """Send one chunk, or an offer that is as large, after all small messages; returns when ZeroMQ has taken it.
 
         Raises:
             LaneError: the connection is down, or went down meanwhile.
         """
         while self._chunk is not None and self.state is LinkState.CONNECTED:
-            with contextlib.suppress(LaneError):
-                await asyncio.shield(self._chunk[1])
+            await asyncio.wait((self._chunk[1],))  # given up by its own sender, too
         if self.state is not LinkState.CONNECTED:
             raise LaneError(f"the replication link to {self.peer} is down: {self.reason or self.state}")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._chunk = (encode_bulk(chunk), done)
+        self._chunk = waiting = (encode_bulk(chunk), done)
         self._wake.set()
-        await done
+        try:
+            await done
+        finally:
+            if done.cancelled() and self._chunk is waiting:  # what is given up does not leave any more
+                self._chunk = None
 
     def refuse(self, reason: str) -> None:
         """Talk no further with this peer until it connects anew: it broke the rules."""
@@ -443,8 +446,8 @@ class ReplicationLink:
         """Queue a small message to a peer; False: it is not connected, the message was dropped."""
         return peer in self.links and self.links[peer].say(message)
 
-    async def ship(self, peer: str, chunk: Chunk) -> None:
-        """Send one chunk; see `PeerConnection.ship`."""
+    async def ship(self, peer: str, chunk: Chunk | Offer) -> None:
+        """Send one chunk, or an offer that is as large; see `PeerConnection.ship`."""
         if peer not in self.links:
             raise LaneError(f"{peer} has left the team")
         await self.links[peer].ship(chunk)

@@ -15,15 +15,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
-import msgspec
 from blake3 import blake3
 from msgspec import Struct, field
+from msgspec.structs import replace
 
 from agent.errors import LaneError
 from agent.system.crash import end_worker_on_mistake
 from agent.system.threads import to_its_end
 from checkpoint.errors import StoreError
 from checkpoint.store.disk import Disk, DiskFile
+from failover.core.wire.codec import encode_bulk
 from failover.core.wire.messages import (
     CHUNK_SIZE_MAX,
     SNAPSHOT_SIZE_MAX,
@@ -61,7 +62,7 @@ class Link(Protocol):
     """The part of `agent.worker.network.replication_link.ReplicationLink` that is needed here."""
 
     def say(self, peer: str, message: Bulk) -> bool: ...
-    async def ship(self, peer: str, chunk: Chunk) -> None: ...
+    async def ship(self, peer: str, chunk: Chunk | Offer) -> None: ...
 
 
 SNAPSHOT: Final = "snapshot"
@@ -112,8 +113,8 @@ class Shipper:
         number = next(self._numbers)
         transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
         try:
-            if not self._link.say(peer, msgspec.structs.replace(offer, transfer=number)):
-                raise LaneError(f"the replication link to {peer} is not connected")
+            if not await self._offered_whole(peer, transfer, replace(offer, transfer=number), descriptor):
+                return
             for offset in range(0, offer.size, CHUNK_SIZE_MAX):
                 size = min(CHUNK_SIZE_MAX, offer.size - offset)
                 await self._until(transfer, lambda end=offset + size: transfer.until >= end)  # type: ignore[misc]
@@ -128,6 +129,22 @@ class Shipper:
             raise
         finally:
             del self._outgoing[number]
+
+    async def _offered_whole(self, peer: str, transfer: _Outgoing, offer: Offered, descriptor: int) -> bool:
+        """Offer it, a small snapshot with all of its bytes; whether they are still to be sent, in chunks.
+
+        Raises:
+            LaneError: as `ship`.
+        """
+        if not isinstance(offer, Offer) or offer.size + len(encode_bulk(offer)) > CHUNK_SIZE_MAX:
+            if not self._link.say(peer, offer):
+                raise LaneError(f"the replication link to {peer} is not connected")
+            return True
+        await self._pace.wait(offer.size)
+        await self._link.ship(peer, replace(offer, content=os.pread(descriptor, offer.size, 0)))
+        transfer.sent = True
+        await self._until(transfer, lambda: transfer.taken or transfer.until >= offer.size, STORED_S)
+        return not transfer.taken
 
     def heard(self, peer: str, message: Credit | Taken | Refuse) -> None:
         """Take the receiver's answer in; one for a transfer that has ended, or of another peer, is dropped."""
@@ -229,12 +246,17 @@ class Desk(Protocol[Kind]):
 
 
 class _Incoming(Struct):
-    """One transfer that comes in, and the task that writes it."""
+    """One transfer that comes in, and the task that writes it.
+
+    Attributes:
+        content: all of it, where it came with the offer; ``credit`` is for what comes in chunks.
+    """
 
     offer: Offered
     chunks: asyncio.Queue[Chunk]
     credit: int = WINDOW
     task: asyncio.Task[None] | None = None
+    content: bytes = b""
 
 
 class Receiver:
@@ -264,6 +286,8 @@ class Receiver:
             self._link.say(peer, Refuse(offer.transfer, str(refusal), refusal.needs_base))
             return
         transfer = self._incoming[peer, offer.transfer] = _Incoming(offer, asyncio.Queue(WINDOW_CHUNKS))
+        if isinstance(offer, Offer) and offer.content:
+            transfer.offer, transfer.content, transfer.credit = replace(offer, content=b""), offer.content, 0
         transfer.task = asyncio.create_task(self._receive(peer, transfer))
         transfer.task.add_done_callback(end_worker_on_mistake)
 
@@ -337,7 +361,13 @@ class Receiver:
         offer, digest, end = transfer.offer, blake3(), 0
         what = SNAPSHOT if isinstance(offer, Offer) else FILE
         file = DiskFile(Disk(), descriptor)
-        self._link.say(peer, Credit(offer.transfer, transfer.credit))
+        if content := transfer.content:
+            transfer.content, end = b"", len(content)
+            if end != offer.size:
+                raise LaneError(f"{peer} sent {end} bytes with an offer of {offer.size}")
+            await to_its_end(_keep, file, content, digest)
+        else:
+            self._link.say(peer, Credit(offer.transfer, transfer.credit))
         while end < offer.size:
             try:
                 async with asyncio.timeout(PATIENCE_S):

@@ -172,6 +172,8 @@ class Offer(msgspec.Struct, frozen=True, tag="offer"):
         size: bytes of the encoded snapshot (``checkpoint/snapshot/FORMAT.md``); ``digest``: blake3 of them, 32 bytes.
         parent: what it continues; None for a base.
         acknowledged: the newest position of its line that counts as acknowledged; None: not known, or an older agent.
+        content: all bytes of a small one, which then needs neither credit nor chunk; b"" where they come in chunks. An older
+            receiver does not know this field: it gives credit, and gets the chunk.
     """
 
     transfer: int
@@ -183,6 +185,7 @@ class Offer(msgspec.Struct, frozen=True, tag="offer"):
     digest: bytes
     spec: ComponentSpec
     acknowledged: Position | None = None
+    content: bytes = b""
 
 
 class Belonging(msgspec.Struct, frozen=True, array_like=True):

@@ -17,9 +17,11 @@ from agent.worker.replication import transfer
 from agent.worker.replication.transfer import Receiver, Refusal, Shipper, digest_of
 from checkpoint.model import Position
 from failover.core.types import ComponentSpec
+from failover.core.wire.codec import encode_bulk
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk, Credit, Offer, Refuse, Taken
 
 SIZE = 5 * CHUNK_SIZE_MAX + 17
+SMALL = 3_000
 BOUND_S = 20.0
 
 
@@ -37,7 +39,7 @@ class Link:
             asyncio.get_running_loop().call_soon(self.deliver, peer, message)
         return self.connected
 
-    async def ship(self, peer: str, chunk: Chunk) -> None:
+    async def ship(self, peer: str, chunk: Chunk | Offer) -> None:
         self.say(peer, chunk)
 
 
@@ -100,10 +102,10 @@ def little_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer, "PATIENCE_S", 0.2)
 
 
-async def ship(two: Two, path: Path) -> None:
+async def ship(two: Two, path: Path, size: int = SIZE) -> None:
     with path.open("rb") as file:
-        digest = digest_of(file.fileno(), SIZE)
-        offer = Offer(0, "/lab/a", 1, Position(1, 1, b""), None, SIZE, digest, ComponentSpec("/lab/a"))
+        digest = digest_of(file.fileno(), size)
+        offer = Offer(0, "/lab/a", 1, Position(1, 1, b""), None, size, digest, ComponentSpec("/lab/a"))
         await asyncio.wait_for(two.shipper.ship("robot2", offer, file.fileno()), BOUND_S)
 
 
@@ -122,6 +124,86 @@ def test_a_snapshot_arrives_whole(tmp_path: Path, content: Path) -> None:
         while not two.desk.taken:
             await asyncio.sleep(0)
         assert two.desk.taken == [content.read_bytes()]
+
+    run(body())
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    path = tmp_path / "snapshot"
+    path.write_bytes(os.urandom(SMALL))
+    return path
+
+
+def test_a_small_snapshot_travels_with_its_offer(tmp_path: Path, small: Path) -> None:
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        await ship(two, small, SMALL)
+        assert two.desk.taken == [small.read_bytes()]
+        assert [type(message) for message in (*two.out.said, *two.back.said)] == [Offer, Taken]
+
+    run(body())
+
+
+def test_a_receiver_of_an_older_release_gets_a_small_snapshot_as_a_chunk(tmp_path: Path, small: Path) -> None:
+    def without_content(message: Bulk) -> Bulk:
+        return msgspec.structs.replace(message, content=b"") if isinstance(message, Offer) else message
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk(), without_content)
+        await ship(two, small, SMALL)
+        assert two.desk.taken == [small.read_bytes()]
+        assert [type(message) for message in two.out.said] == [Offer, Chunk]
+
+    run(body())
+
+
+@pytest.mark.parametrize("size", [SMALL, CHUNK_SIZE_MAX - 1, CHUNK_SIZE_MAX, CHUNK_SIZE_MAX + 1])
+def test_no_message_is_larger_than_a_chunk_by_more_than_its_head(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "snapshot"
+    path.write_bytes(os.urandom(size))
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk())
+        await ship(two, path, size)
+        assert two.desk.taken == [path.read_bytes()]
+        assert max(len(encode_bulk(message)) for message in two.out.said) < CHUNK_SIZE_MAX + 100
+
+    run(body())
+
+
+@pytest.mark.parametrize("spoilt", [b"", b"\0"])
+def test_a_small_snapshot_that_is_not_what_was_offered_leaves_nothing(tmp_path: Path, small: Path, spoilt: bytes) -> None:
+    def spoil(message: Bulk) -> Bulk:
+        if not isinstance(message, Offer):
+            return message
+        return msgspec.structs.replace(message, content=message.content[:-1] + spoilt)
+
+    async def body() -> None:
+        two = Two(tmp_path, Desk(), spoil)
+        with pytest.raises(LaneError, match=r"sent .* bytes with an offer of|is not the promised digest"):
+            await ship(two, small, SMALL)
+        assert two.desk.taken == []
+        assert left_in(tmp_path) == []
+
+    small.write_bytes(os.urandom(SMALL - 1) + b"\1")
+    run(body())
+
+
+def test_the_signs_of_one_that_stores_a_small_snapshot_slowly_are_no_credit(
+    tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transfer, "SIGN_S", 0.01)
+
+    async def body() -> None:
+        free = asyncio.Event()
+        two = Two(tmp_path, Slow(free))
+        shipping = asyncio.create_task(ship(two, small, SMALL))
+        while len(two.back.said) < 3:
+            await asyncio.sleep(0.01)
+        free.set()
+        await shipping
+        assert [type(message) for message in two.out.said] == [Offer]
 
     run(body())
 
