@@ -80,10 +80,13 @@ class Change(Struct, frozen=True):
         Raises:
             RestoreError: shared memory has grown in its place.
         """
-        old, new = _ours(before), _ours(delta.vmas)
         runs, cleared = page_set.extents(delta.runs), page_set.extents(delta.cleared)
         carried = page_set.union(page_set.difference(page_set.intersection(held, page_set.extents(delta.vmas)), cleared), runs)
-        gone, fresh_set = _moved(old, new)
+        is_same = before == delta.vmas  # as of most deltas: they have written pages, and nothing else
+        if is_same and np.array_equal(held, carried):  # what it clears it writes again, too
+            return cls(NO_PAGES, (), NO_PAGES, NO_PAGES, (), carried, NO_PAGES, stiff)
+        old, new = _ours(before), _ours(delta.vmas)
+        gone, fresh_set = (NO_PAGES, NO_PAGES) if is_same else _moved(old, new)
         stiff = page_set.difference(page_set.difference(stiff, gone), fresh_set)
         torn_apart = [vma for vma in new if _is_partly(vma, stiff) and _is_partly(vma, fresh_set)] if len(stiff) else []
         fresh_set = page_set.union(fresh_set, _extents(torn_apart))
