@@ -43,6 +43,29 @@ class Unshown(Struct, frozen=True):
     owner: int
 
 
+class Shown(Struct, frozen=True):
+    """The output logs of a component as this worker has brought them to a position; no other process writes them meanwhile.
+
+    Attributes:
+        ends: of each stream that the position's snapshot tells of.
+    """
+
+    generation: int
+    is_held: bool
+    owner: int
+    ends: dict[int, int]
+
+    @classmethod
+    def by(cls, one: Unshown) -> Shown:
+        """As they are when the output of this snapshot is in them."""
+        ends = {piece.stream: piece.offset + len(piece.content) for piece in one.output}
+        return cls(one.position.generation, one.is_held, one.owner, ends)
+
+    def is_continued_by_nothing(self, one: Unshown) -> bool:
+        """Whether nothing was written up to this snapshot."""
+        return not any(piece.content for piece in one.output) and Shown.by(one) == self
+
+
 class Deposit:
     """The desk (`agent.worker.replication.transfer.Desk`) at which peers hand in snapshots."""
 
@@ -73,8 +96,9 @@ class Deposit:
         self._turns: dict[str, asyncio.Lock] = {}
         self._stored: dict[tuple[str, Position], tuple[Offer, Snapshot]] = {}
         self._unshown: dict[str, deque[Unshown]] = {}
-        self._shown: dict[str, Position] = {}
+        self._brought: dict[str, Position] = {}
         """Up to where the logs were brought last."""
+        self._shown: dict[str, Shown] = {}
 
     def admit(self, act: Admit) -> None:
         """From now on take this component's snapshots from this sender alone."""
@@ -147,8 +171,10 @@ class Deposit:
             return
         unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
         unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED, offer.spec.owner))
-        if self._shown.get(act.component) == snapshot.position:  # of another component, which had this name
-            del self._shown[act.component]
+        if self._brought.get(act.component) == snapshot.position:  # of another component, which had this name
+            del self._brought[act.component]
+        if snapshot.is_base:  # likewise
+            self._shown.pop(act.component, None)
         self._kept(offer, snapshot)
 
     async def discard(self, act: Discard) -> None:
@@ -164,10 +190,31 @@ class Deposit:
     async def show(self, act: Show) -> None:
         """Extend the output streams that readers see up to an accepted position."""
         async with self._turns.setdefault(act.component, asyncio.Lock()):
+            if self._has_shown_all(act.component, act.position):
+                return
             try:
                 await asyncio.to_thread(self._show, act.component, act.position)
             except (CheckpointError, OSError) as error:
                 log.warning("the output of %s up to snapshot %d cannot be shown: %s", act.component, act.position.sequence, error)
+
+    def _due(self, component: str, position: Position) -> list[Unshown]:
+        """Those that are to be shown up to a position."""
+        unshown = tuple(self._unshown.setdefault(component, deque()))
+        return [one for one in unshown if one.position.generation == position.generation and one.position <= position]
+
+    def _forget_shown(self, component: str, position: Position) -> None:
+        unshown = self._unshown[component]
+        while unshown and unshown[0].position <= position:
+            unshown.popleft()
+
+    def _has_shown_all(self, component: str, position: Position) -> bool:
+        """Whether the logs hold all up to a position already: the program has written nothing since the one before."""
+        due, shown = self._due(component, position), self._shown.get(component)
+        if shown is None or not due or due[-1].position != position or not all(map(shown.is_continued_by_nothing, due)):
+            return False
+        self._forget_shown(component, position)
+        self._brought[component] = position
+        return True
 
     def _show(self, component: str, position: Position, *, is_elsewhere: bool = True) -> None:
         """Have the logs hold all up to a position.
@@ -175,15 +222,14 @@ class Deposit:
         Args:
             is_elsewhere: another robot is known to hold it, also where this one took it in.
         """
-        if self._shown.get(component) == position and not is_elsewhere:
+        if self._brought.get(component) == position and not is_elsewhere:
             return  # a takeover need not read the whole chain again
+        self._shown.pop(component, None)
         self._bring_logs(component, position, is_elsewhere=is_elsewhere)
-        self._shown[component] = position
+        self._brought[component] = position
 
     def _bring_logs(self, component: str, position: Position, *, is_elsewhere: bool) -> None:
-        unshown = self._unshown.setdefault(component, deque())
-        directory = log_directory(component, self._places)
-        due = [one for one in tuple(unshown) if one.position.generation == position.generation and one.position <= position]
+        directory, due = log_directory(component, self._places), self._due(component, position)
         if not due or due[-1].position != position:
             self._complete(component, directory, position, is_safe=is_elsewhere)
             return
@@ -198,8 +244,8 @@ class Deposit:
             logs.close()
         if is_gap:  # an earlier worker took in the snapshots before
             self._complete(component, directory, position, is_safe=True)
-        while unshown and unshown[0].position <= position:
-            unshown.popleft()
+        self._shown[component] = Shown.by(due[-1])
+        self._forget_shown(component, position)
 
     def _complete(self, component: str, directory: Path, position: Position, *, is_safe: bool) -> None:
         """An earlier worker took it in, or too many wait: read it from the files."""
@@ -220,6 +266,7 @@ class Deposit:
         async with self._turns.setdefault(component, asyncio.Lock()):
             if position is not None:
                 await asyncio.to_thread(self._show, component, position, is_elsewhere=False)
+            self._shown.pop(component, None)
 
     def mend_logs(self, running: Collection[str]) -> None:
         """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.

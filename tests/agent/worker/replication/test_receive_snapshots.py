@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
-from agent.guard.output_logs import OutputLogs, logs_of
+from agent.guard.output_logs import LOG_NAMES, OutputLogs, logs_of
 from agent.worker.components.paths import Places, log_directory
 from agent.worker.replication.receive_snapshots import Deposit
 from checkpoint.errors import StoreError
@@ -123,6 +123,10 @@ class Standing:
         with path.open("rb") as file:
             await self.deposit.take("robot1", offer, file.fileno())
 
+    def log(self, stream: int) -> Path:
+        """The file of a stream."""
+        return log_directory(COMPONENT, self._places) / LOG_NAMES[stream]
+
     def seen(self) -> bytes:
         """What a reader of its output sees here."""
         logs = OutputLogs(log_directory(COMPONENT, self._places))
@@ -149,6 +153,43 @@ def test_readers_see_what_counts_as_acknowledged_and_not_what_is_merely_stored(t
         await standing.deposit.show(Show(COMPONENT, 1, first.position))
         assert standing.seen() == b"ready\n"
         await standing.deposit.show(Show(COMPONENT, 1, second.position))
+        assert standing.seen() == b"ready\nline 2\n"
+
+    asyncio.run(story())
+
+
+def told_again(made: Snapshot, sequence: int, parent: Snapshot) -> Snapshot:
+    """A snapshot of the same state, whose program has written nothing since."""
+    ends = (replace(piece, offset=piece.offset + len(piece.content), content=b"") for piece in made.output)
+    position = replace(made.position, sequence=sequence)
+    return replace(made, position=position, parent=parent.position, runs=(), cleared=(), contents=b"", output=tuple(ends))
+
+
+@pytest.mark.parametrize("is_taken_over_between", [True, False])
+def test_logs_are_left_alone_where_nothing_was_written_unless_another_process_may_have(
+    tmp_path: Path, is_taken_over_between: bool
+) -> None:
+    first, second = history(2)
+    silent = told_again(first, 2, first)
+    loud = replace(silent, position=replace(silent.position, sequence=3), parent=silent.position, output=second.output)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+
+        async def show(made: Snapshot) -> None:
+            await standing.take(made)
+            standing.deposit.accept(Accept(COMPONENT, 1, made.position))
+            await standing.deposit.show(Show(COMPONENT, 1, made.position))
+
+        await show(first)
+        if is_taken_over_between:
+            await standing.deposit.settled(COMPONENT)
+        with standing.log(1).open("ab") as log:
+            log.write(b"its guard here")
+        await show(silent)
+        is_left_alone = standing.log(1).read_bytes() == b"ready\nits guard here"
+        assert is_left_alone is not is_taken_over_between
+        await show(loud)
         assert standing.seen() == b"ready\nline 2\n"
 
     asyncio.run(story())
