@@ -15,15 +15,22 @@ EVERY_S: Final = 5.0
 
 @contextlib.contextmanager
 def told(tell: Callable[[Event], None], event: UnderWay) -> Iterator[None]:
-    """Tell the event again and again for as long as the body lasts; most bodies are over before the first time."""
+    """Tell the event again and again for as long as the body lasts."""
+    with each(EVERY_S, lambda: tell(event)):
+        yield
+
+
+@contextlib.contextmanager
+def each(period_s: float, act: Callable[[], object]) -> Iterator[None]:
+    """Do something after each period for as long as the body lasts; most bodies are over before the first time."""
     loop = asyncio.get_running_loop()
 
     def again() -> None:
         nonlocal timer
-        timer = loop.call_later(EVERY_S, again)
-        tell(event)
+        timer = loop.call_later(period_s, again)
+        act()
 
-    timer = loop.call_later(EVERY_S, again)
+    timer = loop.call_later(period_s, again)
     try:
         yield
     finally:

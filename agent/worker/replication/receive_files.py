@@ -129,10 +129,10 @@ class Stock:
         if self._awaited.get(peer, {}).get(offer.digest) != offer.size:
             raise Refusal("this robot has not asked for that file")
 
-    async def make_room(self, size: int) -> None:
+    def make_room(self, size: int) -> None:
         """As for a snapshot."""
         try:
-            await asyncio.to_thread(self._store.make_room, size)
+            self._store.make_room(size)
         except StoreError as error:
             log.warning("%s", error)
 

@@ -129,10 +129,10 @@ class Deposit:
         taken = admitted is not None and admitted.sender == peer
         return "" if taken else f"this robot does not take snapshots of {component} from {peer}"
 
-    async def make_room(self, size: int) -> None:
+    def make_room(self, size: int) -> None:
         """Have room for a snapshot of so many bytes, if the snapshots kept for people can give it."""
         try:
-            await asyncio.to_thread(self._store.make_room, size)
+            self._store.make_room(size)
         except StoreError as error:
             log.warning("%s", error)
 

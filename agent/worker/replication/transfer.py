@@ -22,6 +22,7 @@ from msgspec.structs import replace
 from agent.errors import LaneError
 from agent.system.crash import end_worker_on_mistake
 from agent.system.threads import to_its_end
+from agent.worker.components import under_way
 from checkpoint.errors import StoreError
 from checkpoint.store.disk import Disk, DiskFile
 from failover.core.wire.codec import encode_bulk
@@ -238,8 +239,8 @@ class Desk(Protocol[Kind]):
             StoreError: the disk does not take a content; its sender is told.
         """
 
-    async def make_room(self, size: int) -> None:
-        """So many bytes are about to be written."""
+    def make_room(self, size: int) -> None:
+        """So many bytes are about to be written. Called in a thread."""
 
     def not_taken(self, peer: str, offer: Kind, why: str) -> None:
         """They could not be written."""
@@ -250,6 +251,8 @@ class _Incoming(Struct):
 
     Attributes:
         content: all of it, where it came with the offer; ``credit`` is for what comes in chunks.
+        descriptor: of the unnamed file that it is written to; -1: there is none yet.
+        digest: of what is written.
     """
 
     offer: Offered
@@ -257,6 +260,8 @@ class _Incoming(Struct):
     credit: int = WINDOW
     task: asyncio.Task[None] | None = None
     content: bytes = b""
+    descriptor: int = -1
+    digest: blake3 = field(default_factory=blake3)
 
 
 class Receiver:
@@ -328,18 +333,15 @@ class Receiver:
         """Fill an unnamed file, so that no failure leaves half a file, and hand it over."""
         offer = transfer.offer
         try:
-            await self._desk.make_room(offer.size)
-            descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
-            signs = asyncio.create_task(self._repeat_credit(peer, transfer))
-            try:
-                await self._fill(peer, transfer, descriptor)
+            with under_way.each(SIGN_S, lambda: self._link.say(peer, Credit(offer.transfer, transfer.credit))):
+                await to_its_end(self._begin, transfer)
+                if transfer.credit:
+                    await self._fill(peer, transfer)
+                self._require_whole(peer, transfer)
                 if isinstance(offer, Offer):
                     self._incoming.pop((peer, offer.transfer), None)  # a newer offer does not end a whole one
-                await self._desk.take(peer, offer, descriptor)
+                await self._desk.take(peer, offer, transfer.descriptor)
                 self._link.say(peer, Taken(offer.transfer))
-            finally:
-                signs.cancel()
-                os.close(descriptor)
         except OSError as error:
             why = f"cannot write it there: {error.strerror}"
             log.warning("gave up %s from %s: %s", _named(offer), peer, why)
@@ -350,24 +352,34 @@ class Receiver:
             self._link.say(peer, Refuse(offer.transfer, str(error)))
         finally:
             self._incoming.pop((peer, offer.transfer), None)
+            if transfer.descriptor >= 0:
+                os.close(transfer.descriptor)
 
-    async def _repeat_credit(self, peer: str, transfer: _Incoming) -> None:
-        """So that the sender knows that this robot has not forgotten it, however slow the disk is."""
-        while True:
-            await asyncio.sleep(SIGN_S)
-            self._link.say(peer, Credit(transfer.offer.transfer, transfer.credit))
+    def _begin(self, transfer: _Incoming) -> None:
+        """Have an unnamed file, with the content that came with the offer."""
+        self._desk.make_room(transfer.offer.size)
+        transfer.descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        if transfer.content:
+            _keep(DiskFile(Disk(), transfer.descriptor), transfer.content, transfer.digest)
 
-    async def _fill(self, peer: str, transfer: _Incoming, descriptor: int) -> None:
-        offer, digest, end = transfer.offer, blake3(), 0
+    def _require_whole(self, peer: str, transfer: _Incoming) -> None:
+        """See that it is what was offered.
+
+        Raises:
+            LaneError: it is not.
+        """
+        size, content = transfer.offer.size, transfer.content
+        if content and len(content) != size:
+            raise LaneError(f"{peer} sent {len(content)} bytes with an offer of {size}")
+        if transfer.digest.digest() != transfer.offer.digest:
+            raise LaneError(f"{peer} sent {size} bytes whose digest is not the promised digest")
+
+    async def _fill(self, peer: str, transfer: _Incoming) -> None:
+        """Write what comes in chunks."""
+        offer, end = transfer.offer, 0
         what = SNAPSHOT if isinstance(offer, Offer) else FILE
-        file = DiskFile(Disk(), descriptor)
-        if content := transfer.content:
-            transfer.content, end = b"", len(content)
-            if end != offer.size:
-                raise LaneError(f"{peer} sent {end} bytes with an offer of {offer.size}")
-            await to_its_end(_keep, file, content, digest)
-        else:
-            self._link.say(peer, Credit(offer.transfer, transfer.credit))
+        file = DiskFile(Disk(), transfer.descriptor)
+        self._link.say(peer, Credit(offer.transfer, transfer.credit))
         while end < offer.size:
             try:
                 async with asyncio.timeout(PATIENCE_S):
@@ -376,12 +388,10 @@ class Receiver:
                 raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
             if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
                 raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
-            await to_its_end(_keep, file, chunk.content, digest)
+            await to_its_end(_keep, file, chunk.content, transfer.digest)
             end += len(chunk.content)
             transfer.credit = end + WINDOW
             self._link.say(peer, Credit(offer.transfer, transfer.credit))
-        if digest.digest() != offer.digest:
-            raise LaneError(f"{peer} sent {offer.size} bytes whose digest is not the promised digest")
 
 
 def _of(offer: Offered) -> str | bytes:

@@ -58,7 +58,7 @@ class Desk:
     async def take(self, peer: str, offer: Offer, descriptor: int) -> None:
         self.taken.append(os.pread(descriptor, offer.size, 0))
 
-    async def make_room(self, size: int) -> None:
+    def make_room(self, size: int) -> None:
         self.room = size
 
     def not_taken(self, peer: str, offer: Offer, why: str) -> None:
