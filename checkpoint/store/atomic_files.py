@@ -93,6 +93,11 @@ class WholeFiles:
         with self._lock:
             self._damaged.add(path)
 
+    @property
+    def are_damaged(self) -> bool:
+        """Whether any file is set out of use."""
+        return bool(self._damaged)
+
     def remove_damaged(self, folder: Path, is_old: Callable[[Path], bool]) -> None:
         """Remove files that were set out of use; one that has been put again since is no longer among them. Raises OSError."""
         with self._lock:

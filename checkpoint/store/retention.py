@@ -90,6 +90,12 @@ class History:
             self._olds[path.parent.name] = (*olds, Old(final, stored.st_mtime, stored.st_size))
             return True
 
+    def is_too_much(self, folder: str, now_s: float, store_size: int) -> bool:
+        """Whether `thin` or `shrink` would remove something; the disk is not asked."""
+        olds, kept = self.of(folder), self._retention
+        is_long = bool(olds) and (len(olds) > kept.count or now_s - olds[0].stored_s > kept.span_s)
+        return is_long or bool(kept.size_max and store_size + self.size > kept.size_max and any(list(self._olds.values())))
+
     def thin(self, folder: str, now_s: float) -> None:
         """Remove what is too many of one component, or too old. Raises StoreError."""
         with self._lock:

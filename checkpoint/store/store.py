@@ -265,6 +265,19 @@ class Store:
 
     # Forgetting
 
+    def is_prune_due(self, component: str, oldest: Position) -> bool:
+        """Whether `prune` would do anything; the disk is not asked, so that any thread may."""
+        with self._lock:
+            shelf = self._shelf(component)
+            if fold_is_due(shelf.chain_to(oldest)) or shelf.unneeded_for(oldest) or self._files.are_damaged:
+                return True
+            return self._history.is_too_much(folder_name(component), time.time(), self._needed_size())
+
+    def _needed_size(self) -> int:
+        """Bytes of all files that the rules may go back to."""
+        with self._lock:
+            return sum(entry.size for shelf in self._shelves.values() for entry in shelf.entries)
+
     def prune(self, component: str, oldest: Position) -> None:
         """Forget what is not needed to restore ``oldest`` or a later position; fold its chain where that has grown long.
 
@@ -281,9 +294,7 @@ class Store:
             if floor is not None:
                 self._remove_damaged(component, lambda path: (order_of_name(path.name) or floor) < floor)
         self._history.thin(folder_name(component), time.time())
-        with self._lock:
-            needed = sum(entry.size for shelf in self._shelves.values() for entry in shelf.entries)
-        self._history.shrink(needed)
+        self._history.shrink(self._needed_size())
 
     def discard(self, component: str, position: Position) -> None:
         """Forget one position that nothing else here continues; one that is not held, or is continued, stays as it is.

@@ -251,8 +251,11 @@ class Supervisor:
 
     def _prune(self, act: acts.Prune) -> None:
         """Put away beside the queue: a chain is folded then, for a second or more, and a takeover would wait for that."""
+        is_idle = self._pruning is None or self._pruning.done()
+        if is_idle and not self.around.store.is_prune_due(self.name, act.oldest):
+            return  # as after most deltas
         self._to_prune = act
-        if self._pruning is None or self._pruning.done():
+        if is_idle:
             self._pruning = self._task(self._prune_all())
 
     async def _prune_all(self) -> None:

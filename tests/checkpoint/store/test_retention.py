@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
 from checkpoint.store.retention import HISTORY_FOLDER, Retention
@@ -39,7 +41,9 @@ def keep(store: Store, root: Path, number: int, age_s: float = 0.0) -> None:
     (path,) = (entry.path for entry in store.chain_of(COMPONENT, made.position))
     stamp = time.time() - age_s
     os.utime(path, (stamp, stamp))
+    before, is_due = sorted(root.rglob("*")), store.is_prune_due(COMPONENT, made.position)
     store.prune(COMPONENT, made.position)
+    assert is_due == (sorted(root.rglob("*")) != before), "whether there is anything to do is told beforehand"
 
 
 def olds(root: Path) -> list[Path]:
@@ -90,6 +94,21 @@ def test_what_is_too_old_goes(tmp_path: Path) -> None:
         keep(store, root, 3)
         assert [age for age in ages(root) if age > 300] == []
         assert store.newest(COMPONENT) == whole(3).position
+
+
+def test_what_has_just_become_too_old_goes_although_no_snapshot_is_put_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "store"
+    with opened(root, Retention(count=3, span_s=300)) as store:
+        keep(store, root, 1, age_s=290)
+        keep(store, root, 2)
+        assert not store.is_prune_due(COMPONENT, whole(2).position)
+        now_s = time.time()
+        monkeypatch.setattr("checkpoint.store.store.time.time", lambda: now_s + 20)
+        assert store.is_prune_due(COMPONENT, whole(2).position)
+        store.prune(COMPONENT, whole(2).position)
+        assert not olds(root)
 
 
 def test_over_its_size_the_store_gives_up_the_oldest_and_never_what_is_needed(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from checkpoint.snapshot import format
 from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
 from checkpoint.store.disk import Disk, DiskFile
+from checkpoint.store.fold_rules import fold_is_due
 from checkpoint.store.index import Entry
 from checkpoint.store.store import Store, open_store
 from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
@@ -257,6 +258,28 @@ def test_the_outline_of_what_was_made_here_last_is_not_read_again(tmp_path: Path
 def outline_of(store: Store, entry: Entry) -> Snapshot:
     with entry.path.open("rb") as file:
         return store.outline(COMPONENT, entry, file.fileno())
+
+
+def test_whether_anything_is_to_be_put_away_is_known_without_the_disk(tmp_path: Path) -> None:
+    made = history(3)
+    with opened(tmp_path / "store") as store:
+        put(store, made[0])
+        assert not store.is_prune_due(COMPONENT, made[0].position), "all of it is needed"
+        put(store, made[1])
+        put(store, made[2])
+        assert fold_is_due(store.chain_of(COMPONENT))
+        assert store.is_prune_due(COMPONENT, made[-1].position), "it has grown long"
+        store.fold(COMPONENT, made[-1].position)
+        assert store.is_prune_due(COMPONENT, made[-1].position), "what was folded is not needed"
+        store.prune(COMPONENT, made[-1].position)
+        assert not store.is_prune_due(COMPONENT, made[-1].position)
+        put(store, made[0])
+        store.prune(COMPONENT, made[0].position)
+        damaged = store.chain_of(COMPONENT, made[0].position)[0].path
+        damaged.write_bytes(b"altered")
+        with pytest.raises(StoreError):
+            store.load(COMPONENT, made[0].position)
+        assert store.is_prune_due(COMPONENT, made[-1].position), "a damaged file may go"
 
 
 def test_what_is_older_than_wanted_is_forgotten(tmp_path: Path) -> None:

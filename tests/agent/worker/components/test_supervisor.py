@@ -133,6 +133,9 @@ class SlowStore:
         self.begun = threading.Semaphore(0)
         self.calls: list[object] = []
 
+    def is_prune_due(self, _: str, oldest: Position) -> bool:
+        return oldest.sequence > 0
+
     def prune(self, _: str, oldest: Position) -> None:
         self.calls.append(oldest.sequence)
         self.begun.release()
