@@ -107,4 +107,5 @@ class ChainFiles:
 
 def entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
     """A file that has just been written."""
-    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time())
+    pages_size = sum(run.size for run in snapshot.runs)
+    return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time(), pages_size)

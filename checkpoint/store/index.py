@@ -32,6 +32,7 @@ class Entry(Struct, frozen=True):
 
     Attributes:
         size: bytes of the file; ``stored_s``: when it came, in seconds since 1970.
+        pages_size: bytes of the pages that it tells, which the file holds compressed.
     """
 
     path: Path
@@ -40,6 +41,7 @@ class Entry(Struct, frozen=True):
     epoch: int
     size: int
     stored_s: float = 0.0
+    pages_size: int = 0
 
     @property
     def order(self) -> tuple[int, int, int]:

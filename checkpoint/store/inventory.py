@@ -47,7 +47,8 @@ def _intact(path: Path, files: WholeFiles, notice: Callable[[str], None]) -> Ite
         notice(f"{path} holds {place(header.position)} of {header.component}, which is not its name; it is not used")
         return
     stored = path.stat()
-    yield header.component, Entry(path, header.position, header.parent, header.epoch, stored.st_size, stored.st_mtime)
+    told = (header.position, header.parent, header.epoch, stored.st_size, stored.st_mtime, header.contents_size)
+    yield header.component, Entry(path, *told)
 
 
 def why_not_ours(about: os.stat_result) -> str:

@@ -219,7 +219,7 @@ class Store:
             self._check_parent(shelf, snapshot)
             proved = self._proofs.prove(shelf, snapshot, digest) if prove else None
             final = self._root / folder_name(snapshot.component) / file_name(header_of(snapshot))
-            if all(entry.path != final for entry in shelf.entries):
+            if all(entry.position != snapshot.position or entry.path != final for entry in shelf.entries):
                 size = self._files.write(final, lambda file: file.copy_from(source), source)
                 self._add(snapshot.component, entry_of(final, snapshot, size))
             if proved is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import random
 import tracemalloc
 from collections.abc import Sequence
@@ -14,17 +15,19 @@ from hypothesis import given, settings
 from msgspec.structs import replace
 
 from checkpoint.errors import ChainError, FormatError
-from checkpoint.model import PageRun, Snapshot
+from checkpoint.keeper.messages import memfd_holding
+from checkpoint.model import PageRun, Position, Snapshot
 from checkpoint.snapshot import format, frames
 from checkpoint.snapshot.byte_sources import opened
 from checkpoint.snapshot.layout import FRAME_SIZE
 from checkpoint.store import chain, fold_rules
 from checkpoint.store.base_on_disk import stored_base
 from checkpoint.store.folding import Folding
+from checkpoint.store.index import Entry
 from checkpoint.store.store import open_store
 from checkpoint.store.xor_cache import Sender
 from tests.checkpoint.pages.test_xor_delta import STEPS, as_told, whole_chain
-from tests.checkpoint.snapshots import COMPONENT, PAGE, START, page, pages_of, snapshot, vma
+from tests.checkpoint.snapshots import COMPONENT, PAGE, START, history, page, pages_of, snapshot, vma
 
 IN_A_FRAME = FRAME_SIZE // PAGE
 COUNT = 5 * IN_A_FRAME + 100
@@ -185,3 +188,26 @@ def test_a_fold_holds_a_bounded_part_of_the_deltas_pages(tmp_path: Path, monkeyp
         assert pages_of(store.load(COMPONENT)) == pages_of(whole[-1])
     finally:
         store.close()
+
+
+@pytest.mark.parametrize(("pages_size", "count", "is_due"), [(1 << 20, 13, True), (100 << 20, 13, False), (100 << 20, 65, True)])
+def test_a_chain_whose_base_has_many_pages_is_folded_more_seldom_however_well_they_compress(
+    pages_size: int, count: int, is_due: bool
+) -> None:
+    base = Entry(Path("base"), Position(1, 1, b""), None, 1, 3 << 20, pages_size=pages_size)
+    deltas = [Entry(Path(f"{n}"), Position(1, n, b""), Position(1, n - 1, b""), 1, 8_000) for n in range(2, count + 2)]
+    assert fold_rules.fold_is_due([base, *deltas]) is is_due
+
+
+def test_how_many_bytes_of_pages_a_file_tells_is_known_after_a_restart_too(tmp_path: Path) -> None:
+    made = history(2)
+    for _ in range(2):
+        store = open_store(tmp_path / "store")
+        try:
+            for one in made if store.newest(COMPONENT) is None else ():
+                descriptor = memfd_holding(format.encode_bytes(one), "snapshot")
+                store.put(descriptor)
+                os.close(descriptor)
+            assert [entry.pages_size for entry in store.chain_of(COMPONENT)] == [len(one.contents) for one in made]
+        finally:
+            store.close()
