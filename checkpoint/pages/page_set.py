@@ -10,6 +10,7 @@ histories; it does not protect against an attacker (the file's blake3 digests do
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeAlias
 
@@ -34,6 +35,9 @@ EMPTY_SUM = bytes(DIGEST_SIZE)
 
 _LANE = "<u8"
 
+MANY_ADDRESSES = 1024
+"""So many are looked up one by one faster than the work on whole arrays is begun."""
+
 DIGESTED = 1024
 """Pages digested at a time: less than a millisecond, after which another thread of a program may run."""
 
@@ -41,10 +45,47 @@ DIGESTED = 1024
 # Sets of pages
 
 
+class Mappings(tuple[Vma, ...]):
+    """The mappings of a process, of which every step of a snapshot asks what they cover: worked out once for this very object.
+
+    Attributes:
+        sound_for: the page size for which `checkpoint.snapshot.validity` found them well-formed; 0: not looked yet.
+    """
+
+    sound_for = 0
+
+    @functools.cached_property
+    def extents(self) -> Words:
+        """The set that they cover; read-only."""
+        return _read_only(_extents(self))
+
+    def know(self, bounds: Words) -> None:
+        """Take what they cover from their starts and ends, which have been worked out."""
+        self.extents = _read_only(joined(bounds))
+
+    @functools.cached_property
+    def guarded(self) -> tuple[Vma, ...]:
+        """Those of them that have guards."""
+        return tuple(vma for vma in self if vma.guards)
+
+
 def extents(runs: Iterable[PageRun | PageCopy | Vma]) -> Words:
     """The set that runs or mappings cover, in any order and overlap."""
+    return runs.extents if isinstance(runs, Mappings) else _extents(runs)
+
+
+def _extents(runs: Iterable[PageRun | PageCopy | Vma]) -> Words:
     edges = [edge for run in runs if run.start < run.end for edge in (run.start, run.end)]
-    told = np.array(edges, dtype=np.uint64).reshape(-1, 2)
+    return joined(np.array(edges, dtype=np.uint64).reshape(-1, 2))
+
+
+def _read_only(found: Words) -> Words:
+    found.setflags(write=False)
+    return found
+
+
+def joined(told: Words) -> Words:
+    """The set that such pairs cover; none of them is empty."""
     if len(told) < 2 or (told[1:, 0] > told[:-1, 1]).all():
         return told  # as most come: in order, and none touches the next
     ordered = told[told[:, 0].argsort(kind="stable")]
@@ -91,25 +132,30 @@ def difference(left: Words, right: Words) -> Words:
 
 def _combined(left: Words, right: Words, rule: Callable[[Flags, Flags], Flags]) -> Words:
     """Walk over every boundary of both sets; an extent opens and closes where the rule's answer changes."""
-    points = np.concatenate((left.ravel(), right.ravel()))
+    points = np.concatenate((left.reshape(-1), right.reshape(-1)))
     points.sort()  # a boundary of both stands twice: the second one changes nothing
     inside = rule(covered(left, points), covered(right, points))
-    before = np.concatenate(([False], inside[:-1]))
-    return np.stack((points[inside & ~before], points[~inside & before]), axis=1)
+    return points[_changes(inside)].reshape(-1, 2)
+
+
+def _changes(flags: Flags) -> Flags:
+    """Which differ from the one before; before the first all are false."""
+    changes: Flags = flags.copy()
+    np.not_equal(flags[1:], flags[:-1], out=changes[1:])
+    return changes
 
 
 def covered(pages: Words, addresses: Words) -> Flags:
-    """For each address whether it lies in the set."""
-    opened = np.searchsorted(pages[:, 0], addresses, side="right")
-    closed = np.searchsorted(pages[:, 1], addresses, side="right")
-    return opened > closed
+    """For each address whether it lies in the set: behind an odd number of boundaries."""
+    inside: Flags = pages.reshape(-1).searchsorted(addresses, side="right") & 1 == 1
+    return inside
 
 
 def covers(pages: Words, others: Words) -> bool:
     """Whether every page of the second set is in the first."""
     if not len(others):
         return True
-    place = np.searchsorted(pages[:, 1], others[:, 0], side="right")
+    place = pages[:, 1].searchsorted(others[:, 0], side="right")
     if place[-1] >= len(pages):
         return False
     around = pages[place]
@@ -147,7 +193,10 @@ def cut(pages: Words, size: int) -> list[Words]:
 
 def addresses_of(pages: Words, page_size: int) -> Words:
     """The address of every page of the set, in order."""
-    counts = ((pages[:, 1] - pages[:, 0]) // np.uint64(page_size)).astype(np.int64)
+    sizes = pages[:, 1] - pages[:, 0]
+    if (sizes == page_size).all():  # as those of most deltas
+        return pages[:, 0].copy()
+    counts = (sizes // np.uint64(page_size)).astype(np.int64)
     firsts = np.repeat(pages[:, 0], counts)
     index_in_run = np.arange(len(firsts)) - np.repeat(np.cumsum(counts) - counts, counts)
     return firsts + index_in_run.astype(np.uint64) * np.uint64(page_size)
@@ -204,9 +253,11 @@ def extents_of_addresses(addresses: Words, page_size: int) -> Words:
     if not len(addresses):
         return np.empty((0, 2), dtype=np.uint64)
     step = np.uint64(page_size)
-    first = np.concatenate(([True], addresses[1:] - addresses[:-1] != step))
-    last = np.concatenate((first[1:], [True]))
-    return np.stack((addresses[first], addresses[last] + step), axis=1)
+    breaks = (addresses[1:] - addresses[:-1] != step).nonzero()[0]
+    found = np.empty((len(breaks) + 1, 2), dtype=np.uint64)
+    found[0, 0], found[1:, 0] = addresses[0], addresses[breaks + 1]
+    found[:-1, 1], found[-1, 1] = addresses[breaks] + step, addresses[-1] + step
+    return found
 
 
 # Contents of pages
@@ -287,7 +338,9 @@ class PageMap(Struct, frozen=True, eq=False):
         Returns:
             The rest, and the words of the pages that went.
         """
-        dropped = ~_covered_in_order(kept, self.addresses) | _covered_in_order(forgotten, self.addresses)
+        dropped = ~_covered_in_order(kept, self.addresses)
+        if len(forgotten):
+            dropped |= _covered_in_order(forgotten, self.addresses)
         if not dropped.any():
             return self, self.words[:0]
         return PageMap(self.addresses[~dropped], self.words[~dropped]), self.words[dropped]
@@ -298,8 +351,10 @@ class PageMap(Struct, frozen=True, eq=False):
         Returns:
             The new map, and the words of the pages that were replaced.
         """
-        places = np.searchsorted(self.addresses, addresses)
-        known = self.addresses[np.minimum(places, len(self.addresses) - 1)] == addresses if len(self.addresses) else places < 0
+        if not len(self.addresses):
+            return PageMap(addresses, words), self.words[:0]
+        places = self.addresses.searchsorted(addresses)
+        known = self.addresses[np.minimum(places, len(self.addresses) - 1)] == addresses
         replaced = self.words[places[known]]
         changed = self.words.copy()
         changed[places[known]] = words[known]
@@ -316,7 +371,9 @@ class PageMap(Struct, frozen=True, eq=False):
 
 
 def _covered_in_order(pages: Words, addresses: Words) -> Flags:
-    """Like ``covered``, for addresses in order: the work grows with the extents, not with the addresses."""
+    """Like ``covered``, for addresses in order: the work grows with the extents, not with the addresses, where those are many."""
+    if len(addresses) <= MANY_ADDRESSES:
+        return covered(pages, addresses)
     edges = np.zeros(len(addresses) + 1, dtype=np.int32)
     np.add.at(edges, np.searchsorted(addresses, pages[:, 0]), 1)
     np.subtract.at(edges, np.searchsorted(addresses, pages[:, 1]), 1)
@@ -331,11 +388,13 @@ class PageTable(Struct, frozen=True, eq=False):
 
     Attributes:
         page_sum: as in ``Snapshot.page_sum``.
+        within: mappings in which all of its pages are known to lie; None: not known.
     """
 
     page_size: int
     pages: PageMap
     page_sum: bytes
+    within: Words | None = None
 
     @classmethod
     def empty(cls, page_size: int) -> PageTable:
@@ -356,7 +415,8 @@ class PageTable(Struct, frozen=True, eq=False):
             contents: bytes of ``runs``, in address order.
             copies: pages with the bytes of others of ``runs``.
         """
-        addresses = addresses_of(extents(runs), self.page_size)
+        mapped, carried, gone = extents(vmas), extents(runs), extents(cleared)
+        addresses = addresses_of(carried, self.page_size)
         digests = digest_pages(contents, addresses, self.page_size)
         if copies:
             copied, places = copied_pages(copies, addresses, self.page_size)
@@ -364,7 +424,11 @@ class PageTable(Struct, frozen=True, eq=False):
             addresses = np.concatenate((addresses, copied))
             order = np.argsort(addresses)
             addresses, digests = addresses[order], digests[order]
-        kept, dropped = self.pages.without(extents(vmas), extents(cleared))
+        if not len(gone) and self.within is not None and np.array_equal(mapped, self.within):
+            kept, dropped = self.pages, self.pages.words[:0]  # as at most deltas: it would look at every page to find that out
+        else:
+            kept, dropped = self.pages.without(mapped, gone)
         pages, replaced = kept.overlaid(addresses, digests)
         page_sum = add_to_sum(self.page_sum, digests, np.concatenate((dropped, replaced)))
-        return PageTable(self.page_size, pages, page_sum)
+        within = mapped if not copies and covers(mapped, carried) else None
+        return PageTable(self.page_size, pages, page_sum, within)

@@ -7,7 +7,7 @@ unknown fields, doubled keys and other encodings of the same value do not pass.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -38,6 +38,11 @@ STATE_DIGEST_SIZE = 16
 
 MAX_FACT_DEPTH = 8
 """How deep the facts of a resource may be nested."""
+
+PLAIN = frozenset((type(None), bool, int, float, str, bytes))
+"""Types of facts that hold no others."""
+
+OUT_OF_ORDER = "not in canonical form (keys out of order)"
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -239,10 +244,13 @@ def decode_state(packed: bytes | memoryview, *, is_tree: bool = False) -> State:
 def _check_canonical(state: _State | _MemberRecord) -> None:
     """Refuse facts that cannot be, and keys that are out of order."""
     for record in state.resources:
-        _check_fact(record.facts, f"state: facts of {record.kind} {record.name!r}", MAX_FACT_DEPTH)
-    mappings = (state.process.limits, *(thread.registers for thread in state.threads), *(held.facts for held in state.resources))
+        try:
+            _check_fact(record.facts, MAX_FACT_DEPTH)
+        except FormatError as error:
+            raise FormatError(f"state: facts of {record.kind} {record.name!r}: {error}") from None
+    mappings = (state.process.limits, *(thread.registers for thread in state.threads))
     if not all(map(_is_sorted, mappings)):
-        raise FormatError("state: not in canonical form (keys out of order)")
+        raise FormatError(f"state: {OUT_OF_ORDER}")
 
 
 def _resources(records: tuple[_ResourceRecord, ...]) -> tuple[Resource, ...]:
@@ -294,17 +302,16 @@ def _encoded(value: object, what: str) -> bytes:
 def _sorted(value: Any) -> Any:
     """The same value with the keys of every mapping in order."""
     if isinstance(value, Mapping):
-        return {key: _sorted(value[key]) for key in sorted(value)}
+        inner = [(key, value[key]) for key in sorted(value)]
+        return {key: one if type(one) in PLAIN else _sorted(one) for key, one in inner}
     if isinstance(value, list | tuple):
-        return [_sorted(inner) for inner in value]
+        return [one if type(one) in PLAIN else _sorted(one) for one in value]
     return value
 
 
-def _is_sorted(value: Any) -> bool:
-    """Whether the keys of every mapping in it, as msgpack decodes it, are in order."""
-    if isinstance(value, dict):
-        return all(earlier < later for earlier, later in pairwise(value)) and all(map(_is_sorted, value.values()))
-    return not isinstance(value, list) or all(map(_is_sorted, value))
+def _is_sorted(value: Mapping[Any, object]) -> bool:
+    """Whether the keys of a mapping are in order."""
+    return all(earlier < later for earlier, later in pairwise(value))
 
 
 def _decoded(packed: bytes | memoryview, kind: type[_Value], what: str) -> _Value:
@@ -318,17 +325,25 @@ def _decoded(packed: bytes | memoryview, kind: type[_Value], what: str) -> _Valu
     return value
 
 
-def _check_fact(fact: object, where: str, depth: int) -> None:
-    """Refuse what a fact cannot be: extension types, keys that are not text, endless nesting."""
+def _check_fact(fact: object, depth: int) -> None:
+    """Refuse what a fact cannot be: extension types, keys that are not text, or not in order, endless nesting.
+
+    Args:
+        depth: how deep it may be nested yet; a value that holds no other is not looked at by itself.
+    """
     if depth == 0:
-        raise FormatError(f"{where}: nested deeper than {MAX_FACT_DEPTH}")
-    if isinstance(fact, dict):
-        for key, inner in fact.items():
-            if not isinstance(key, str):
-                raise FormatError(f"{where}: a key is not text")
-            _check_fact(inner, where, depth - 1)
-    elif isinstance(fact, list):
-        for inner in fact:
-            _check_fact(inner, where, depth - 1)
-    elif not (fact is None or isinstance(fact, int | str | bytes | bool | float)):
-        raise FormatError(f"{where}: {type(fact).__name__} is not a type of fact")
+        raise FormatError(f"nested deeper than {MAX_FACT_DEPTH}")
+    inner: Iterable[object] = ()
+    if type(fact) is dict:
+        if not all(type(key) is str for key in fact):
+            raise FormatError("a key is not text")
+        if not _is_sorted(fact):
+            raise FormatError(OUT_OF_ORDER)
+        inner = fact.values()
+    elif type(fact) is list:
+        inner = fact
+    elif type(fact) not in PLAIN:
+        raise FormatError(f"{type(fact).__name__} is not a type of fact")
+    for one in inner:
+        if depth == 1 or type(one) not in PLAIN:
+            _check_fact(one, depth - 1)

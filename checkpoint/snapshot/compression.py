@@ -34,6 +34,13 @@ def compressor() -> Compressor:
     return Compressor(level=COMPRESSION_LEVEL)
 
 
+def own_compressor() -> Compressor:
+    """This thread's own: to make one takes as long as to compress a small snapshot."""
+    if not hasattr(_of_thread, "compressor"):
+        _of_thread.compressor = compressor()
+    return _of_thread.compressor  # type: ignore[no-any-return]
+
+
 def stored(raw: bytes | memoryview, compressor: Compressor) -> tuple[Codec, bytes | memoryview]:
     """Compressed where it is worth it."""
     return _better(raw, compressor.compress(raw))

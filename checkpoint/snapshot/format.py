@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from checkpoint.errors import FormatError
 from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.pages import page_set
-from checkpoint.pages.page_set import Flags, Words
+from checkpoint.pages.page_set import Flags, Mappings, Words
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.runtime import parallel
 from checkpoint.runtime.identity_memo import Memo
@@ -117,7 +117,7 @@ def _pack_sections(snapshot: Snapshot) -> tuple[tuple[Section, ...], list[bytes]
         SectionKind.RUNS: _pack_runs(snapshot),
         SectionKind.OUTPUT: canonical_state.encode_output(snapshot.output),
     }
-    compressor = compression.compressor()
+    compressor = compression.own_compressor()
     sections: list[Section] = []
     stored: list[bytes] = []
     offset = layout.PREAMBLE_SIZE
@@ -328,7 +328,7 @@ def _read_outline(reader: Reader, preamble: Preamble) -> tuple[Snapshot, bytes |
         clocks=decoded.clocks,
         process=decoded.process,
         threads=decoded.threads,
-        vmas=decoded.vmas,
+        vmas=Mappings(decoded.vmas),
         resources=decoded.resources,
         cleared=table.cleared,
         runs=table.runs,

@@ -46,7 +46,7 @@ class Packer:
     def __init__(self, threads: int) -> None:
         self._compressors: SimpleQueue[Compressor] = SimpleQueue()
         for _ in range(threads):
-            self._compressors.put(compression.compressor())
+            self._compressors.put(compression.compressor() if threads > 1 else compression.own_compressor())
 
     def __call__(self, raw: memoryview) -> Body:
         """The body of one frame."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
 from checkpoint.errors import FormatError
 from checkpoint.model import OutputPiece, PageCopy, PageRun, Position, Snapshot, ThreadState, Vma
 from checkpoint.pages import page_set
+from checkpoint.pages.page_set import Mappings
 from checkpoint.runtime.lazy_numpy import np
 from checkpoint.snapshot.canonical_state import STATE_DIGEST_SIZE
 from checkpoint.snapshot.layout import MAX_CONTENTS_SIZE
@@ -40,14 +42,14 @@ def check_snapshot(snapshot: Snapshot, contents_size: int | None = None) -> None
     if page_size not in range(MIN_PAGE_SIZE, MAX_PAGE_SIZE + 1) or page_size & (page_size - 1):
         raise FormatError(f"machine: page size {page_size} is not a power of two from {MIN_PAGE_SIZE} to {MAX_PAGE_SIZE}")
     _check_numbers(snapshot)
-    _check_extents(snapshot.vmas, page_size, "vmas")
+    _check_mappings(snapshot.vmas, page_size, "vmas")
     _check_extents(snapshot.cleared, page_size, "cleared runs")
-    _check_extents(snapshot.runs, page_size, "runs")
+    carried = page_set.joined(_check_extents(snapshot.runs, page_size, "runs"))
     _check_members(snapshot, page_size)
-    _check_runs_mapped(snapshot.runs, every_mapping(snapshot))
+    _check_mapped(carried, snapshot)
     _check_copies(snapshot, page_size)
-    _check_differences(snapshot, page_size)
-    _check_guards(snapshot, page_size)
+    _check_differences(snapshot, page_size, carried)
+    _check_guards(snapshot, page_size, carried)
     _check_contents(snapshot, len(memoryview(snapshot.contents).cast("B")) if contents_size is None else contents_size)
     _check_threads(snapshot.process.pid, snapshot.threads)
     _check_output(snapshot.output)
@@ -79,19 +81,32 @@ def place(position: Position) -> str:
     return f"{position.generation}.{position.sequence}"
 
 
-def _check_extents(items: Iterable[PageRun | PageCopy | Vma], page_size: int, name: str) -> None:
-    """Aligned, not empty, in address order, without overlap."""
-    pairs = [(item.start, item.end) for item in items]
-    outside = [pair for pair in pairs if not 0 <= pair[0] < pair[1] <= ADDRESS_END]
-    if outside:
-        raise FormatError(f"{name}: {outside[0][0]:#x}-{outside[0][1]:#x} is empty or beyond the address space")
-    bounds = np.array(pairs, dtype=np.uint64).reshape(-1, 2)
-    unaligned = np.flatnonzero((bounds & np.uint64(page_size - 1)).any(axis=1))
-    if len(unaligned):
+def _check_mappings(vmas: tuple[Vma, ...], page_size: int, name: str) -> None:
+    """As `_check_extents`, once for the same ones."""
+    if isinstance(vmas, Mappings) and vmas.sound_for == page_size:
+        return
+    bounds = _check_extents(vmas, page_size, name)
+    if isinstance(vmas, Mappings):
+        vmas.sound_for = page_size
+        vmas.know(bounds)
+
+
+def _check_extents(items: Iterable[PageRun | PageCopy | Vma], page_size: int, name: str) -> page_set.Words:
+    """Aligned, not empty, in address order, without overlap: start and end of each."""
+    edges = [edge for item in items for edge in (item.start, item.end)]
+    if not edges:
+        return np.empty((0, 2), dtype=np.uint64)
+    if not 0 <= min(edges) <= max(edges) <= ADDRESS_END or any(map(operator.ge, edges[::2], edges[1::2])):
+        start, end = next(pair for pair in zip(edges[::2], edges[1::2], strict=True) if not 0 <= pair[0] < pair[1] <= ADDRESS_END)
+        raise FormatError(f"{name}: {start:#x}-{end:#x} is empty or beyond the address space")
+    bounds = np.array(edges, dtype=np.uint64).reshape(-1, 2)
+    if int(np.bitwise_or.reduce(bounds, axis=None)) & (page_size - 1):
+        unaligned = np.flatnonzero((bounds & np.uint64(page_size - 1)).any(axis=1))
         raise FormatError(f"{name}: {_span(bounds, unaligned[0])} is not of whole pages of {page_size} bytes")
-    early = np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1])
-    if len(early):
+    if (bounds[1:, 0] < bounds[:-1, 1]).any():
+        early = np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1])
         raise FormatError(f"{name}: {_span(bounds, early[0] + 1)} overlaps or comes before {_span(bounds, early[0])}")
+    return bounds
 
 
 def _span(bounds: page_set.Words, index: np.intp) -> str:
@@ -116,7 +131,7 @@ def _check_members(snapshot: Snapshot, page_size: int) -> None:
             raise FormatError(f"members: the parent {parent} of {pid} is none of them")
     _check_descent({process.pid: process.ppid for process in processes[1:]})
     for member in snapshot.members:
-        _check_extents(member.vmas, page_size, f"vmas of {member.process.pid}")
+        _check_mappings(member.vmas, page_size, f"vmas of {member.process.pid}")
         if member.vmas and member.vmas[-1].end > 1 << SLOT_SHIFT:
             raise FormatError(f"vmas of {member.process.pid}: beyond its slot")
         if not member.threads:
@@ -137,9 +152,10 @@ def _check_descent(parents: Mapping[int, int]) -> None:
         settled |= line
 
 
-def _check_runs_mapped(runs: Iterable[PageRun | PageCopy], vmas: Iterable[PageRun | Vma]) -> None:
-    stray = page_set.difference(page_set.extents(runs), page_set.extents(vmas))
-    if len(stray):
+def _check_mapped(carried: page_set.Words, snapshot: Snapshot) -> None:
+    mapped = page_set.extents(every_mapping(snapshot))
+    if not page_set.covers(mapped, carried):
+        stray = page_set.difference(carried, mapped)
         raise FormatError(f"runs: {_span(stray, np.intp(0))} lies in no mapping")
 
 
@@ -151,7 +167,7 @@ def _check_copies(snapshot: Snapshot, page_size: int) -> None:
         raise FormatError("copies: one process alone has none")
     _check_extents(snapshot.copies, page_size, "copies")
     targets, carried = page_set.extents(snapshot.copies), page_set.extents(snapshot.runs)
-    _check_runs_mapped(snapshot.copies, every_mapping(snapshot))
+    _check_mapped(targets, snapshot)
     if len(twice := page_set.intersection(targets, carried)):
         raise FormatError(f"copies: {_span(twice, np.intp(0))} is carried, too")
     sources = [PageRun(copy.source, copy.source + copy.size) for copy in snapshot.copies]
@@ -164,15 +180,15 @@ def _check_copies(snapshot: Snapshot, page_size: int) -> None:
         raise FormatError(f"copies: {size} bytes with their sources, above the limit of {MAX_CONTENTS_SIZE}")
 
 
-def _check_differences(snapshot: Snapshot, page_size: int) -> None:
+def _check_differences(snapshot: Snapshot, page_size: int, carried: page_set.Words) -> None:
     """Differences are of a delta, carried, from a page that is still there when they are applied, and no copy is of one."""
     if not snapshot.differences:
         return
     if snapshot.parent is None:
         raise FormatError("differences: a base has nothing that they could be from")
-    _check_extents(snapshot.differences, page_size, "differences")
-    told = page_set.extents(snapshot.differences)
-    if len(stray := page_set.difference(told, page_set.extents(snapshot.runs))):
+    told = page_set.joined(_check_extents(snapshot.differences, page_size, "differences"))
+    if not page_set.covers(carried, told):
+        stray = page_set.difference(told, carried)
         raise FormatError(f"differences: {_span(stray, np.intp(0))} is not carried")
     sources = page_set.extents(PageRun(copy.source, copy.source + copy.size) for copy in snapshot.copies)
     for what, others in (("cleared", page_set.extents(snapshot.cleared)), ("copied", sources)):
@@ -180,18 +196,19 @@ def _check_differences(snapshot: Snapshot, page_size: int) -> None:
             raise FormatError(f"differences: {_span(both, np.intp(0))} is {what}, too")
 
 
-def _check_guards(snapshot: Snapshot, page_size: int) -> None:
+def _check_guards(snapshot: Snapshot, page_size: int, carried: page_set.Words) -> None:
     """Guards lie inside their own mapping and hold nothing."""
     for slot, vmas in ((0, snapshot.vmas), *((member.slot, member.vmas) for member in snapshot.members)):
-        for vma in vmas:
-            if vma.guards:
-                _check_extents(vma.guards, page_size, "guards")
-                if vma.guards[0].start < vma.start or vma.guards[-1].end > vma.end:
-                    raise FormatError(f"guards: not all inside their mapping {vma.start:#x}-{vma.end:#x}")
-        every = page_set.extents(shifted_runs((guard for vma in vmas for guard in vma.guards), slot))
-        carried = page_set.intersection(every, page_set.extents(snapshot.runs)) if len(every) else every
-        if len(carried):
-            raise FormatError(f"guards: {_span(carried, np.intp(0))} is carried, too")
+        guarded = vmas.guarded if isinstance(vmas, Mappings) else [vma for vma in vmas if vma.guards]
+        if not guarded:
+            continue
+        for vma in guarded:
+            _check_extents(vma.guards, page_size, "guards")
+            if vma.guards[0].start < vma.start or vma.guards[-1].end > vma.end:
+                raise FormatError(f"guards: not all inside their mapping {vma.start:#x}-{vma.end:#x}")
+        every = page_set.extents(shifted_runs((guard for vma in guarded for guard in vma.guards), slot))
+        if len(both := page_set.intersection(every, carried)):
+            raise FormatError(f"guards: {_span(both, np.intp(0))} is carried, too")
 
 
 def _check_contents(snapshot: Snapshot, contents_size: int) -> None:

@@ -196,18 +196,20 @@ class PageScanner:
     def written_count(self, ranges: Words, limit: int) -> int:
         """How many pages `written` would find, counted no further than ``limit``; nothing is protected."""
         count = 0
-        for start, end in ranges.tolist():
-            count += self._counted(start, end, limit - count)
-            if count >= limit:
-                break
-        return count
+        for batch in _batches(ranges):
+            if count < limit:
+                count += self._counted(batch, limit)
+        return min(count, limit)
 
-    def _counted(self, start: int, end: int, limit: int) -> int:
-        orders = self._asked(WRITTEN, np.array([[start, end]], dtype=np.uint64), limit=limit)
-        regions = int(orders.counts[0])
-        if regions < 0:
-            self._refused("count written", -regions)
-        return page_set.total_size(orders.regions[0, : max(regions, 0), :2]) // abi.PAGE_SIZE
+    def _counted(self, batch: Words, limit: int) -> int:
+        """Of these ranges, counted in each no further than ``limit``."""
+        orders, size = self._asked(WRITTEN, batch, limit=limit), 0
+        for place, regions in enumerate(orders.counts[: len(batch)].tolist()):
+            if regions > 0:
+                size += page_set.total_size(orders.regions[place, :regions, :2])
+            elif regions < 0:
+                self._refused("count written", -regions)
+        return size // abi.PAGE_SIZE
 
     def existing(self, ranges: Words, *, own: bool = True) -> Words:
         """Pages present or swapped out, but guards, which look as if they were swapped out.

@@ -85,3 +85,11 @@ def test_a_page_sum_tells_content_and_place_apart() -> None:
         return page_set.PageTable.empty(PAGE).apply((), runs_of({number}), byte * PAGE, (vma(0, 9),)).page_sum
 
     assert len({sum_at(1, b"a"), sum_at(2, b"a"), sum_at(1, b"b"), page_set.EMPTY_SUM}) == 4
+
+
+def test_the_same_mappings_are_worked_out_once() -> None:
+    mappings = page_set.Mappings(vma(number, 2) for number in (0, 2, 9))
+    assert page_set.page_runs(page_set.extents(mappings)) == page_set.page_runs(page_set.extents(tuple(mappings)))
+    assert page_set.extents(mappings) is page_set.extents(mappings)
+    assert not page_set.extents(mappings).flags.writeable, "several hold it"
+    assert page_set.extents(page_set.Mappings()).shape == (0, 2)

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from checkpoint.errors import FormatError
-from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot
+from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot, Vma
+from checkpoint.pages.page_set import Mappings
 from checkpoint.snapshot import format, layout, validity
 from tests.checkpoint.snapshots import PAGE, START, family, history, page, snapshot, vma
 
@@ -176,10 +177,14 @@ BROKEN = {
 }
 
 
+@pytest.mark.parametrize("kind", [tuple, Mappings])
 @pytest.mark.parametrize("words", [*BROKEN])
-def test_a_snapshot_that_does_not_hold_together_is_not_written(words: str) -> None:
-    with pytest.raises(FormatError, match=words):
-        format.encode_bytes(BROKEN[words](snapshot({n: page("x") for n in range(4)})))
+def test_a_snapshot_that_does_not_hold_together_is_not_written(words: str, kind: type[tuple[Vma, ...]]) -> None:
+    made = BROKEN[words](snapshot({n: page("x") for n in range(4)}))
+    made = replace(made, vmas=kind(made.vmas))
+    for _ in range(2):  # mappings that were refused once are no better the second time
+        with pytest.raises(FormatError, match=words):
+            format.encode_bytes(made)
 
 
 def with_child(made: Snapshot, **changes: object) -> Snapshot:
