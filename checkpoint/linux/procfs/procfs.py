@@ -311,6 +311,14 @@ _ESCAPED: Final = re.compile(r"\\n|\\\\")
 """Escaped characters of a name: a line feed and a backslash. Source: proc_task_name() in fs/proc/array.c."""
 
 
+_OF_STATUS: Final = re.compile(
+    r"^(State|Umask|Tgid|NStgid|PPid|TracerPid|Uid|Gid|Groups|Pid|NSpid|NSpgid|NSsid|VmRSS|Threads"
+    r"|CapInh|CapPrm|CapEff|CapBnd|CapAmb|NoNewPrivs|Seccomp):[ \t]*(.*)$",
+    re.MULTILINE,
+)
+"""Lines that tell what `Status` holds: a third of all."""
+
+
 def _name_in(status: str) -> str:
     """The name of a process, with the spaces at its ends; the kernel escapes two characters of it."""
     name = status.partition("\n")[0].partition("\t")[2]
@@ -322,7 +330,7 @@ def parse_status(text: str) -> Status:
 
     Source: proc_pid_status(5).
     """
-    fields = parse_fields(text)
+    fields = dict(reversed(_OF_STATUS.findall(text)))  # the first of several lines of one key counts
 
     def numbers(key: str, base: int = 10) -> tuple[int, ...]:
         return tuple(int(word, base) for word in fields.get(key, "").split())
@@ -371,9 +379,16 @@ def signal_sets(text: bytes) -> tuple[int, int, int]:
 
 def swapped_size(pid: int) -> int:
     """Bytes of a process that are swapped out."""
-    text = read_bytes(pid, "status")
-    begin = text.find(b"\nVmSwap:")
-    return int(text[begin + len(b"\nVmSwap:") :].split(maxsplit=1)[0]) * 1024 if begin >= 0 else 0
+    return sizes_in(read_bytes(pid, "status"), "VmSwap")[0]
+
+
+def sizes_in(text: bytes, *keys: str) -> list[int]:
+    """Bytes of memory by an unparsed /proc/PID/status; 0 for what it does not tell, as of a process that has ended."""
+    found = []
+    for key in keys:
+        begin = text.find(f"\n{key}:".encode())
+        found.append(int(text[begin + len(key) + 2 :].split(maxsplit=1)[0]) * 1024 if begin >= 0 else 0)
+    return found
 
 
 def pid_max() -> int:
@@ -476,12 +491,12 @@ LIMIT_COUNT: Final = 16
 _LIMIT_LINE: Final = re.compile(r" (unlimited|[0-9]+) +(unlimited|[0-9]+) ")
 
 
-def limits(pid: int) -> dict[int, tuple[int, int]]:
+def parse_limits(text: str) -> dict[int, tuple[int, int]]:
     """Soft and hard limits from /proc/PID/limits, whose lines stand in the order of the numbers; -1 is infinity.
 
     prlimit(2) would need CAP_SYS_RESOURCE for a process of another user.
     """
-    lines = read_text(pid, "limits").splitlines()[1 : LIMIT_COUNT + 1]
+    lines = text.splitlines()[1 : LIMIT_COUNT + 1]
     found = (_LIMIT_LINE.search(line) for line in lines)
     return {number: (_limit(match[1]), _limit(match[2])) for number, match in enumerate(found) if match}
 

@@ -18,6 +18,7 @@ Programs that are not covered (`checkpoint.engines.ptrace.standby_copy.eligibili
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 from collections.abc import Container, Iterator, Mapping
@@ -142,8 +143,7 @@ class ReadyCopy(ProcessRestore):
     @property
     def size(self) -> int:
         """Bytes of memory that it takes on this machine."""
-        fields = procfs.parse_fields(procfs.read_text(self._tracee.pid, "status"))
-        return sum(int(fields.get(name, "0 kB").split()[0]) << 10 for name in ("RssAnon", "RssShmem"))
+        return sum(procfs.sizes_in(procfs.read_bytes(self._tracee.pid, "status"), "RssAnon", "RssShmem"))
 
     # --- The three steps ---
 
@@ -334,11 +334,18 @@ class ReadyCopy(ProcessRestore):
 
     def _clocks_ahead_ns(self, elapsed_ns: int) -> int | None:
         """How far its monotonic time is ahead of the program's; None where it has this machine's, for nothing can be set then."""
+        ahead_of_ours_ns = self._ahead_of_ours_ns
+        if ahead_of_ours_ns is None:
+            return None
+        return ahead_of_ours_ns + time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self._state.clocks.monotonic_ns - elapsed_ns
+
+    @functools.cached_property
+    def _ahead_of_ours_ns(self) -> int | None:
+        """How far its monotonic time is ahead of ours, as at its birth (see `require_clocks`); None where both are the same."""
         pid = self._tracee.pid
         if not os.path.lexists(TIME_NAMESPACE) or procfs.read_link(pid, "ns/time") == os.readlink(TIME_NAMESPACE):
             return None
-        ahead_of_ours_ns = _monotonic_offset_ns(pid) - _monotonic_offset_ns(os.getpid())
-        return ahead_of_ours_ns + time.clock_gettime_ns(time.CLOCK_MONOTONIC) - self._state.clocks.monotonic_ns - elapsed_ns
+        return _monotonic_offset_ns(pid) - _monotonic_offset_ns(os.getpid())
 
     def _check_room(self, *tables: CallTable) -> None:
         if any(table.end - table.base > self._room for table in tables):
