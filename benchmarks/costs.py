@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterable
@@ -11,8 +12,8 @@ from typing import Final
 from benchmarks import interference
 from benchmarks.figures import OURS, Figure, Findings
 from benchmarks.interference import NAME, NO_COPY, ON_LOOPBACK, UNPROTECTED, WINDOW_S
-from benchmarks.running import Running, running
-from failover.cli.demo.robots import RobotMachine, Stage
+from benchmarks.running import PROGRAMS, BenchmarkError, Running, running
+from failover.cli.demo.robots import RobotMachine, Stage, means
 
 RATES: Final = (1, 10, 50)
 """Snapshots a second."""
@@ -21,6 +22,14 @@ RESIDENT_MB: Final = 100
 DIRTY_KB: Final = 200
 """Written each 50 ms: 4 MB/s."""
 TURNS: Final = 4
+
+SMALL: Final = "small"
+SMALL_DIRTY_KB: Final = 100
+SMALL_PERIOD_MS: Final = 100
+SMALL_S: Final = 20.0
+QUICK_SMALL_S: Final = 5.0
+STANDBYS_SNAPSHOTS: Final = 20
+"""That the standby has before it counts: the first ones are larger, and its copy is laid meanwhile."""
 
 CELLS: Final = 60_000
 CHANGES: Final = 300
@@ -46,6 +55,7 @@ def costs(quick: bool, directory: Path) -> Findings:
     figures: list[Figure] = []
     for number in QUICK_RATES if quick else RATES:
         figures += _of_work(number, 1 if quick else TURNS, directory / f"work-{number}")
+    figures += _of_small_deltas(1 if quick else TURNS, QUICK_SMALL_S if quick else SMALL_S, directory / "small")
     for who, settings in ((OURS, ""), (WHOLE, 'xor_cache = ""\n')):
         figures.append(_on_the_wire(who, settings, QUICK_SNAPSHOTS if quick else SNAPSHOTS, directory / f"wire-{len(settings)}"))
     figures += _idle(QUICK_IDLE_S if quick else IDLE_S, directory / "idle")
@@ -54,8 +64,10 @@ def costs(quick: bool, directory: Path) -> Findings:
         f"The work of a Python program with {RESIDENT_MB} MB resident that writes 4 MB/s, protected and released in turns, "
         f"{WINDOW_S:g} s each, by snapshots a second, on a machine that plays both robots, without a ready copy; processor time "
         "of the processes of the robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a "
-        f"Python program with {CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. What an agent takes that "
-        "protects nothing (beats each 20 ms; guard and keeper wait in advance for the first program).",
+        f"Python program with {CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. Of small deltas "
+        f"({SMALL_DIRTY_KB} KB in {RESIDENT_MB} MB, each {SMALL_PERIOD_MS} ms; the standby keeps a ready copy, where robots can "
+        "have PIDs of their own): processor time of every process of both robots by delta, beats included. What an agent takes "
+        "that protects nothing (beats each 20 ms; guard and keeper wait in advance for the first program).",
         tuple(figures),
     )
 
@@ -104,8 +116,44 @@ def _protected(robot: RobotMachine, program: Running) -> tuple[float, float, dic
     return work, more / span, {part: (after[part] - before[part]) / span * 100 for part in after}
 
 
-def _snapshots(robot: RobotMachine) -> int:
-    return sum(int(one["snapshots"]) for one in robot.status()["components"] if one["name"] == NAME)
+def _snapshots(robot: RobotMachine, name: str = NAME) -> int:
+    return sum(int(one["snapshots"] or 0) for one in robot.status()["components"] if one["name"] == name)
+
+
+def _of_small_deltas(turns: int, span_s: float, directory: Path) -> list[Figure]:
+    """Milliseconds of processor time that a delta takes of each process of both robots."""
+    directory.mkdir()
+    argv = ["/usr/bin/python3", str(PROGRAMS / "resident.py"), str(RESIDENT_MB), str(SMALL_DIRTY_KB)]
+    taken: dict[str, list[float]] = {}
+    with Stage(directory / "robots", means(), f"snapshot_period_ms = {SMALL_PERIOD_MS}\n") as stage:
+        stage.directory.mkdir()
+        stage.start()
+        with stage.robots[0].control() as link:
+            link.ask("run", argv=argv, name=SMALL, cwd="/", wait=False)
+        name = f"/demo/{stage.robots[0].name}/{SMALL}"
+        deadline = time.monotonic() + interference.PATIENCE_S
+        while _snapshots(stage.robots[1], name) < STANDBYS_SNAPSHOTS:
+            if time.monotonic() > deadline:
+                raise BenchmarkError(f"{name} was not protected in time: {stage.robots[0].last_words()}")
+            time.sleep(interference.POLL_S)
+        time.sleep(interference.SETTLED_S)
+        for _ in range(turns):
+            for part, ms in _by_delta(stage, name, span_s).items():
+                taken.setdefault(part, []).append(ms)
+    return [Figure("processor time of a small delta", part, "ms", tuple(values)) for part, values in taken.items()]
+
+
+def _by_delta(stage: Stage, name: str, span_s: float) -> dict[str, float]:
+    """Of each process, and of each robot as a whole."""
+    parts = [(who, _parts(robot)) for who, robot in zip(("primary", "standby"), stage.robots, strict=True)]
+    count, before = _snapshots(stage.robots[0], name), [_processor_s(of_robot) for _, of_robot in parts]
+    time.sleep(span_s)
+    count, after = _snapshots(stage.robots[0], name) - count, [_processor_s(of_robot) for _, of_robot in parts]
+    found: dict[str, float] = {}
+    for (who, of_robot), earlier, later in zip(parts, before, after, strict=True):
+        spent = {part: (later[part] - earlier[part]) * 1000 / count for part in of_robot}
+        found |= {f"{who}, all": sum(spent.values())} | {f"{who}, {part}": ms for part, ms in spent.items()}
+    return found
 
 
 def _on_the_wire(who: str, settings: str, count: int, directory: Path) -> Figure:
@@ -163,20 +211,11 @@ def _idle(span_s: float, directory: Path) -> list[Figure]:
 def _parts(robot: RobotMachine) -> dict[str, list[int]]:
     """The processes of an agent, by what they are."""
     found: dict[str, list[int]] = {}
-    for pid in _descendants(robot.status()["pid"]):
-        command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-        for sign, part in PARTS.items():
-            if sign in command:
+    for pid in robot.processes():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+            for part in (part for sign, part in PARTS.items() if sign in command):
                 found.setdefault(part, []).append(pid)
-    return found
-
-
-def _descendants(pid: int) -> list[int]:
-    """A process, its children, and theirs."""
-    found = [pid]
-    for one in found:
-        for task in Path(f"/proc/{one}/task").iterdir():
-            found += map(int, (task / "children").read_text().split())
     return found
 
 
