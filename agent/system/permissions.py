@@ -271,7 +271,7 @@ def _inheritance_of(pid: int) -> Inheritance:
         groups=status.groups,
         bounding=status.capabilities[3],
         no_new_privs=status.no_new_privs,
-        limits=procfs.limits(pid),
+        limits=procfs.parse_limits(procfs.read_text(pid, "limits")),
         nice=max(stat.nice, 0) if reset else stat.nice,
         policy=os.SCHED_OTHER if plain else policy,
         priority=os.sched_getparam(pid).sched_priority if realtime and not plain else 0,

@@ -17,6 +17,7 @@ from checkpoint.capability import Area, preserved, refused
 from checkpoint.errors import ProbeError, ProcessGoneError
 from checkpoint.linux.memory.tracker import is_orphan
 from checkpoint.linux.procfs import procfs, vm_flags
+from checkpoint.linux.procfs.particulars import OURS, Afresh, Told
 from checkpoint.linux.procfs.procfs import MapsLine, Status
 from checkpoint.linux.trace import seccomp as trace_seccomp
 from checkpoint.model import Resource
@@ -308,6 +309,7 @@ def refuse_process(
     files_kept: bool = False,
     detaches_memory: bool = False,
     lines: Sequence[MapsLine] | None = None,
+    facts: Told | None = None,
 ) -> Iterator[str]:
     """Why a process as a whole cannot be captured.
 
@@ -316,30 +318,37 @@ def refuse_process(
         files_kept: a store keeps its program file by content, so that it need not be there any more.
         detaches_memory: shared memory that others have mapped, too, becomes its own copy.
         lines: its mappings, where they are known.
+        facts: where they have been asked for already.
     """
     lines = procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines
+    facts = facts or Afresh(pid)
     yield from refused_threads.refuse(pid, status)
     if not detaches_memory:
         yield from shared_memory.refuse(pid, lines, kin)
-    yield from refuse_entering(pid, status, files_kept=files_kept, lines=lines)
-    yield from _refuse_places(pid)
-    yield from _refuse_namespaces(pid)
+    yield from refuse_entering(pid, status, files_kept=files_kept, lines=lines, facts=facts)
+    yield from _refuse_places(facts)
+    yield from _refuse_namespaces(pid, facts)
 
 
 def refuse_entering(
-    pid: int, status: Status, *, files_kept: bool = False, lines: Sequence[MapsLine] | None = None
+    pid: int,
+    status: Status,
+    *,
+    files_kept: bool = False,
+    lines: Sequence[MapsLine] | None = None,
+    facts: Told | None = None,
 ) -> Iterator[str]:
     """Why a process cannot even be asked; arguments as of `refuse_process`."""
     if status.tracer not in (0, os.getpid()):
         yield f"it is traced by pid {status.tracer}: end that debugger"
     if status.seccomp and (why := trace_seccomp.why_not()):
         yield seccomp.not_ours(why)
-    yield from _refuse_image(pid, files_kept)
+    yield from _refuse_image(pid, facts or Afresh(pid), files_kept)
     yield from _refuse_memory(procfs.parse_maps(procfs.read_text(pid, "maps")) if lines is None else lines)
 
 
-def _refuse_image(pid: int, files_kept: bool) -> Iterator[str]:
-    executable = procfs.read_link(pid, "exe")
+def _refuse_image(pid: int, facts: Told, files_kept: bool) -> Iterator[str]:
+    executable = facts.link("exe")
     if executable.endswith(procfs.DELETED) and not files_kept:
         yield f"its program file {executable} is no longer there: restart the program, then protect it"
         return
@@ -353,22 +362,22 @@ def _refuse_memory(lines: Sequence[MapsLine]) -> Iterator[str]:
         yield "it has no vdso (it unmapped it, or the kernel was started with vdso=0), by which a capture enters it"
 
 
-def _refuse_places(pid: int) -> Iterator[str]:
-    directory = procfs.read_link(pid, "cwd")
+def _refuse_places(facts: Told) -> Iterator[str]:
+    directory = facts.link("cwd")
     is_kernels = directory.startswith(KERNEL_PLACES) and not proc_and_sys.left_by_ended(directory)
     if procfs.is_gone(directory) and is_kernels:
         yield f"its working directory {directory} is gone: let the program change to another one"
-    root = procfs.read_link(pid, "root")
+    root = facts.link("root")
     if procfs.is_gone(root):
         yield f"its root directory {root} is gone: run it in one that stays"
 
 
-def _refuse_namespaces(pid: int) -> Iterator[str]:
+def _refuse_namespaces(pid: int, facts: Told) -> Iterator[str]:
     """Namespaces of its own, except those that we give: `failover run` PID and time, a restore time; with them mount and user."""
 
     def differs(kind: str) -> bool:
         try:
-            return procfs.read_link(pid, f"ns/{kind}") != os.readlink(f"/proc/self/ns/{kind}")
+            return facts.link(f"ns/{kind}") != facts.link(f"{OURS}{kind}")
         except (ProcessGoneError, FileNotFoundError):
             return False  # a kernel without this kind
 
@@ -378,20 +387,20 @@ def _refuse_namespaces(pid: int) -> Iterator[str]:
         if kind not in allowed and differs(kind):
             yield f"it lives in a {kind} namespace of its own, which is not kept yet: run it, and failover, in the same one"
     for kind in ("pid", "time"):
-        if _has_other_for_children(pid, kind):
+        if _has_other_for_children(pid, kind, facts):
             yield f"its children are to live in a {kind} namespace of their own (unshare), which is not kept yet: run it without"
 
 
-def _has_other_for_children(pid: int, kind: str) -> bool:
+def _has_other_for_children(pid: int, kind: str, facts: Told) -> bool:
     """Whether its children live in another namespace than it; the link leads nowhere before the first child.
 
     Source: exit_task_namespaces() in do_exit(): of a process that ends, long before it is told, no link but those of ``pid`` and
     ``user`` leads anywhere.
     """
     try:
-        return os.readlink(f"/proc/{pid}/ns/{kind}_for_children") != os.readlink(f"/proc/{pid}/ns/{kind}")
-    except FileNotFoundError:
+        return facts.link(f"ns/{kind}_for_children") != facts.link(f"ns/{kind}")
+    except ProcessGoneError:
         lives = os.path.exists(f"/proc/{pid}/ns/mnt")
         return lives and os.path.lexists(f"/proc/{pid}/ns/{kind}_for_children")
-    except OSError:  # gone, or not ours to look at: others say so
+    except (ProbeError, OSError):  # gone, or not ours to look at: others say so
         return False

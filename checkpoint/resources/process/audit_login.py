@@ -21,6 +21,7 @@ from typing import Final
 from checkpoint.capability import Area, by_rule
 from checkpoint.errors import CheckpointError
 from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.particulars import Afresh, Told
 from checkpoint.linux.trace.call_table import AT_FDCWD, CallTable
 from checkpoint.model import Resource
 from checkpoint.resources.restore_context import number_of
@@ -44,20 +45,24 @@ _UNSET: Final = 0xFFFF_FFFF
 
 def login_of(pid: int) -> tuple[int, int]:
     """The user of its login and the number of its audit session, `NOBODY` for each that is not set."""
-    return _number_in(pid, "loginuid"), _number_in(pid, "sessionid")
+    return _login_in(Afresh(pid))
 
 
-def _number_in(pid: int, name: str) -> int:
+def _login_in(facts: Told) -> tuple[int, int]:
+    return _number_in(facts, "loginuid"), _number_in(facts, "sessionid")
+
+
+def _number_in(facts: Told, name: str) -> int:
     try:
-        number = int(procfs.read_text(pid, name))
+        number = int(facts.read(name))
     except (CheckpointError, ValueError):
         return NOBODY
     return NOBODY if number == _UNSET else number
 
 
-def describe(pid: int) -> tuple[Resource, ...]:
+def describe(facts: Told) -> tuple[Resource, ...]:
     """The login of a process; nothing if it belongs to none."""
-    user, session = login_of(pid)
+    user, session = _login_in(facts)
     if (user, session) == (NOBODY, NOBODY):
         return ()
     return (Resource(KIND, "login", {"descriptors": [], "user": user, "session": session}),)

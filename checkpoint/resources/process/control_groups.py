@@ -65,14 +65,19 @@ Groups = Mapping[str, str]
 
 
 def groups_of(pid: int) -> Groups:
-    """Where a process is; nothing of one that has ended.
+    """Where a process is; nothing of one that has ended."""
+    with contextlib.suppress(CheckpointError):
+        return groups_in(procfs.read_text(pid, "cgroup"))
+    return {}
+
+
+def groups_in(text: str) -> Groups:
+    """The same, by its /proc/PID/cgroup.
 
     Source: cgroups(7): ``hierarchy-ID:controller-list:cgroup-path``.
     """
-    with contextlib.suppress(CheckpointError):
-        lines = [line.split(":", 2) for line in procfs.read_text(pid, "cgroup").splitlines()]
-        return {line[1]: line[2] for line in lines if len(line) == 3 and not line[2].endswith(REMOVED)}
-    return {}
+    lines = [line.split(":", 2) for line in text.splitlines()]
+    return {line[1]: line[2] for line in lines if len(line) == 3 and not line[2].endswith(REMOVED)}
 
 
 class _Mounts:
@@ -102,15 +107,16 @@ class _Mounts:
 # --- Captured ----------------------------------------------------------------------------------------------------------
 
 
-def added_to(state: Snapshot, pids: Sequence[int], *, is_guarded: bool) -> Snapshot:
+def added_to(state: Snapshot, places: Mapping[int, Groups], guard: int) -> Snapshot:
     """A snapshot with the places of its processes that are not the usual one.
 
     Args:
-        pids: of its processes as `Snapshot.processes` orders them.
+        places: of its processes, by pid, as `Snapshot.processes` orders them.
+        guard: pid of its guard; 0: it has none.
     """
-    usual = groups_of(procfs.status(pids[0]).ppid if is_guarded else os.getpid())
-    told = [tuple(_elsewhere(pid, usual, pids, is_guarded=is_guarded)) for pid in pids]
-    threads = [_of_threads(pid) if state.is_base else () for pid in pids]  # a program of 200 threads has 200 files
+    usual = groups_of(guard or os.getpid())
+    told = [tuple(_elsewhere(groups, usual, places, is_guarded=bool(guard))) for groups in places.values()]
+    threads = [_of_threads(pid) if state.is_base else () for pid in places]  # a program of 200 threads has 200 files
     if not any(told) and not any(threads):
         return state
     first, *others = map(_described, told, threads)
@@ -134,9 +140,9 @@ def _of_threads(pid: int) -> tuple[str, ...]:
     return ()
 
 
-def _elsewhere(pid: int, usual: Groups, pids: Collection[int], *, is_guarded: bool) -> Iterator[Fact]:
-    """The groups of a process that are not the usual ones."""
-    for hierarchy, path in groups_of(pid).items():
+def _elsewhere(groups: Groups, usual: Groups, pids: Collection[int], *, is_guarded: bool) -> Iterator[Fact]:
+    """Those of a process's groups that are not the usual ones."""
+    for hierarchy, path in groups.items():
         home = usual.get(hierarchy, "/")
         if is_guarded and hierarchy == UNIFIED and (made := GUARDS.search(path)):
             home = path[: made.end()]

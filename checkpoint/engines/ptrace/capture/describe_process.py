@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 from msgspec.structs import replace
 
 from checkpoint.arch import cpu as arch
@@ -13,6 +11,7 @@ from checkpoint.engines.ptrace.capture.frozen_threads import ThreadStanding
 from checkpoint.engines.ptrace.facts import describe
 from checkpoint.engines.ptrace.facts.file_identity import Identities
 from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.particulars import Particulars
 from checkpoint.linux.spawn import cpuid
 from checkpoint.model import PosixTimer, ProcessState, ThreadState
 
@@ -70,7 +69,7 @@ def _first_thread(standing: Standing) -> ThreadState:
     )
 
 
-def process_state(pid: int, standing: Standing, identities: Identities) -> ProcessState:
+def process_state(standing: Standing, identities: Identities, facts: Particulars) -> ProcessState:
     """The process as a whole."""
     status, told = standing.status, standing.told
     return ProcessState(
@@ -79,28 +78,36 @@ def process_state(pid: int, standing: Standing, identities: Identities) -> Proce
         pgid=status.pgids[-1] if status.pgids else 0,
         sid=status.sids[-1] if status.sids else 0,
         executable=identities.executable(),
-        arguments=tuple(os.fsdecode(procfs.read_bytes(pid, "cmdline")).split("\0")[:-1]),
-        layout=describe.layout(standing.stat, told, procfs.read_bytes(pid, "auxv")),
-        working_directory=procfs.read_link(pid, "cwd"),
-        root_directory=procfs.read_link(pid, "root"),
+        arguments=facts.meaning("cmdline", _arguments),
+        layout=describe.layout(standing.stat, told, facts.read("auxv")),
+        working_directory=facts.link("cwd"),
+        root_directory=facts.link("root"),
         umask=status.umask,
         credentials=describe.credentials(status, told),
-        personality=int(procfs.read_text(pid, "personality"), 16),
-        limits=procfs.limits(pid),
-        oom_score_adj=int(procfs.read_text(pid, "oom_score_adj")),
+        personality=facts.meaning("personality", _hexadecimal),
+        limits=facts.meaning("limits", procfs.parse_limits),
+        oom_score_adj=facts.meaning("oom_score_adj", int),
         dumpable=told.dumpable,
         keep_caps=told.keep_caps,
         child_subreaper=told.child_subreaper,
         parent_death_signal=told.parent_death_signal,
         thp_disabled=told.thp_disabled,
         switches=told.switches,
-        coredump_filter=describe.coredump_filter(pid),
+        coredump_filter=describe.coredump_filter(facts),
         signal_actions=told.actions,
         pending=standing.place.shared_pending,
         interval_timers=told.interval_timers,
         posix_timers=_timers(standing),
         isolated=len(status.pids) > 1,
     )
+
+
+def _arguments(text: str) -> tuple[str, ...]:
+    return tuple(text.split("\0")[:-1])
+
+
+def _hexadecimal(text: str) -> int:
+    return int(text, 16)
 
 
 def _timers(standing: Standing) -> tuple[PosixTimer, ...]:

@@ -200,6 +200,7 @@ class MemoryCapture:
         self._boards: Words = NONE
         self._boards_named: Words = NONE
         self._mapped: Words = NONE
+        self._of_files: Words = NONE
         self._vdso: Words = NONE
         self._followed: Words = NONE
         self.buffer = FreezeBuffer()
@@ -400,6 +401,7 @@ class MemoryCapture:
             copies=(),
             unread=unread,
             untouched=self._untouched(),
+            of_files=self._of_files,
         )
 
     def confirm(self) -> bool:
@@ -432,6 +434,7 @@ class MemoryCapture:
             copies=(*copied.copies, Copy(missing, content)),
             copy_ns=copy_ns,
             untouched=self._untouched(),
+            of_files=self._of_files,
         )
 
     def _read_within_budget(self, missing: Words, content: memoryview) -> None:
@@ -501,6 +504,7 @@ class MemoryCapture:
         self._followed = memory_tracker.extents_of(self._private)
         self._orphans = memory_tracker.extents_of([line for line in self.lines if memory_tracker.is_orphan(line)])
         self._mapped = memory_tracker.extents_of([line for line in self.lines if line.name not in memory_tracker.NOT_CARRIED])
+        self._of_files = memory_tracker.extents_of([line for line in self.lines if line.has_file])
         self._vdso = memory_tracker.extents_of([line for line in self.lines if line.name == VDSO])
         self._boards = memory_tracker.extents_of([line for line in self.lines if line.name == memory_tracker.BOARD])
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from msgspec import Struct, field
 
 from checkpoint.linux import abi
-from checkpoint.linux.memory import tracker
 from checkpoint.linux.memory.tracker import NONE
 from checkpoint.linux.procfs.procfs import MapsLine
 from checkpoint.model import Position
@@ -30,7 +29,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
 
     Attributes:
         lines: the mappings.
-        mapped: all that may be carried.
+        mapped: all that may be carried; ``of_files``: what is mapped of files.
         is_base: whether it is for a base.
         guards: see ``checkpoint.model.Vma.guards``.
         scans: everything that was named and is not acknowledged, the last scan's at the end.
@@ -50,6 +49,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
     valid: Words
     copies: tuple[Copy, ...]
     untouched: Words = field(default_factory=lambda: NONE)
+    of_files: Words = field(default_factory=lambda: NONE)
     copy_ns: int = 0
     unread: Words | None = None
 
@@ -83,8 +83,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
         Once: the copies may be used up by it.
         """
         sources, _ = merge.newest(self.copies, abi.PAGE_SIZE).without(self.carried, NONE)
-        of_files = tracker.extents_of([line for line in self.lines if line.has_file])
-        zero = merge.are_zero(self.copies, sources, abi.PAGE_SIZE) & ~page_set.covered(of_files, sources.addresses)
+        zero = merge.are_zero(self.copies, sources, abi.PAGE_SIZE) & ~page_set.covered(self.of_files, sources.addresses)
         dropped = page_set.extents_of_addresses(sources.addresses[zero], abi.PAGE_SIZE)
         sent, _ = sources.without(self.carried, dropped)
         return sent.addresses, self._gathered(sent), dropped

@@ -30,8 +30,9 @@ from checkpoint.errors import CaptureError, CheckpointError, ProcessGoneError, R
 from checkpoint.linux.memory.tracker import NONE, NOT_CARRIED
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.live_thread import SPOKESMEN_MAX, spokesman_of
+from checkpoint.linux.procfs.particulars import Particulars
 from checkpoint.linux.procfs.procfs import MapsLine
-from checkpoint.linux.procfs.vm_flags import WATCHED, FlagsReader
+from checkpoint.linux.procfs.vm_flags import WATCHED, Flags, FlagsReader
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from checkpoint.model import Position, ProcessState, Resource, ThreadState, Vma
@@ -40,7 +41,16 @@ from checkpoint.resources.events import aio
 from checkpoint.resources.files import clean_private_pages
 from checkpoint.resources.ipc import boards, system_v_memory
 from checkpoint.resources.open_file import Opened
-from checkpoint.resources.process import audit_login, job_control, mlockall, parent_death_signals, scheduling, seccomp
+from checkpoint.resources.process import (
+    audit_login,
+    control_groups,
+    job_control,
+    mlockall,
+    parent_death_signals,
+    scheduling,
+    seccomp,
+)
+from checkpoint.resources.process.control_groups import Groups
 from checkpoint.resources.survey import gather
 from checkpoint.runtime.identity_memo import Memo
 
@@ -123,6 +133,9 @@ class CapturedProcess:
         self.detached: Collection[tuple[int, int]] = frozenset()
         self._flags = FlagsReader(self.pid)
         self._of_mappings = Memo[tuple[str, ...]]()
+        self._told_by_mappings = Memo[tuple[tuple[Resource, ...], tuple[Resource, ...]]]()
+        self._particulars: Particulars | None = None
+        self._is_told = False
         self._look: Look | None = None
         self._settled: Look | None = None
         self._last: LastLook | None = None
@@ -179,6 +192,8 @@ class CapturedProcess:
         self.memory.close()
         self.onlooker.close()
         self.threads.close()
+        if self._particulars is not None:
+            self._particulars.close()
 
     def has_rested(self) -> bool:
         """Whether it is as the last look found it, and as was acknowledged; see `checkpoint.engines.ptrace.capture.at_rest`."""
@@ -256,14 +271,29 @@ class CapturedProcess:
         taken = self.memory.take(copied, base=base) if copied is not None else self.memory.take_unread()
         if self.memory.has_rings and not is_awaited:
             raise CaptureError(f"cannot capture {self.order.component}: it has just made a ring of asynchronous I/O; try again")
-        self._look = Look(self.onlooker.ask(place, outputs, opened), taken)
+        self._look, self._is_told = Look(self.onlooker.ask(place, outputs, opened), taken), False
         return self._look
 
     # Afterwards
 
     def process(self, look: Look) -> ProcessState:
         """The process as a whole."""
-        return process_state(self.pid, look.standing, self.identities)
+        return process_state(look.standing, self.identities, self._facts())
+
+    def groups(self) -> Groups:
+        """Where it is in control groups; nothing of one that has ended."""
+        with contextlib.suppress(CheckpointError):
+            return self._facts().meaning("cgroup", control_groups.groups_in)
+        return {}
+
+    def _facts(self) -> Particulars:
+        """Facts of /proc that are told when it may run again: asked for once after each look."""
+        if self._particulars is None:
+            self._particulars = Particulars(self.pid, keeps_files=not self.threads.is_one_of_many)
+        if not self._is_told:
+            self._particulars.ask()
+            self._is_told = True
+        return self._particulars
 
     def thread_states(self, look: Look) -> tuple[ThreadState, ...]:
         """Its threads, the first one first."""
@@ -295,6 +325,7 @@ class CapturedProcess:
                 files_kept=self.files_kept,
                 detaches_memory=self.order.terms.detaches_memory,
                 lines=lines,
+                facts=self._facts(),
             )
             of_rings = aio.refuse(look.standing.opened) if self.memory.has_rings else ()
             return (
@@ -324,20 +355,25 @@ class CapturedProcess:
         Raises:
             CaptureError: one of its threads has just changed its rights.
         """
-        told = self._flags.flags
-        ours = [codes for start, codes in told.items() if self.memory.borrowed.holds(start)]
-        of_program = (told.get(line.start, ()) for line in look.taken.lines if line.name not in NOT_CARRIED)
+        told, lines = self._flags.flags, look.taken.lines
+        locked, of_boards = self._told_by_mappings.of(lines, told, make=lambda: self._of_lines(lines, told))
         return (
-            *mlockall.describe(of_program, ours),
-            *system_v_memory.describe(look.taken.lines, self.detached),
-            *boards.describe_mappings(look.taken.lines),
+            *locked,
+            *(system_v_memory.describe(lines, self.detached) if self.memory.has_segments else ()),
+            *of_boards,
             *clean_private_pages.describe(look.taken.lines, look.taken.untouched, look.standing.opened),
             *self._limits(look.standing),
             *scheduling.describe(self.pid),
             *parent_death_signals.describe(self._death_signals(look.standing)),
-            *audit_login.describe(self.pid),
+            *audit_login.describe(self._facts()),
             *self.onlooker.tables.describe(),
         )
+
+    def _of_lines(self, lines: tuple[MapsLine, ...], told: Flags) -> tuple[tuple[Resource, ...], tuple[Resource, ...]]:
+        """What follows from the mappings and their flags alone: locks on what it will map, boards."""
+        ours = [codes for start, codes in told.items() if self.memory.borrowed.holds(start)]
+        of_program = (told.get(line.start, ()) for line in lines if line.name not in NOT_CARRIED)
+        return mlockall.describe(of_program, ours), boards.describe_mappings(lines)
 
     def _death_signals(self, standing: Standing) -> Iterator[tuple[int, int]]:
         """By thread, of those besides the first."""

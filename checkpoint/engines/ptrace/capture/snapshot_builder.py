@@ -135,8 +135,8 @@ class SnapshotBuilder:
             output=self._outputs.pieces(self._output_since(parent), totals) if self._outputs else (),
         )
         outline = frozen.departing.added_to(outline)
-        pids = (self._pid, *(others.in_order() if others else ()))
-        outline = control_groups.added_to(outline, pids, is_guarded=self._is_guarded)
+        places = {self._pid: first_process.groups(), **(others.groups() if others else {})}
+        outline = control_groups.added_to(outline, places, first.standing.status.ppid if self._is_guarded else 0)
         if self._owner is not None and (beyond := credentials.refusal(credentials.beyond(outline, self._owner), self._owner)):
             self._refuse((beyond,))
         if first.taken.unread is not None:
@@ -172,22 +172,23 @@ class SnapshotBuilder:
     ) -> Snapshot:
         """A snapshot without pages, descriptors and output."""
         first, others = frozen.first, frozen.others
-        masks = first.xstate_mask | (others.xstate_mask if others else 0)
+        masks, here = first.xstate_mask | (others.xstate_mask if others else 0), describe.this_machine()
+        mappings = first_process.mappings(first, others.pids if others else frozenset())
         return Snapshot(
             component=self._component,
             engine=PTRACE,
             position=Position(order.generation, order.sequence, bytes(16)),
             parent=parent,
             machine=replace(
-                describe.this_machine(),
+                here,
                 robot=order.robot,
                 xstate_mask=masks,
-                features=cpu_baseline.features_used(describe.this_machine().features, self._level),
+                features=cpu_baseline.features_used(here.features, self._level),
             ),
             clocks=first.standing.told.clocks,
             process=first_process.process(first),
             threads=first_process.thread_states(first),
-            vmas=(*first_process.mappings(first, others.pids if others else frozenset()), *parcel.vmas),
+            vmas=mappings if not parcel.vmas else (*mappings, *parcel.vmas),
             epoch=order.epoch,
             freeze_us=frozen.freeze_us,
             members=others.members(first) if others else (),

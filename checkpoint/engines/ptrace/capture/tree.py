@@ -43,6 +43,7 @@ from checkpoint.resources import other_holders, refusals, shared_descriptions
 from checkpoint.resources.ipc import standard_streams
 from checkpoint.resources.open_file import Held, Owners, Surroundings
 from checkpoint.resources.process import job_control, refused_threads, shared_with_parent, thread_credentials
+from checkpoint.resources.process.control_groups import Groups
 from checkpoint.resources.survey import gather
 from checkpoint.resources.survey import look as sorted_into_kinds
 from checkpoint.snapshot import process_tree
@@ -138,9 +139,9 @@ class SeenOthers(Struct):
     def _by_slot(self) -> list[SeenProcess]:
         return sorted(self.processes, key=lambda seen: seen.captured.slot)
 
-    def in_order(self) -> tuple[int, ...]:
-        """Their pids as we see them, in the order of `members`."""
-        return tuple(seen.captured.pid for seen in self._by_slot())
+    def groups(self) -> dict[int, Groups]:
+        """Where they are in control groups, by their pids as we see them, in the order of `members`."""
+        return {seen.captured.pid: seen.captured.groups() for seen in self._by_slot()}
 
     def members(self, first: Look) -> tuple[Member, ...]:
         """All of them."""

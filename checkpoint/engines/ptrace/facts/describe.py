@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import socket
 
 from blake3 import blake3
 
@@ -13,6 +12,7 @@ from checkpoint.errors import ProbeError
 from checkpoint.linux import abi
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.procfs import procfs
+from checkpoint.linux.procfs.particulars import Told as Facts
 from checkpoint.linux.procfs.procfs import Stat, Status
 from checkpoint.linux.spawn import cpuid
 from checkpoint.model import Credentials, Machine, MemoryLayout
@@ -48,10 +48,10 @@ def credentials(status: Status, told: Told) -> Credentials:
     )
 
 
-def coredump_filter(pid: int) -> int:
+def coredump_filter(facts: Facts) -> int:
     """Source: core(5); the file is empty for a process without memory, and missing where the kernel makes no core dumps."""
     try:
-        return int(procfs.read_text(pid, "coredump_filter"), 16)
+        return int(facts.read("coredump_filter"), 16)
     except (ProbeError, ValueError):
         return -1
 
@@ -59,17 +59,22 @@ def coredump_filter(pid: int) -> int:
 def this_machine() -> Machine:
     """Where we run; ``robot`` and ``xstate_mask`` are left to the capture."""
     about = os.uname()
-    with open("/proc/sys/kernel/random/boot_id") as file:
-        boot_id = file.read().strip()
     return Machine(
         architecture=about.machine,
         page_size=abi.PAGE_SIZE,
         kernel=about.release,
-        boot_id=boot_id,
-        hostname=socket.gethostname(),
+        boot_id=_boot_id(),
+        hostname=about.nodename,
         features=cpuid.features(),
         vdso_digest=_vdso_digest(),
     )
+
+
+@functools.cache
+def _boot_id() -> str:
+    """The kernel's own, which stays the same as long as we live."""
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        return file.read().strip()
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from checkpoint.linux.procfs import procfs, vm_flags
 from checkpoint.linux.procfs.procfs import DELETED, MapsLine
 from checkpoint.model import FileIdentity, Resource, Vma, VmaKind
 from checkpoint.pages import page_set
-from checkpoint.pages.page_set import Words
+from checkpoint.pages.page_set import Mappings, Words
 from checkpoint.resources.files import linked_names, regular
 from checkpoint.resources.refusals import HUGE_NAME
 from checkpoint.runtime.identity_memo import Memo
@@ -60,6 +60,7 @@ class Identities:
         self._known: dict[tuple[int, int, str], FileIdentity] = {}
         self._without_name: dict[tuple[int, int, str], tuple[int, frozenset[int]]] = {}
         self._found = Memo[tuple[Vma, ...]]()
+        self._build_id_of: tuple[tuple[int, ...], bytes] = ((), b"")
         self._sees_sizes = False
         """Whether sizes are read: only a mapped shared object itself tells its size."""
 
@@ -75,7 +76,7 @@ class Identities:
             self._found.forget()
         if not len(guards):
             return found
-        return tuple(
+        return Mappings(
             replace(vma, guards=page_set.page_runs(page_set.intersection(guards, page_set.extents((vma,))))) for vma in found
         )
 
@@ -85,7 +86,7 @@ class Identities:
         self._without_name = {key: looked for key, looked in self._without_name.items() if key in mapped}
         self._mapped_twice = _mapped_twice(lines)
         self._sees_sizes = any(map(is_shared_object, lines))
-        return tuple(self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
+        return Mappings(self._vma(line, flags.get(line.start, ())) for line in lines if line.name != VSYSCALL)
 
     def _vma(self, line: MapsLine, flags: tuple[str, ...]) -> Vma:
         is_told = self._is_told(line)
@@ -213,6 +214,7 @@ class Identities:
             about = os.stat(through)
         except OSError:
             return FileIdentity(path, deleted=deleted)
+        version = about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
         return FileIdentity(
             path=self._names.get(path, path),
             device=about.st_dev,
@@ -220,12 +222,16 @@ class Identities:
             mode=about.st_mode,
             size=about.st_size,
             mtime_ns=about.st_mtime_ns,
-            build_id=b"" if is_memory else build_id(through),
-            digest=b""
-            if is_memory
-            else regular.digest_at(through, (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)),
+            build_id=b"" if is_memory else self._build_id(through, version),
+            digest=b"" if is_memory else regular.digest_at(through, version),
             deleted=deleted,
         )
+
+    def _build_id(self, path: str, version: tuple[int, ...]) -> bytes:
+        """The build id of a file. That of the program itself is told at each capture, and read again for another version only."""
+        if self._build_id_of[0] != version or not self._build_id_of[1]:
+            self._build_id_of = version, build_id(path)
+        return self._build_id_of[1]
 
 
 def _changed_at(directory: str) -> int:

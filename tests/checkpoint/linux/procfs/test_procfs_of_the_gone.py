@@ -12,6 +12,7 @@ from checkpoint.engines.ptrace.facts import probe
 from checkpoint.errors import ProcessGoneError
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.descriptors import descriptor_numbers
+from checkpoint.linux.procfs.particulars import Afresh
 from checkpoint.resources import refusals
 from checkpoint.resources.survey import glance
 from tests.checkpoint.round_trip import as_nobody
@@ -59,4 +60,4 @@ def test_who_ends_in_the_middle_of_a_look_is_gone(monkeypatch: pytest.MonkeyPatc
 def test_who_has_ended_is_not_taken_for_one_whose_children_are_to_live_elsewhere() -> None:
     """Of it the links of most namespaces lead nowhere, as one does of a program that has called unshare(2)."""
     with zombie() as pid:
-        assert [reason for reason in refusals._refuse_namespaces(pid) if "its children" in reason] == []
+        assert [reason for reason in refusals._refuse_namespaces(pid, Afresh(pid)) if "its children" in reason] == []

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from checkpoint.linux.procfs import procfs
 from checkpoint.resources.process import control_groups
 from tests.checkpoint.round_trip import everybody_below
 from tests.failover.cli.test_verbs import COMMAND
@@ -221,8 +220,8 @@ def test_a_component_of_a_user_enters_only_groups_of_that_user(hierarchy: Hierar
 
 def test_the_usual_place_is_not_recorded() -> None:
     here = os.getpid()
-    assert control_groups.groups_of(here)
-    assert not list(control_groups._elsewhere(here, control_groups.groups_of(here), (here,), is_guarded=False))
+    assert (usual := control_groups.groups_of(here))
+    assert not list(control_groups._elsewhere(usual, usual, (here,), is_guarded=False))
 
 
 @pytest.mark.parametrize(
@@ -233,9 +232,6 @@ def test_the_usual_place_is_not_recorded() -> None:
         ("/other", ""),
     ],
 )
-def test_under_a_guard_the_usual_place_is_the_group_that_it_made(
-    path: str, below: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(control_groups, "groups_of", lambda _: {"": path})
-    told = [groups[2] for groups in control_groups._elsewhere(procfs.pid_max(), {"": "/agents"}, (), is_guarded=True)]  # type: ignore[index, call-overload]
+def test_under_a_guard_the_usual_place_is_the_group_that_it_made(path: str, below: str | None) -> None:
+    told = [groups[2] for groups in control_groups._elsewhere({"": path}, {"": "/agents"}, (), is_guarded=True)]  # type: ignore[index, call-overload]
     assert told == ([] if below is None else [below])
