@@ -267,6 +267,7 @@ class Deposit:
             if position is not None:
                 await asyncio.to_thread(self._show, component, position, is_elsewhere=False)
             self._shown.pop(component, None)
+            self._brought.pop(component, None)
 
     def mend_logs(self, running: Collection[str]) -> None:
         """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.

@@ -195,6 +195,36 @@ def test_logs_are_left_alone_where_nothing_was_written_unless_another_process_ma
     asyncio.run(story())
 
 
+@pytest.mark.parametrize("begins_anew", [True, False])
+def test_a_takeover_reads_nothing_where_nothing_was_written_and_the_logs_where_a_base_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begins_anew: bool
+) -> None:
+    """A base may be of another component that has this name now: its logs are looked at."""
+    (first,) = history(1)
+    silent = told_again(first, 2, first)
+    if begins_anew:
+        silent = replace(first, position=replace(first.position, sequence=64), output=silent.output)
+
+    async def story() -> None:
+        standing = Standing(tmp_path)
+        for made in (first, silent):
+            await standing.take(made)
+            standing.deposit.accept(Accept(COMPONENT, 1, made.position))
+            if made is silent:
+                with standing.log(1).open("ab") as log:
+                    log.write(b"another's")
+            await standing.deposit.show(Show(COMPONENT, 1, made.position))
+        is_looked_at = standing.log(1).read_bytes() == b"ready\n"
+        assert is_looked_at is begins_anew
+        opened, really = list[Position](), standing.store.open_chain
+        monkeypatch.setattr(standing.store, "open_chain", lambda *asked: opened.append(asked[-1]) or really(*asked))
+        for expected in ([], [silent.position]):  # a guard may have written since the first one
+            await standing.deposit.settled(COMPONENT, silent.position)
+            assert opened == expected
+
+    asyncio.run(story())
+
+
 def test_a_snapshot_that_the_core_does_not_accept_leaves_nothing(tmp_path: Path) -> None:
     """The robot had claimed the component while it was being stored: it goes on from the one before."""
     first, second = history(2)
