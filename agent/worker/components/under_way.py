@@ -24,6 +24,7 @@ def told(tell: Callable[[Event], None], event: UnderWay) -> Iterator[None]:
 def each(period_s: float, act: Callable[[], object]) -> Iterator[None]:
     """Do something after each period for as long as the body lasts; most bodies are over before the first time."""
     loop = asyncio.get_running_loop()
+    timer: asyncio.TimerHandle
 
     def again() -> None:
         nonlocal timer
