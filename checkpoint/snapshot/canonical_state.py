@@ -248,7 +248,7 @@ def _check_canonical(state: _State | _MemberRecord) -> None:
             _check_fact(record.facts, MAX_FACT_DEPTH)
         except FormatError as error:
             raise FormatError(f"state: facts of {record.kind} {record.name!r}: {error}") from None
-    mappings = (state.process.limits, *(thread.registers for thread in state.threads))
+    mappings: tuple[Mapping[Any, object], ...] = (state.process.limits, *(thread.registers for thread in state.threads))
     if not all(map(_is_sorted, mappings)):
         raise FormatError(f"state: {OUT_OF_ORDER}")
 
