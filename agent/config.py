@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
+from agent.alerts_config import AlertsConfig
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
 from agent.task_config import TaskConfig, declaration
@@ -202,6 +203,7 @@ class Config:
         keep_size: of the whole store; beyond it the oldest of those go. "": as much as there is.
         wireless: interfaces that count as wireless though the kernel cannot know: an Ethernet port that leads to a radio.
         media: how frames leave over an interface, by its name.
+        alerts: commands that tell an operator.
     """
 
     robot: str = ""
@@ -235,6 +237,7 @@ class Config:
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     components: dict[str, ComponentConfig] = field(default_factory=dict)
     tasks: dict[str, TaskConfig] = field(default_factory=dict)
+    alerts: AlertsConfig = field(default_factory=AlertsConfig)
 
     @property
     def xor_cache_size(self) -> int:
@@ -370,6 +373,7 @@ def load(path: Path) -> Settings:
     _check_rule(path, config, members)
     _check_components(path, config, members)
     _check_tasks(path, config, members)
+    _check_alerts(path, config, members)
     return Settings(path, config, members, secret)
 
 
@@ -451,18 +455,38 @@ def _check_tasks(path: Path, config: Config, members: Team) -> None:
             raise ConfigError(f'{where}: command is missing: command = ["/opt/controller", "--fast"]')
         if members.robots[config.robot].role != "robot":
             raise ConfigError(f"{where}: {config.robot} is a {members.robots[config.robot].role}, and runs no programs")
-        try:
-            uid = _uid_of(task.user)
-        except KeyError as error:
-            raise ConfigError(f"{where}: user = {task.user!r}: this robot has no such user; see getent passwd") from error
-        if uid != os.geteuid() and os.geteuid() != 0:
-            raise ConfigError(f"{where}: user = {task.user!r}: this agent does not run as root: it runs programs of its own user")
+        _check_user(where, task.user)
+
+
+def _check_alerts(path: Path, config: Config, members: Team) -> None:
+    """An operator who would not be told learns it when the agent starts."""
+    alerts = config.alerts
+    if not alerts.wanted:
+        return
+    where = f"{path}:{strict_toml.line_of(path.read_text(), ('alerts',))}: alerts"
+    if members.robots[config.robot].role == "witness":
+        raise ConfigError(f"{where}: {config.robot} is a witness, and holds nothing to tell of; set it on robots and servers")
+    if not alerts.user and os.geteuid() == 0:
+        raise ConfigError(
+            f'{where}: user is missing, and this agent runs as root: name whose rights the commands have, as user = "nobody"'
+        )
+    _check_user(where, alerts.user)
+
+
+def _check_user(where: str, user: str) -> None:
+    """Raises ConfigError: this agent cannot run anything as that user."""
+    try:
+        uid = _uid_of(user)
+    except KeyError as error:
+        raise ConfigError(f"{where}: user = {user!r}: this robot has no such user; see getent passwd") from error
+    if uid != os.geteuid() and os.geteuid() != 0:
+        raise ConfigError(f"{where}: user = {user!r}: this agent does not run as root: it runs programs of its own user")
 
 
 def _uid_of(user: str) -> int:
     if not user:
         return os.geteuid()
-    from failover.config.accounts import account_of  # here: an agent without tasks does not load it
+    from failover.config.accounts import account_of  # here: an agent without tasks and alerts does not load it
 
     return account_of(user).pw_uid
 

@@ -15,6 +15,7 @@ import agent.errors
 import agent.main
 import checkpoint.errors
 import failover.errors
+from agent.alerts_config import AlertsConfig
 from agent.config import ComponentConfig, Config, HooksConfig, MediumConfig
 from agent.worker.control import status_view
 from agent.worker.network.replication_link import LinkState
@@ -134,6 +135,7 @@ def defaults(kind: type[Any]) -> dict[str, object]:
         ("agent.toml: one component", ComponentConfig),
         ("agent.toml: one medium", MediumConfig),
         ("agent.toml: hooks of one component", HooksConfig),
+        ("agent.toml: alerts", AlertsConfig),
         ("team.toml: who belongs", Robot),
         ("team.toml: the board", BoardConfig),
         ("team.toml: one item of the board", ItemConfig),

@@ -13,7 +13,7 @@ import logging
 import os
 from collections.abc import Coroutine
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from agent.config import Settings
 from agent.core_config import retention
@@ -60,6 +60,9 @@ from failover.core.types import HISTORY_MAX, Found, Held
 from failover.core.wire.messages import Belongings, Bulk, Cancel, Chunk, Content, Credit, Lacking, Offer, Refuse, Taken
 from failover.errors import FailoverError
 
+if TYPE_CHECKING:
+    from agent.worker.alerts import Alerts
+
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
 """Between two looks for brought files that no snapshot needs any more."""
@@ -100,6 +103,7 @@ class Worker(Switchboard):
         )
         self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
         self.connect(Verbs(self, self.gate))
+        self._alerts: Alerts | None = None
 
     async def prepare(self) -> Inventory:
         """Open the store, find what outlived the last agent."""
@@ -138,6 +142,11 @@ class Worker(Switchboard):
             self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
             self._task(self._keep_what_goes())
+        if self.settings.config.alerts.wanted:
+            from agent.worker.alerts import Alerts  # here: a robot that tells nobody does not load it
+
+            self._alerts = Alerts(self.settings, self.verbs, self.tell, hooks)
+            self._alerts.begin()
         found = await self._find_guards(records)
         await self._mend_logs(found)
         if found:
@@ -200,6 +209,8 @@ class Worker(Switchboard):
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._alerts is not None:
+            await self._alerts.close()
         await self._dispatch.close()
         await self._bringing.close()
         await asyncio.gather(*(supervisor.close() for supervisor in self.supervisors.values()))
@@ -222,6 +233,8 @@ class Worker(Switchboard):
 
     def obeys(self, act: acts.Act) -> None:
         """Carry an act of the core out."""
+        if self._alerts is not None:
+            self._alerts.ordered(act)
         match act:
             case acts.Answer():
                 self.answered(act)
@@ -388,6 +401,8 @@ class Worker(Switchboard):
         if isinstance(event, events.Captured) and self.supervisor(event.component).figures.snapshots == 1:
             self._new_here.set()  # the first one of it: look at once who else writes to its files
         super().tell(event)
+        if self._alerts is not None:
+            self._alerts.heard(event)
 
     def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
         figures = self.supervisor(offer.component).figures
@@ -446,7 +461,8 @@ class Worker(Switchboard):
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        notices = [*self.notices(), *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        complaints = self._alerts.complaints.values() if self._alerts is not None else ()
+        notices = [*self.notices(), *complaints, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
         ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory())
         return team_view(self.settings, self._life, told, ours)

@@ -59,19 +59,23 @@ def is_unknown(component: Sight) -> bool:
     return component.get("role") != "primary" and component.get("state") not in OVER_STATES | BAD_STATES
 
 
+def is_unwell(component: Sight) -> bool:
+    """It runs nowhere, unprotected, degraded, or a robot that holds its checkpoints could not go on from them well."""
+    one = sight(component)
+    is_bad = one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) or is_unknown(one)
+    is_over = one.get("state") in OVER_STATES
+    return (is_bad and not is_over) or any(
+        seen.get("cold") or seen.get("unstored") or is_lacking(seen) for seen in sights(component)
+    )
+
+
 def is_healthy(status: Mapping[str, Any]) -> bool:
     """Whether all that should be protected is, as far as any robot that answered knows.
 
     No component is degraded, failed, unprotected, without a standby that can run it, or where no answer came from; no robot
     counts a peer as dead, or has lately heard one say more than it may.
     """
-    living = [one for one in map(sight, status["components"]) if one.get("state") not in OVER_STATES]
-    unwell = any(
-        one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) or is_unknown(one) for one in living
-    )
-    unwell |= any(
-        seen.get("cold") or seen.get("unstored") or is_lacking(seen) for one in status["components"] for seen in sights(one)
-    )
+    unwell = any(map(is_unwell, status["components"]))
     unwell |= any(peer.get("doubted") for peer in status["peers"]) or any((status.get("doubted_elsewhere") or {}).values())
     peers = {peer["name"]: peer["state"] for peer in status["peers"]}
     return not unwell and all("dead" not in seen.values() for seen in (peers, *(status.get("peers_elsewhere") or {}).values()))

@@ -17,6 +17,7 @@ import msgspec
 import pytest
 
 from agent import config as configuration
+from agent.alerts_config import AlertsConfig
 from agent.config import ComponentConfig, Config, MediumConfig
 from agent.core_config import level_of, node_config, started_here
 from agent.errors import ConfigError
@@ -52,8 +53,9 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     (component,) = documented.pop("components").values()
     (task,) = documented.pop("tasks").values()
     (medium,) = documented.pop("media").values()
+    assert documented.pop("alerts") == dataclasses.asdict(AlertsConfig())
     defaults = dataclasses.asdict(Config())
-    del defaults["components"], defaults["tasks"], defaults["media"]
+    del defaults["components"], defaults["tasks"], defaults["media"], defaults["alerts"]
     assert documented == defaults
     assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
     assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
@@ -235,6 +237,11 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (('[components."/lab/a"]', 'directory = "opt"'), 4, "is not absolute"),
         (('[components."/lab/a"]', 'environment = { "A=B" = "c" }'), 4, "has a variable 'A=B'"),
         (('[components."/lab/a"]', "environment = { A = 1 }"), 5, "Expected `str`"),
+        (("[alerts]", 'user = "nobody"', 'on_split = ["tell"]', "per_hour = 0"), 4, "per_hour is 0; it must be at least 1"),
+        (("[alerts]", 'on_takeover = [""]'), 4, "the first word names the program"),
+        (("[alerts]", 'on_takover = ["tell"]'), 5, "did you mean 'on_takeover'"),
+        (("[alerts]", 'on_split = "tell"'), 5, "Expected `array`"),
+        (("[alerts]", 'user = "no-such-user"', 'on_split = ["tell"]'), 4, "this robot has no such user"),
     ],
 )
 def test_a_mistake_is_named_with_file_line_and_cure(directory: Path, lines: tuple[str, ...], line: int, said: str) -> None:
@@ -426,3 +433,17 @@ def test_slots_by_name_work_with_a_lease_of_four_rounds(directory: Path) -> None
     loaded = configuration.load(written(directory, "lease_ms = 200", "[media.wlan0]", "slots = true"))
     assert loaded.config.medium("wlan0").slots is True
     assert loaded.config.medium("eth0") == MediumConfig()
+
+
+@pytest.mark.root
+def test_an_agent_of_root_tells_an_operator_by_a_named_users_rights_alone(directory: Path) -> None:
+    with pytest.raises(ConfigError, match=r"user is missing, and this agent runs as root.*nobody"):
+        configuration.load(written(directory, "[alerts]", 'on_split = ["tell"]'))
+    assert configuration.load(written(directory, "[alerts]", "limit_s = 5")).config.alerts.limit_s == 5, "nothing would be run"
+
+
+def test_a_witness_has_nothing_to_tell_of(directory: Path) -> None:
+    members = {"robot1": replace(ROBOT, role="witness"), "robot2": ROBOT, "robot3": ROBOT}
+    team.write(directory / "team", Team("lab", members))
+    with pytest.raises(ConfigError, match="is a witness, and holds nothing to tell of"):
+        configuration.load(written(directory, "[alerts]", 'user = "nobody"', 'on_split = ["tell"]'))

@@ -24,6 +24,7 @@ hook.
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import logging
 import os
@@ -74,11 +75,13 @@ class Hook(Struct, frozen=True):
         command: the first word names the program; () for none.
         limit_s: it is ended after that.
         user: None: the agent's own user, for a hook that its operator wrote; else the program's, for one that came with it.
+        told: what it reads from its standard input.
     """
 
     command: tuple[str, ...]
     limit_s: float
     user: Inheritance | None = None
+    told: bytes = b""
 
 
 class Occasion(Struct, frozen=True):
@@ -134,22 +137,30 @@ class Hooks(Struct, frozen=True):
 
     async def run(self, kind: Kind, hook: Hook, occasion: Occasion) -> Outcome:
         """Run one and wait for its end."""
+        failure, said = await self.carry_out(hook, occasion.environment(kind))
+        last_line = _log_output(kind, occasion, said)
+        if not failure:
+            return Outcome(last_line=last_line)
+        sentence = f"{kind} ({' '.join(hook.command)}) failed on {occasion.robot}, {occasion.why}: {failure}"
+        log.warning("%s: %s", occasion.component, sentence)
+        return Outcome(sentence, last_line)
+
+    async def carry_out(self, hook: Hook, environment: Mapping[str, str]) -> tuple[str, bytes]:
+        """Run a command and wait for its end: why it failed, "" if it did not, and the last that it wrote."""
         name = secrets.token_hex(4)
         try:
-            running = await self._begun(name, hook, occasion.environment(kind))
+            running = await self._begun(name, hook, environment)
         except (OSError, ValueError) as error:  # a command that came from another robot may hold a zero byte
-            return self._told(kind, hook, occasion, f"cannot be started: {in_words(error)}")
+            return f"cannot be started: {in_words(error)}", b""
         try:
             said = await running.last_said(hook.limit_s + (SYSTEMD_S if self.starter else 0))
         except TimeoutError:
             await _end(running.process)
-            return self._told(kind, hook, occasion, f"took longer than {hook.limit_s:g} s and was ended")
+            return f"took longer than {hook.limit_s:g} s and was ended", running.said
         finally:
             running.output.close()
-        last_line = _log_output(kind, occasion, said)
-        if not running.process.returncode:
-            return Outcome(last_line=last_line)
-        return self._told(kind, hook, occasion, self._failure(name, running.process.returncode), last_line)
+        status = running.process.returncode
+        return self._failure(name, status) if status else "", said
 
     def _failure(self, name: str, status: int) -> str:
         if self.starter:
@@ -163,15 +174,20 @@ class Hooks(Struct, frozen=True):
             options = [f"--setenv={variable}={value}" for variable, value in environment.items()]
             options += [f"--property=TimeoutStartSec={hook.limit_s:g}s"]
             options += [f"--uid={wanted['user']}", f"--gid={wanted['group']}"] if wanted else []
+            if hook.told:
+                content = base64.b64encode(hook.told).decode()
+                options += ["--property=StandardInput=data", f"--property=StandardInputData={content}"]
             way = in_a_unit(self.starter, "hook", name)
             command, variables, wanted = [*way[:-1], *options, "--", *command], dict(os.environ), {}
         reading, writing = os.pipe()
+        standard_input = asyncio.subprocess.DEVNULL
         try:
+            standard_input = _file_of(hook.told)
             process = await asyncio.create_subprocess_exec(
                 *command,
                 env=variables,
                 cwd="/",
-                stdin=asyncio.subprocess.DEVNULL,
+                stdin=standard_input,
                 stdout=writing,
                 stderr=asyncio.subprocess.STDOUT,
                 start_new_session=True,
@@ -182,15 +198,12 @@ class Hooks(Struct, frozen=True):
             raise
         finally:
             os.close(writing)
+            if standard_input >= 0:
+                os.close(standard_input)
         reader = asyncio.StreamReader()
         protocol = asyncio.StreamReaderProtocol(reader)
         output, _ = await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, os.fdopen(reading, "rb", buffering=0))
         return _Running(process, reader, output)
-
-    def _told(self, kind: Kind, hook: Hook, occasion: Occasion, why: str, last_line: str = "") -> Outcome:
-        sentence = f"{kind} ({' '.join(hook.command)}) failed on {occasion.robot}, {occasion.why}: {why}"
-        log.warning("%s: %s", occasion.component, sentence)
-        return Outcome(sentence, last_line)
 
 
 class _Running(Struct):
@@ -228,6 +241,16 @@ class _Running(Struct):
     async def _read(self) -> None:
         while piece := await self.reader.read(CHUNK):
             self.said = (self.said + piece)[-OUTPUT_MAX:]
+
+
+def _file_of(content: bytes) -> int:
+    """A descriptor from which a command can read that, however slowly; of no file, where there is nothing to read."""
+    if not content:
+        return asyncio.subprocess.DEVNULL
+    descriptor = os.memfd_create("told", os.MFD_CLOEXEC)
+    os.write(descriptor, content)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    return descriptor
 
 
 def _user_of(user: Inheritance | None) -> dict[str, Any]:

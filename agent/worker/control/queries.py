@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Final, Protocol
 
 from agent.config import Settings
@@ -88,7 +88,7 @@ class Questions:
         """
         self._lines = lines
         self._gate = gate
-        self._telling = Telling(lines)
+        self.telling = Telling(lines)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -132,7 +132,7 @@ class Questions:
 
     def errands(self) -> dict[str, Order]:
         """What another robot may ask of this one: how things stand here."""
-        return {"standing": self.standing, "picture": self.picture, "story": self._telling.page}
+        return {"standing": self.standing, "picture": self.picture, "story": self.telling.page}
 
     async def _no_work(self, _say: Conversation, _arguments: dict[str, Any]) -> dict[str, Any]:
         me = self._lines.settings.config.robot
@@ -155,16 +155,23 @@ class Questions:
 
     async def _sight(self, team: bool, uid: int) -> dict[str, Any]:
         """This robot's picture, for a user; with ``team`` each component also as the other living robots see it."""
-        mine = self._lines.picture(await self._lines.ask("status"))
-        for component in mine["components"]:
-            component["elsewhere"] = {}
+        mine = await self.joined(None if team else ())
         if team:
-            living = await self._reachable()
-            answers = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in living))
-            _join(mine, {robot: picture for robot, picture in zip(living, answers, strict=True) if picture})
             mine["healthy"] = is_healthy(mine)
         mine["components"] = await self._shown(uid, mine["components"])
         mine["rights"] = self._gate.standing() if self._gate is not None else ""
+        return mine
+
+    async def joined(self, robots: Collection[str] | None) -> dict[str, Any]:
+        """This robot's picture, with what others say: of these robots those that live and answer; None: of all."""
+        mine = self._lines.picture(await self._lines.ask("status"))
+        for component in mine["components"]:
+            component["elsewhere"] = {}
+        if robots is not None and not robots:
+            return mine
+        asked = [robot for robot in await self._reachable() if robots is None or robot in robots]
+        answers = await asyncio.gather(*(self._asked(peer, "picture", {}) for peer in asked))
+        _join(mine, {robot: picture for robot, picture in zip(asked, answers, strict=True) if picture})
         return mine
 
     async def _shown(self, uid: int, components: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -193,7 +200,7 @@ class Questions:
         """
         wanted = arguments_of(WhyArguments, "why", arguments)
         name = await self._known(wanted.name) if wanted.name else ""
-        told = await self._telling.whole(name, wanted.robot, wanted.age_ms_max)
+        told = await self.telling.whole(name, wanted.robot, wanted.age_ms_max)
         if (gate := self._rules()) is not None:
             asker = await gate.subject(say.caller.uid, "see")
             names = {line["component"] for line in told["story"]}

@@ -94,7 +94,7 @@ class Telling:
         """This robot's own lines for another robot: the newest that fit before ``before``, with its clocks."""
         came_ns = clock.wall_ns(clock.now_ns())
         wanted = arguments_of(PageArguments, "story", arguments)
-        lines, damaged = await self._own(wanted.name, wanted.age_ms_max)
+        lines, damaged = await self.own_lines(wanted.name, wanted.age_ms_max)
         older = [line for line in lines if wanted.before == (0, 0) or _place(line) < wanted.before]
         fitting = _fitting(older)
         now = _reading()
@@ -108,7 +108,7 @@ class Telling:
             "left_ns": now.wall_ns,
         }
 
-    async def _own(self, component: str, age_ms_max: int) -> tuple[list[Line], int]:
+    async def own_lines(self, component: str, age_ms_max: int) -> tuple[list[Line], int]:
         """This robot's lines, oldest first. It asks the main loop for lines not written yet before it reads the disk."""
         told = await self._worker.ask("why")
         try:
@@ -129,7 +129,7 @@ class Telling:
         heard = Heard(robot)
         try:
             if robot == self._worker.settings.config.robot:
-                heard.lines, heard.damaged = await self._own(component, age_ms_max)
+                heard.lines, heard.damaged = await self.own_lines(component, age_ms_max)
                 heard.reading = _reading()
             else:
                 await self._fetch(heard, component, age_ms_max)

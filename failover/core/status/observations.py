@@ -11,6 +11,9 @@ from failover.core.component import Turn
 from failover.core.events import Event, Received
 from failover.core.types import MS
 
+COUNTS_AS_DEAD = "it counts as dead"
+"""Ends what is said of a peer that is silent."""
+
 TOLD_SHARE = 2
 """An own stall is told from this part of the loyalty on: shorter ones come and go."""
 
@@ -65,6 +68,6 @@ def _farewell(turn: Turn, robot: str) -> str:
     peer = turn.team.peers[robot]
     limit_ms = (turn.team.loyal_until_ns(robot) - peer.heard_ns) // MS
     if not peer.boot:
-        return f"{robot} has not been heard in the {limit_ms} ms since this agent started: it counts as dead"
+        return f"{robot} has not been heard in the {limit_ms} ms since this agent started: {COUNTS_AS_DEAD}"
     links = ", ".join(link for link in sorted(peer.links) if link)
-    return f"{robot} was silent for {limit_ms} ms on every link{f' ({links})' if links else ''}: it counts as dead"
+    return f"{robot} was silent for {limit_ms} ms on every link{f' ({links})' if links else ''}: {COUNTS_AS_DEAD}"
