@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from failover.core.events import Prefer
+from failover.core.events import Handover, Prefer
 from failover.core.types import MS, ComponentSpec, Launch
 from tests.simulation.deeds import LACK
 from tests.simulation.invariants import seen_at
-from tests.simulation.teams import pair
+from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
 PART = "/team/part"
@@ -64,3 +64,19 @@ def test_what_one_robot_lacked_is_not_said_of_the_one_that_is_preferred_then() -
     assert later(world, 1_000) == ["robot1"] and "its return waits: robot2" in notes(world)
     world.command("robot1", Prefer(world.request(), PART, "robot2"))
     assert "waits" not in notes(world), "it is asked anew"
+
+
+def test_the_robot_where_it_was_started_stands_by_after_a_handover_so_that_it_can_go_back() -> None:
+    world = World(1, elective(3, (ComponentSpec(PART, home="robot3", launch=Launch(("part",))),)))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(2_000 * MS)
+    (first,) = world.acting(PART)
+    if first != "robot3":
+        assert seen_at(world, first, PART).standby == "robot3"
+        world.command(first, Handover(world.request(), PART, "robot3"))
+        assert later(world, 1_000) == ["robot3"]
+    world.command("robot3", Handover(world.request(), PART, seen_at(world, "robot3", PART).standby))
+    (away,) = later(world, 1_000)
+    assert away != "robot3"
+    assert seen_at(world, away, PART).standby == "robot3", "though another robot's name is less"

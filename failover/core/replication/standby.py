@@ -27,7 +27,7 @@ from failover.core.membership import Peer
 from failover.core.schedule.slack import LAG_NS_MAX, LAG_PERIODS
 from failover.core.types import ENDED, HISTORY_MAX, MS, PEERS_MAX, Config, OnUnsupported, State
 from failover.core.wire.messages import NEEDS_BASE, Entry
-from failover.core.wire.names import weight
+from failover.core.wire.names import Weight, weight
 
 NS_PER_US = 1_000
 
@@ -40,7 +40,10 @@ written, all of its memory is read meanwhile."""
 
 
 def choose_standby(component: Component, turn: Turn) -> None:
-    """The operator's choice, else the least loaded living robot, else the lesser name. Under ``freeze`` it stays for good."""
+    """The operator's choice, else where it would move back to, else the least loaded living robot, else the lesser name.
+
+    Under ``freeze`` it stays for good.
+    """
     if component.standby and _stays(component, turn):
         return
     wanted = component.rules.standby
@@ -50,7 +53,12 @@ def choose_standby(component: Component, turn: Turn) -> None:
         if grants(component, peer, turn.me) and turn.config.keeps(peer.robot) and (not wanted or peer.robot == wanted)
     ]
     if able:
-        component.standby = min(able, key=lambda peer: (not turn.config.runs(peer.robot), peer.load, weight(peer.robot))).robot
+        home = component.rules.prefer or (component.spec.home if component.spec else "")
+
+        def placing(peer: Peer) -> tuple[bool, bool, int, Weight]:
+            return not turn.config.runs(peer.robot), peer.robot != home, peer.load, weight(peer.robot)
+
+        component.standby = min(able, key=placing).robot
         component.due_ns = turn.now_ns
         turn.say(component, f"{component.standby} is its standby")
 
