@@ -259,6 +259,25 @@ VERBS: Final = (
         "failover.cli.verbs.components:failback",
     ),
     Verb(
+        "drill",
+        "try a takeover of one component: move it to its standby and back, measure both",
+        """
+        Move the component to its standby, wait until it is protected there, move it back, and report: for how long its program
+        stood still each time (from the instant at which the robot before took the last state to the first act at the other one),
+        whether its output went on, how soon it was protected again. Nothing is lost by it. First this command tells what it will
+        do; then it asks for confirmation; without a terminal it does nothing unless you give --yes. It refuses a component that
+        is not protected. If a step fails, the component stays where it is then, and this command says where that is.
+
+        Exit status 1: something was not as promised, or took longer than --at-most-ms. A real loss takes longer, by the silence
+        after which a robot is replaced, and loses what was done since the last checkpoint; the report says both figures.
+
+          failover drill mapper
+          failover drill mapper --yes --at-most-ms 500 --json
+        """,
+        "failover.cli.arguments.components:drill",
+        "failover.cli.verbs.drill:drill",
+    ),
+    Verb(
         "promote",
         "run a component that is held, without waiting for silent robots",
         """

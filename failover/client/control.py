@@ -95,7 +95,7 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
     restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reasons,
-    output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy}]
+    output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
         tasks of the schedule: its captures, and those of them that delayed an activation; of the newest: the longest time between
@@ -118,6 +118,9 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     contested: at its primary: which of its files others hold open for writing, so that a restore is refused; by sentence
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
+    resumed: {at, robot, state_at, sequence}: of its last restore at this robot: when its program acted here first (seconds
+        since 1970, by this robot's calendar); whose checkpoint that was, its number, and when that robot took it, by its own
+        calendar (of a program that keeps its state: when it made the commit); None: none in this life of the agent
     restarts: of a program that agent.toml declares: how often it was started anew after an end, in this life of the agent
     state: starting | running | restarting | frozen | held | restoring | ended | degraded | failed | released
     lag_ms: age of what the standby holds: since its capture began, or, where a program keeps its state, since its commit

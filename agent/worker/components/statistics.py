@@ -163,6 +163,20 @@ class Memory(Struct, frozen=True):
     remembered_max: int
 
 
+class Resumed(Struct, frozen=True):
+    """How a component came to run here.
+
+    Attributes:
+        at_ns: when its program acted here first, by our clock.
+        robot: whose checkpoint it resumed from; state_at_ns: when that was taken, by that robot's calendar, since 1970.
+    """
+
+    at_ns: int
+    robot: str
+    state_at_ns: int
+    position: Position
+
+
 class Figures(Struct):
     """The figures that ``failover status`` shows of one component on this robot; None where one is not known."""
 
@@ -181,6 +195,7 @@ class Figures(Struct):
     newest: Position | None = None
     exit_status: int | None = None
     outage_ms: float | None = None
+    resumed: Resumed | None = None
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     spec: ComponentSpec | None = None

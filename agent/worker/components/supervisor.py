@@ -30,11 +30,13 @@ from agent.worker.components.hook_runner import Occasions
 from agent.worker.components.ready_copy import ReadyCopy
 from agent.worker.components.restore_limits import bound_of
 from agent.worker.components.snapshots import Snapshots, newest_of
-from agent.worker.components.statistics import NOT_WANTED, Commits, CopyFigures, Figures, shortened
+from agent.worker.components.statistics import NOT_WANTED, Commits, CopyFigures, Figures, Resumed, shortened
 from agent.worker.components.warm_program import Standby
 from checkpoint.engine import COOPERATIVE, LASTING_NOTES
 from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
 from checkpoint.keeper.messages import close_all
+from checkpoint.model import Position
+from checkpoint.snapshot import format
 from failover.core import acts, events
 from failover.core.acts import Act
 from failover.core.types import ComponentSpec, Resumption
@@ -381,9 +383,10 @@ class Supervisor:
             occasion = await self._occasions.before_resume(act, descriptors[-1], outage_ns)
             laps.lap("preparing")
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
+            acts_ns = component.let_go_ns or clock.now_ns()
+            self.figures.resumed = await asyncio.to_thread(_resumed_from, descriptors[-1], act.position, acts_ns)
         finally:
             close_all(tuple(descriptors))
-        acts_ns = component.let_go_ns or clock.now_ns()
         self.component = component
         self.figures.restores += 1
         self.figures.commits = Commits()  # of another process: its numbers begin anew
@@ -569,3 +572,11 @@ class Supervisor:
             line = resume.last_line(component) if status else ""
             said = f"{SAID}{line}" if line else ""
             self.around.tell(events.Exited(self.name, self.epoch, status or 0, refusal, component.keeps, said))
+
+
+def _resumed_from(snapshot: int, position: Position, acts_ns: int) -> Resumed | None:
+    """For the status: whose checkpoint it resumed from, and when that was taken. It runs already, whatever is read here."""
+    with contextlib.suppress(*TROUBLE):
+        outline = format.read_outline(snapshot)
+        return Resumed(acts_ns, outline.machine.robot, outline.clocks.realtime_ns, position)
+    return None

@@ -24,7 +24,7 @@ from failover.core.frames.terms import SlotsView
 from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State, StatusView
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
-    from agent.worker.components.statistics import Commits, Figures, Memory
+    from agent.worker.components.statistics import Commits, Figures, Memory, Resumed
     from agent.worker.components.supervisor import Supervisor
     from checkpoint.store.store import Kept, Store
 
@@ -294,6 +294,7 @@ def _component(view: ComponentView, supervisor: Supervisor | None, settings: Set
         "restores": figures.restores if figures else 0,
         "crashes": figures.crashes if figures else 0,
         "outage_ms": figures.outage_ms if figures else None,
+        "resumed": _resumed(figures.resumed) if figures and figures.resumed else None,
         "restarts": view.restarted,
         "exit_status": view.status if view.state is State.FINISHED or (view.state is State.FAILED and view.status) else None,
         "kept": _kept(store.kept(view.name) if store is not None else None),
@@ -319,6 +320,16 @@ def _component(view: ComponentView, supervisor: Supervisor | None, settings: Set
             *_hung_up_devices(view, figures, settings),
             *_waiting_output(view, waiting),
         ],
+    }
+
+
+def _resumed(resumed: Resumed) -> dict[str, Any]:
+    """How it came to run here."""
+    return {
+        "at": clock.wall_ns(resumed.at_ns) / 1e9,
+        "robot": resumed.robot,
+        "state_at": resumed.state_at_ns / 1e9,
+        "sequence": resumed.position.sequence,
     }
 
 

@@ -1,4 +1,4 @@
-"""run, protect, release, stop, logs, handover, failback, promote, prefer: one component of a team."""
+"""run, protect, release, stop, logs, handover, failback, drill, promote, prefer: one component of a team."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from failover.cli.arguments.resources import (
     add_shared_files,
     add_shared_memory,
 )
-from failover.cli.arguments.shared import add_agent, add_name, add_pid, signal_number
+from failover.cli.arguments.shared import add_agent, add_name, add_pid, positive, signal_number
 
 HOOKS: Final = {
     "before_capture": "before the agent takes a whole snapshot of it, and before the last one of a handover",
@@ -109,6 +109,16 @@ def handover(room: argparse.ArgumentParser) -> None:
     """Of ``failover handover``."""
     add_name(room)
     room.add_argument("--to", metavar="ROBOT", help="the target robot (default: its standby)")
+    add_agent(room)
+
+
+def drill(room: argparse.ArgumentParser) -> None:
+    """Of ``failover drill``."""
+    add_name(room)
+    room.add_argument(
+        "--at-most-ms", metavar="MS", type=positive, help="fail where the program stood still for longer (default: no limit)"
+    )
+    room.add_argument("-y", "--yes", action="store_true", help="do not ask for confirmation")
     add_agent(room)
 
 

@@ -287,7 +287,7 @@ def promote(arguments: argparse.Namespace) -> int:
         wanted["robot"] = would["to"]
         if not arguments.json:
             print(f"failover: {would['sentence']}", *would["risks"], sep="\n  - ", file=sys.stderr)
-        if would["risks"] and not (arguments.yes or _agreed(f"promote {would['to']} all the same?")):
+        if would["risks"] and not (arguments.yes or agreed(f"promote {would['to']} all the same?")):
             told = tuple(would["risks"]) if arguments.json else ()
             raise AgentRefusedError(f"{would['name']} is left as it is; --yes promotes {would['to']} all the same", "Risk", told)
         answer = agent.ask("promote", **wanted, sure=True)
@@ -295,7 +295,7 @@ def promote(arguments: argparse.Namespace) -> int:
     return _tell(arguments, answer, f"{answer['name']} runs on {answer['to']} now, epoch {answer['epoch']}")
 
 
-def _agreed(question: str) -> bool:
+def agreed(question: str) -> bool:
     """Whether the person at the terminal says yes; False without a terminal."""
     if not sys.stdin.isatty():
         return False
