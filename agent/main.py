@@ -117,7 +117,7 @@ def _check_rights(directory: Path) -> None:
 def _run(settings: configuration.Settings) -> int:
     from agent.main_loop.loop import beat
 
-    set_up_log(settings.config.log_level)
+    set_up_log(settings.config.log_level, settings.config.robot)
     syscalls.small_stacks()
     if settings.config.insecure:
         log.warning("%s", INSECURE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Iterable
@@ -13,6 +14,7 @@ from msgspec.structs import replace
 
 from agent.event_log import EventLogFile
 from agent.system import clock
+from agent.system.log_setup import DECISIONS
 from failover.core.event_log.decisions import Decision, Line
 
 WAITING_MAX: Final = 512
@@ -23,6 +25,8 @@ RETRY_S: Final = 1.0
 
 REPEAT_NS: Final = 60 * 10**9
 """The same sentence about the same component is written again after this time only, or after another one about it."""
+
+log = logging.getLogger(DECISIONS)
 
 COMPONENTS_MAX: Final = 2_048
 """Components whose last sentence is remembered."""
@@ -116,6 +120,10 @@ class EventLogWriter:
             self.trouble = f"this robot cannot write its event log: {error.strerror}; failover why will not show its decisions"
             return False
         self._written = batch[-1].number
+        for line in batch:
+            decision = line.decision
+            about = {"component": decision.component, "epoch": decision.facts.epoch}
+            log.info("%s: %s", decision.component or self._robot, decision.sentence, extra=about)
         lost = self._given_up
         self.trouble = f"{lost} decisions are missing in the event log: the disk did not take them in time" if lost else ""
         return True

@@ -1,13 +1,31 @@
-"""The agent's log: lines to standard error, where systemd's journal or a terminal takes them."""
+"""The agent's log: lines with times to standard error; under systemd entries with fields to its journal, which has the times."""
 
 from __future__ import annotations
 
 import logging
 import sys
+from typing import Final
+
+from agent.system.journal import JournalHandler, is_ours
+
+DECISIONS: Final = "failover.decisions"
+"""The logger of what a robot decided. Its lines come from a thread of low priority, which may not hold up the main loop's: it has
+a handler, and so a lock, of its own."""
+
+FORMAT: Final = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
 
 
-def set_up_log(level: str) -> None:
+def set_up_log(level: str, robot: str) -> None:
     """Begin to write lines of that level and above."""
-    logging.basicConfig(
-        level=level.upper(), stream=sys.stderr, format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S"
-    )
+    logging.basicConfig(level=level.upper(), handlers=[_handler(robot)])
+    decisions = logging.getLogger(DECISIONS)
+    decisions.addHandler(_handler(robot))
+    decisions.propagate = False
+
+
+def _handler(robot: str) -> logging.Handler:
+    if is_ours():
+        return JournalHandler(robot)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter(FORMAT, "%H:%M:%S"))
+    return handler

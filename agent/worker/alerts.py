@@ -202,7 +202,7 @@ class Alerts:
     def _take(self, told: Iterable[Alert], at_s: float | None = None) -> None:
         now_s = clock.wall_ns(clock.now_ns()) / 1e9
         for alert in told:
-            log.warning("%s: %s: %s", alert.component, alert.kind, alert.reason)
+            log.warning("%s: %s: %s", alert.component, alert.kind, alert.reason, extra={"epoch": alert.epoch})
             if not self._config.command(alert.kind):
                 continue
             if len(self._due) < WAITING_MAX:

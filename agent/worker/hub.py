@@ -464,7 +464,7 @@ def live(kind: Callable[[Settings, Channel[ToWorker]], Switchboard]) -> int:
     path, descriptor = Path(sys.argv[1]), int(sys.argv[2])
     try:
         settings = configuration.load(path)
-        set_up_log(settings.config.log_level)
+        set_up_log(settings.config.log_level, settings.config.robot)
         with contextlib.suppress(asyncio.CancelledError):
             asyncio.run(_live(kind, settings, descriptor))
     except (AgentError, CheckpointError, OSError) as error:

@@ -69,6 +69,22 @@ def as_user(machine: Machine, user: str, script: str) -> tuple[int, str]:
     return service.as_user(machine, user, "bash", "-c", script)
 
 
+def test_the_journal_can_be_asked_for_one_component_with_its_epoch(machine: Machine, alices: str) -> None:
+    name = f"/lab/robot1/{alices}"
+    robots.until(lambda: "it runs at robot1" in of_the_journal(machine, f"COMPONENT={name}", "MESSAGE"), "its start to be told")
+    assert component(machine, alices)["epoch"] == 1
+    assert set(of_the_journal(machine, f"COMPONENT={name}", "EPOCH").split()) == {"1"}
+    assert "it runs at robot1" in of_the_journal(machine, "ROBOT=robot1", "MESSAGE")
+    assert of_the_journal(machine, "COMPONENT=/lab/robot1/another", "MESSAGE") == ""
+
+
+def of_the_journal(machine: Machine, *asked: str) -> str:
+    """The values of a field (the last argument) in the entries of the agent that fit."""
+    *fitting, field = asked
+    entries = machine.run("journalctl", "--unit", SERVICE, "--output=cat", f"--output-fields={field}", *fitting, check=False)
+    return str(entries.stdout)
+
+
 @pytest.fixture(scope="module")
 def alices(machine: Machine) -> str:
     """A component of Alice's that has checkpoints."""

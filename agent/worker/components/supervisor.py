@@ -280,7 +280,7 @@ class Supervisor:
             self.around.tell(events.NothingToCapture(self.name, act.epoch, message))
             return
         if not isinstance(act, acts.Capture) or reasons != self.figures.reasons:  # a capture is tried again every second
-            log.warning("%s: %s: %s", self.name, type(act).__name__, message)
+            log.warning("%s: %s: %s", self.name, type(act).__name__, message, extra={"epoch": getattr(act, "epoch", 0)})
         match act:
             case acts.LetGo():
                 self._not_let_go = trouble
@@ -396,7 +396,7 @@ class Supervisor:
         since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
         protecting = f"; protecting it again {(clock.now_ns() - acts_ns) / 1e6:.1f} ms" if component.let_go_ns else ""
         sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}{protecting}"
-        log.info("%s: %s", self.name, sentence)
+        log.info("%s: %s", self.name, sentence, extra={"epoch": act.epoch})
         self.started.set()
         lost_ns = 0 if act.why is Resumption.HANDED_OVER else max(0, age_ns - idle_ns)
         self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns, lost_ns))
