@@ -26,6 +26,8 @@ from typing import Final
 
 from msgspec import Struct
 
+from agent.guard import output_times
+from agent.guard.output_times import OutputTimes
 from agent.system import syscalls
 from checkpoint.model import OutputPiece
 
@@ -81,6 +83,7 @@ class OutputLogs:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._offsets = _open(directory / OFFSETS_NAME)
         self._logs = {stream: _open(directory / LOG_NAMES[stream]) for stream in STREAMS}
+        self._times = OutputTimes(directory)
         self.trims = _can_trim(self._logs[1])
         """Whether old bytes can be given back here; otherwise the logs grow until the disk is full."""
 
@@ -91,6 +94,11 @@ class OutputLogs:
         for descriptor in opened:
             if descriptor != CLOSED:
                 os.close(descriptor)
+        self._times.close()
+
+    def mark(self) -> None:
+        """Bytes are about to be written: note when."""
+        self._times.mark(self.totals())
 
     def descriptor(self, stream: int) -> int:
         """The log's file descriptor; it stays this object's."""
@@ -162,6 +170,8 @@ class OutputLogs:
             is_safe: they come from another robot, so that two hold them.
         """
         for piece in pieces:
+            if piece.content:
+                self.mark()
             bounds = self.bounds(piece.stream)
             gap = piece.offset > bounds.size
             start = piece.offset if gap else min(bounds.start, piece.offset)
@@ -227,7 +237,7 @@ def discard(directory: Path) -> None:
     Raises:
         OSError: the directory cannot be written.
     """
-    for name in (OFFSETS_NAME, *LOG_NAMES.values()):
+    for name in (OFFSETS_NAME, output_times.NAME, *LOG_NAMES.values()):
         (directory / name).unlink(missing_ok=True)
 
 

@@ -192,6 +192,8 @@ class Pump:
         return bool(content)
 
     def _store(self, stream: int, offset: int, rest: memoryview) -> None:
+        if rest:
+            self.logs.mark()
         while rest:
             try:
                 written = self.logs.write(stream, offset, rest)

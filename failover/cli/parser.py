@@ -208,13 +208,16 @@ VERBS: Final = (
         """
         Show standard output and standard error of a component from its beginning (at most the last 256 MB of each), as far as no
         takeover can take it back, and all of it once the component has ended. Give this order at any robot. --follow continues
-        through a takeover.
+        through a takeover. The times of --times and --since are those of the robot that answers, exact to a tenth of a second for
+        the last minutes and coarser before: when the program wrote it, or, at a standby, when a checkpoint brought it there.
 
           failover logs /lab/robot1/mapper
           failover logs --follow --stream 2 /lab/robot1/mapper
+          failover logs --tail 20 --times mapper
+          failover logs --since 10min mapper
         """,
         "failover.cli.arguments.components:logs",
-        "failover.cli.verbs.components:logs",
+        "failover.cli.verbs.logs:logs",
     ),
     Verb(
         "why",

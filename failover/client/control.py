@@ -25,7 +25,8 @@ verb           arguments                                                result, 
 ``start``      ``name`` *must*                                          ``{name, robot, notes}``: of agent.toml, after its end
 ``stop``       ``name`` *must*, ``signal`` 15                           ``{name, exit_status}`` once it has ended
 ``logs``       ``name`` *must*, ``follow`` false, ``offsets`` [0, 0]:    Output …, Result ``{name, totals, exit_status}``
-               below zero, from the end of the stream
+               below zero, from the end of the stream; ``since_ms``
+               0: not what is older; ``times`` false: with instants
 ``why``        ``name`` "", ``robot`` "", ``age_ms_max`` 0               see `WHY`
 ``rights``     ``user``, ``right``, ``path``, all *must*                ``{allow, because, groups, place}``
 ``may``        ``rights`` *must*, ``paths`` *must*                      ``{robot, team, answers: {right: {path: because}}}``:
@@ -189,11 +190,15 @@ class Update(msgspec.Struct, frozen=True, tag="update"):
 
 
 class Output(msgspec.Struct, frozen=True, tag="output"):
-    """Bytes that the component wrote; ``stream`` 1 or 2, ``offset`` of the first byte in the whole stream."""
+    """Bytes that the component wrote; ``stream`` 1 or 2, ``offset`` of the first byte in the whole stream.
+
+    ``times``: where they were asked for: (offset from which on, ns since 1970 by the calendar of the robot that has the logs).
+    """
 
     stream: Annotated[int, msgspec.Meta(ge=1, le=2)]
     offset: Annotated[int, msgspec.Meta(ge=0)]
     content: bytes
+    times: tuple[tuple[int, int], ...] = ()
 
 
 class Result(msgspec.Struct, frozen=True, tag="result"):

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -118,3 +119,45 @@ def test_whoever_watches_goes_on_when_the_agent_is_back(pair: Pair, tmp_path: Pa
         watching.wait()
     assert lines(out) == list(range(len(lines(out))))
     assert lines(err) == [-number for number in range(len(lines(err)))]
+
+
+IN_TWO_PARTS = """
+import os, sys, time
+for number in range(10):
+    print("early", number, flush=True)
+while not os.path.exists(sys.argv[1]):
+    time.sleep(0.01)
+for number in range(10):
+    print("late", number, flush=True)
+time.sleep(1000)
+"""
+
+APART_S = 4
+"""Between the two parts: longer than a checkpoint and a command take here."""
+
+
+def test_the_last_lines_and_what_is_younger_are_shown_with_their_times_at_both_robots(pair: Pair, tmp_path: Path) -> None:
+    first, go = pair[0], tmp_path / "go"
+    early, late = ([f"{part} {number}" for number in range(10)] for part in ("early", "late"))
+
+    def shown(robot: RobotMachine, *options: str) -> list[str]:
+        return robots.failover(robot, "logs", *options, "parts").stdout.splitlines()
+
+    robots.run(first, "parts", "/usr/bin/python3", "-S", "-c", IN_TWO_PARTS, str(go))
+    for robot in pair:
+        robots.until(lambda: shown(robot) == early, f"the first part at {robot.name}")  # noqa: B023
+        robots.until(lambda: shown(robot, "--since", f"{APART_S}s") == [], f"it to be old at {robot.name}")  # noqa: B023
+    go.touch()
+    began_s = time.monotonic()
+    for robot in pair:
+        robots.until(lambda: shown(robot) == early + late, f"the second part at {robot.name}")  # noqa: B023
+        if time.monotonic() - began_s < APART_S - 2:  # on a machine that is not too busy for it
+            assert shown(robot, "--since", f"{APART_S - 1}s") == late
+        assert shown(robot, "--since", "1h") == early + late
+        assert shown(robot, "--tail", "3") == late[-3:] and shown(robot, "--tail", "15") == early[-5:] + late
+        assert shown(robot, "--tail", "100") == early + late
+        timed = [line.split("  ", 1) for line in shown(robot, "--times")]
+        assert [text for _, text in timed] == early + late
+        times = [instant for instant, _ in timed]
+        assert times == sorted(times) and times[9] < times[10], "the second part is younger"
+        assert [line.split("  ", 1) for line in shown(robot, "--times", "--tail", "2")] == timed[-2:]

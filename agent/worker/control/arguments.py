@@ -132,6 +132,8 @@ class LogsArguments(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     follow: bool = False
     offsets: tuple[Offset, Offset] = (0, 0)
+    since_ms: Annotated[int, msgspec.Meta(ge=0)] = 0
+    times: bool = False
 
 
 class NameArguments(msgspec.Struct, forbid_unknown_fields=True):
@@ -196,6 +198,8 @@ class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     stream: int
     offset: Offset
+    since_ms: Annotated[int, msgspec.Meta(ge=0)] = 0
+    times: bool = False
 
 
 class TeamArguments(msgspec.Struct, forbid_unknown_fields=True):

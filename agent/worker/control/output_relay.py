@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any, Final, Protocol
+
+from msgspec import Struct
 
 from agent.config import Settings
 from agent.errors import RefusedError
 from agent.guard.output_logs import STREAMS, OutputLogs
+from agent.guard.output_times import Times
 from agent.main_loop.messages import Told
+from agent.system import clock
 from agent.system.permissions import ROOT, check_right
 from agent.worker.components.paths import Places, log_directory
 from agent.worker.components.supervisor import Supervisor
@@ -53,6 +58,38 @@ class Worker(Protocol):
     async def ask(self, what: Any) -> Told: ...
 
 
+Instants = tuple[tuple[int, int], ...]
+"""When bytes were written: see `agent.guard.output_times.Times.of`."""
+
+
+class Passage(Struct, frozen=True):
+    """What a client wants of both streams.
+
+    Attributes:
+        offsets: from which on; below zero from the end.
+        committed: only what no takeover can take back; all of it once it has ended.
+        since_ms: not what is older; 0: of any age.
+        times: with the instants at which it was written.
+    """
+
+    offsets: tuple[int, int] = (0, 0)
+    committed: bool = True
+    follow: bool = False
+    since_ms: int = 0
+    times: bool = False
+
+
+class Part(Struct, frozen=True):
+    """One piece of one stream, as it is asked for."""
+
+    name: str
+    stream: int
+    offset: int
+    committed: bool
+    since_ms: int
+    times: bool
+
+
 class OutputRelay:
     """Reads streams, here or elsewhere."""
 
@@ -60,35 +97,34 @@ class OutputRelay:
         self._worker = worker
         self._gate = gate
 
-    async def pass_on(
-        self, say: Conversation, name: str, offsets: tuple[int, int], *, committed: bool, follow: bool, check: Check | None = None
-    ) -> tuple[int, int]:
-        """Send the streams' bytes from the offsets on; with ``follow`` until the component's end is a record.
-
-        An offset below zero counts from the end.
+    async def pass_on(self, say: Conversation, name: str, wanted: Passage, check: Check | None = None) -> tuple[int, int]:
+        """Send what is wanted of the streams; with ``follow`` until the component's end is a record.
 
         Args:
-            committed: only what no takeover can take back; all of it once it has ended.
             check: asked again and again whether a rule lets this user read it, with any owner; raises where it does not.
 
         Raises:
             RefusedError: another robot has them, and went away; or the user may not read on.
         """
-        at = dict(zip(STREAMS, offsets, strict=True))
+        at = dict(zip(STREAMS, wanted.offsets, strict=True))
+        since = dict.fromkeys(STREAMS, wanted.since_ms)
         now_s, permitted, again_s = asyncio.get_running_loop().time, False, 0.0
         while True:
             if check is not None and now_s() >= again_s:
                 permitted, again_s = await check(), now_s() + CHECK_S
             over, elsewhere = await self._standing(name)
-            whole = over or not committed or (not follow and await self._has_ended(name))
+            whole = over or not wanted.committed or (not wanted.follow and await self._has_ended(name))
             sent = False
             for stream in STREAMS:
-                piece = await self._read(name, elsewhere, stream, at[stream], not whole, say.caller.uid, permitted)
+                part = Part(name, stream, at[stream], not whole, since[stream], wanted.times)
+                piece, times = await self._read(elsewhere, part, say.caller.uid, permitted)
+                if since[stream]:
+                    at[stream], since[stream] = piece.offset, 0
                 if piece.content:
-                    await say.output(stream, piece.offset, piece.content)
+                    await say.output(stream, piece.offset, piece.content, times)
                     at[stream] = piece.offset + len(piece.content)
                     sent = True
-            if not sent and (over or not follow):
+            if not sent and (over or not wanted.follow):
                 return max(at[1], 0), max(at[2], 0)
             if not sent:
                 await asyncio.sleep(POLL_ELSEWHERE_S if elsewhere else POLL_S)
@@ -105,26 +141,36 @@ class OutputRelay:
             by = ROOT
         else:
             check_right(by, wanted.name, owner)
-        piece = self._read_here(wanted.name, wanted.stream, wanted.offset, not await self._has_ended(wanted.name), by)
-        return {"offset": piece.offset, "content": piece.content}
+        is_committed = not await self._has_ended(wanted.name)
+        part = Part(wanted.name, wanted.stream, wanted.offset, is_committed, wanted.since_ms, wanted.times)
+        piece, times = self._read_here(part, by)
+        told = {"offset": piece.offset, "content": piece.content}
+        return told | {"times": times} if wanted.times else told
 
-    async def _read(
-        self, name: str, robot: str, stream: int, offset: int, committed: bool, by: int, permitted: bool
-    ) -> OutputPiece:
+    async def _read(self, robot: str, part: Part, by: int, permitted: bool) -> tuple[OutputPiece, Instants]:
         if not robot:
-            return self._read_here(name, stream, offset, committed, ROOT if permitted else by)
-        told = await self._worker.errands.send(robot, "piece", {"name": name, "stream": stream, "offset": offset}, by)
-        return OutputPiece(stream, told["offset"], told["content"])
+            return self._read_here(part, ROOT if permitted else by)
+        question: dict[str, Any] = {"name": part.name, "stream": part.stream, "offset": part.offset}
+        if part.since_ms or part.times:  # an agent of an earlier release knows neither
+            question |= {"since_ms": part.since_ms, "times": part.times}
+        told = await self._worker.errands.send(robot, "piece", question, by)
+        times = tuple((int(offset), int(at_ns)) for offset, at_ns in told.get("times", ()))
+        return OutputPiece(part.stream, told["offset"], told["content"]), times
 
-    def _read_here(self, name: str, stream: int, offset: int, committed: bool, by: int) -> OutputPiece:
+    def _read_here(self, part: Part, by: int) -> tuple[OutputPiece, Instants]:
         """Raises RefusedError: these are still the logs of another user's component, which had the name before."""
-        logs = OutputLogs(log_directory(name, self._worker.places))
+        directory = log_directory(part.name, self._worker.places)
+        logs = OutputLogs(directory)
         try:
             if logs.owner is not None:
-                check_right(by, f"the output of {name} that is kept here", logs.owner)
-            return logs.read(stream, offset, PIECE_SIZE, committed=committed)
+                check_right(by, f"the output of {part.name} that is kept here", logs.owner)
+            offset = _since(directory, part, logs.bounds(part.stream).size) if part.since_ms else part.offset
+            piece = logs.read(part.stream, offset, PIECE_SIZE, committed=part.committed)
         finally:
             logs.close()
+        if not part.times or not piece.content:
+            return piece, ()
+        return piece, tuple(Times(directory).of(part.stream, piece.offset, piece.offset + len(piece.content)))
 
     async def _standing(self, name: str) -> tuple[bool, str]:
         """Whether the component's end is a record, and the robot to ask for what it wrote; "" for this one."""
@@ -169,3 +215,10 @@ def _where(view: ComponentView, peers: tuple[PeerView, ...]) -> str:
     living = {peer.robot for peer in peers if peer.state in LIVING}
     holds = view.state is State.STANDBY and bool(view.positions)
     return view.primary if view.primary in living and not holds else ""
+
+
+def _since(directory: Path, part: Part, size: int) -> int:
+    """The offset from which on a stream was written within the last ``since_ms``; its end where nothing was."""
+    since_ns = clock.wall_ns(clock.now_ns()) - part.since_ms * 1_000_000
+    found = Times(directory).since(since_ns)
+    return size if found is None else found[part.stream - 1]

@@ -54,9 +54,9 @@ class Conversation:
         """Something to show."""
         await self.reply(Update(value))
 
-    async def output(self, stream: int, offset: int, content: bytes) -> None:
+    async def output(self, stream: int, offset: int, content: bytes, times: tuple[tuple[int, int], ...] = ()) -> None:
         """Bytes of the component."""
-        await self.reply(Output(stream, offset, content))
+        await self.reply(Output(stream, offset, content, times))
 
     async def reply(self, reply: Reply) -> None:
         """One message; waits while the client does not read."""

@@ -30,7 +30,7 @@ from agent.worker.control.arguments import (
     StopArguments,
     arguments_of,
 )
-from agent.worker.control.output_relay import OutputRelay
+from agent.worker.control.output_relay import OutputRelay, Passage
 from agent.worker.control.queries import Lines, Questions, named_after
 from agent.worker.control.quotas import check_components
 from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
@@ -161,7 +161,7 @@ class Verbs(Questions):
         if not wanted.wait:
             return started
         await say.update({"started": started})
-        await self._output_relay.pass_on(say, name, (0, 0), committed=wanted.output == COMMITTED, follow=True)
+        await self._output_relay.pass_on(say, name, Passage(committed=wanted.output == COMMITTED, follow=True))
         if supervisor.ended is not None and supervisor.ended.done():
             report = supervisor.ended.result()
             return {"name": name, "exit_status": report.status, "failed": report.failed, "reason": report.reason}
@@ -358,9 +358,8 @@ class Verbs(Questions):
             await self._check_right(say.caller.uid, name, "read")
             return True
 
-        totals = await self._output_relay.pass_on(
-            say, name, wanted.offsets, committed=True, follow=wanted.follow, check=permitted
-        )
+        passage = Passage(wanted.offsets, follow=wanted.follow, since_ms=wanted.since_ms, times=wanted.times)
+        totals = await self._output_relay.pass_on(say, name, passage, permitted)
         view = await self._view(name)
         return {"name": name, "totals": list(totals), "exit_status": view.get("exit_status")}
 

@@ -16,7 +16,7 @@ from failover.cli.arguments.resources import (
     add_shared_files,
     add_shared_memory,
 )
-from failover.cli.arguments.shared import add_agent, add_name, add_pid, positive, signal_number
+from failover.cli.arguments.shared import add_agent, add_name, add_pid, ago, positive, signal_number
 
 HOOKS: Final = {
     "before_capture": "before the agent takes a whole snapshot of it, and before the last one of a handover",
@@ -102,6 +102,9 @@ def logs(room: argparse.ArgumentParser) -> None:
     add_name(room)
     room.add_argument("-f", "--follow", action="store_true", help="follow until the program ends, or Ctrl-C")
     room.add_argument("--stream", type=int, choices=(1, 2), help="standard output (1) or standard error (2) alone")
+    room.add_argument("--since", metavar="AGO", type=ago, help="only what was written since then: 90s, 10min, 2h, 3d")
+    room.add_argument("--tail", metavar="N", type=positive, help="only the last N lines of each stream, and what follows")
+    room.add_argument("-t", "--times", action="store_true", help="before each line, when it was written")
     add_agent(room)
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from checkpoint.sentences import near
 from failover.config.choices import none_of
+from failover.config.quantities import span_ms
 
 EXIT_STATUSES: Final = "Exit status: 0 healthy, 1 failed or degraded, 2 usage, 3 no agent."
 
@@ -103,6 +104,14 @@ def positive(text: str) -> int:
     if not 0 < number <= NUMBER_MAX:
         raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a whole number above zero, or too large a one")
     return number
+
+
+def ago(text: str) -> int:
+    """A span of time such as 90s or 10min, in milliseconds."""
+    try:
+        return span_ms(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def whole(text: str) -> int:

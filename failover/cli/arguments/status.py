@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from failover.cli.arguments.shared import add_agent, positive
-from failover.config.quantities import span_ms
+from failover.cli.arguments.shared import add_agent, ago, positive
 
 
 def status(room: argparse.ArgumentParser) -> None:
@@ -22,11 +21,3 @@ def why(room: argparse.ArgumentParser) -> None:
     room.add_argument("--since", metavar="AGO", type=ago, help="only younger entries: 90s, 10min, 2h, 3d")
     room.add_argument("-b", "--brief", action="store_true", help="one line each, without the facts below it")
     add_agent(room)
-
-
-def ago(text: str) -> int:
-    """A span of time such as 90s or 10min, in milliseconds."""
-    try:
-        return span_ms(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error

@@ -1,4 +1,4 @@
-"""run, protect, release, stop, logs, handover, failback, promote, prefer: the verbs that act on one component."""
+"""run, protect, release, stop, handover, failback, promote, prefer: the verbs that act on one component."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, Final
 from failover.cli.arguments.components import HOOKS
 from failover.cli.connection import connect
 from failover.cli.output import render, team_tree
-from failover.client.control import Control, Output, Result, Update
+from failover.client.control import Control, Output, Update
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
 
 RECONNECT_S: Final = 30.0
@@ -213,50 +213,6 @@ def stop(arguments: argparse.Namespace) -> int:
         answer = agent.ask("stop", name=arguments.name, signal=arguments.signal)
     status = answer.get("exit_status")
     return _tell(arguments, answer, f"{answer['name']} has ended" + ("" if status is None else f": {team_tree.ending(status)}"))
-
-
-def logs(arguments: argparse.Namespace) -> int:
-    """Show the output of a component, on whichever robot it wrote it; with --follow through restarts of the agent."""
-    offsets = [0, 0]
-    agent = connect(arguments)
-    try:
-        while True:
-            try:
-                totals = _show_logs(agent, arguments, offsets)
-                break
-            except LostAgentError:
-                if not arguments.follow:
-                    raise
-                agent.close()
-                agent = reconnect(arguments, arguments.name)
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        agent.close()
-    if arguments.json:
-        render.as_json(totals)
-    return 0
-
-
-def _show_logs(agent: Control, arguments: argparse.Namespace, offsets: list[int]) -> dict[str, Any]:
-    """Show the streams from the offsets on, which move along; returns the agent's last answer."""
-    for reply in agent.stream("logs", name=arguments.name, follow=arguments.follow, offsets=offsets):
-        if isinstance(reply, Output):
-            _show_piece(arguments, reply)
-            offsets[reply.stream - 1] = reply.offset + len(reply.content)
-        elif isinstance(reply, Result):
-            return reply.value
-    return {}
-
-
-def _show_piece(arguments: argparse.Namespace, piece: Output) -> None:
-    if arguments.stream is not None and piece.stream != arguments.stream:
-        return
-    if arguments.json:
-        text = piece.content.decode(errors="surrogateescape")
-        render.as_json({"stream": piece.stream, "offset": piece.offset, "content": text})
-    else:
-        write_output(piece)
 
 
 def handover(arguments: argparse.Namespace) -> int:

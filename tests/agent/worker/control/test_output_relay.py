@@ -12,7 +12,7 @@ import pytest
 from agent.errors import RefusedError
 from agent.guard.output_logs import OutputLogs
 from agent.worker.components.paths import Places, log_directory
-from agent.worker.control.output_relay import OutputRelay
+from agent.worker.control.output_relay import OutputRelay, Passage
 from failover.core.types import State
 
 NAME = "/lab/r1/mapper"
@@ -27,8 +27,9 @@ class Listener:
         self.heard = b""
         self.caller = SimpleNamespace(uid=0)
 
-    async def output(self, _stream: int, _offset: int, content: bytes) -> None:
+    async def output(self, _stream: int, _offset: int, content: bytes, times: tuple[tuple[int, int], ...]) -> None:
         self.heard += content
+        self.times = times
 
 
 class Worker:
@@ -63,7 +64,7 @@ def places(tmp_path: Path) -> Places:
 def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Places, state: State, heard: bytes) -> None:
     listener: Any = Listener()
     relay = OutputRelay(Worker(places, state))
-    asyncio.run(relay.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    asyncio.run(relay.pass_on(listener, NAME, Passage()))
     assert listener.heard == heard
 
 
@@ -71,7 +72,7 @@ def test_logs_show_all_of_it_as_soon_as_status_says_that_it_has_ended(places: Pl
 def test_an_offset_below_zero_counts_from_the_end(places: Places, offset: int, heard: bytes) -> None:
     listener: Any = Listener()
     relay = OutputRelay(Worker(places, State.FINISHED))
-    totals = asyncio.run(relay.pass_on(listener, NAME, (offset, offset), committed=True, follow=False))
+    totals = asyncio.run(relay.pass_on(listener, NAME, Passage((offset, offset))))
     assert listener.heard == heard and totals == (len(WRITTEN), 0)
 
 
@@ -84,8 +85,8 @@ def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wro
     listener.caller = SimpleNamespace(uid=7001)
     relay = OutputRelay(Worker(places, State.PRIMARY))
     with pytest.raises(RefusedError, match="belongs to uid 7002"):
-        asyncio.run(relay.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+        asyncio.run(relay.pass_on(listener, NAME, Passage()))
     assert listener.heard == b""
     listener.caller = SimpleNamespace(uid=7002)
-    asyncio.run(relay.pass_on(listener, NAME, (0, 0), committed=True, follow=False))
+    asyncio.run(relay.pass_on(listener, NAME, Passage()))
     assert listener.heard == WRITTEN[:COMMITTED]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from failover.cli.arguments.status import ago
+from failover.cli.arguments.shared import ago
 from failover.cli.verbs.why import paragraph, sighting, told_of_robots
 
 SILENT: dict[str, Any] = {
