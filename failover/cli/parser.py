@@ -193,9 +193,11 @@ VERBS: Final = (
         Show every robot, its components, how old their newest checkpoint is (lag), how long a snapshot stops them (freeze), and
         in one sentence what holds if this robot dies now. Exit status 1 says that something is degraded: failover cannot capture
         a program, checkpoints do not arrive, a component has no protection, a robot is silent. Notes below the tree name each.
-        NO_COLOR=1 switches colours off. A narrow terminal shows a list instead of a table.
+        NO_COLOR=1 switches colours off. A narrow terminal shows a list instead of a table. With NAME it is about one component.
 
           failover status
+          failover status mapper
+          failover status --brief
           failover status --watch
           failover status --json | jq '.components[].lag_ms'
         """,

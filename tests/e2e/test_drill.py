@@ -69,7 +69,7 @@ def test_what_is_not_protected_is_left_alone(pair: Pair) -> None:
     assert "no drill of /demo/robot1/count: it is NOT PROTECTED: " in refused.stderr
     assert robots.component(first, "count")["role"] == "primary"
     unknown = drill(first, "--yes", name="nothing")
-    assert "'nothing' is no component; this team protects /demo/robot1/count" in unknown.stderr
+    assert "no component is called 'nothing'; this team protects /demo/robot1/count" in unknown.stderr
 
 
 def test_in_a_team_of_four_a_program_that_keeps_its_state_comes_back_to_its_own_robot(tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ from failover.cli.arguments.shared import add_agent, ago, positive
 
 def status(room: argparse.ArgumentParser) -> None:
     """Of ``failover status``."""
+    room.add_argument("name", metavar="NAME", nargs="?", help="only this component, with all that is known of it")
+    room.add_argument("-b", "--brief", action="store_true", help="one line, and one for each component that is not well")
     room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
     room.add_argument("--every-ms", metavar="MS", type=positive, default=500, help="with --watch (default: 500)")
     add_agent(room)

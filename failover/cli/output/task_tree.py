@@ -9,7 +9,7 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from failover.cli.output.board_tree import ms, span
-from failover.cli.output.team_tree import Mood, Row, mood_of, size, state_of
+from failover.cli.output.team_tree import Mood, Row, mood_of, mood_of_robot, size, state_of
 from failover.client.health import sight
 from failover.client.process_use import Use
 from failover.schedule.overview import Seen
@@ -102,8 +102,7 @@ def rows(tree: Sequence[Robot]) -> list[Row]:
     found: list[Row] = []
     for robot in tree:
         if robot.state:
-            mood: Mood = "good" if robot.state == "live" else "bad" if robot.state == "dead" else "warning"
-            found.append(Row((robot.name, robot.state, *[""] * (len(COLUMNS) - 2)), mood))
+            found.append(Row((robot.name, robot.state, *[""] * (len(COLUMNS) - 2)), mood_of_robot(robot.state)))
         for component, branch, below in (
             _branches(robot.components) if robot.state else ((one, "", "") for one in robot.components)
         ):

@@ -12,8 +12,9 @@ from typing import Any, Final, Literal
 from msgspec import Struct
 
 from failover.client.health import BAD_STATES as BAD_STATES
-from failover.client.health import OVER_STATES, is_lacking, is_unknown, is_unprotected, sight
+from failover.client.health import OVER_STATES, is_lacking, is_unknown, is_unprotected, is_unwell, sight
 from failover.client.health import is_healthy as is_healthy
+from failover.errors import AgentRefusedError
 
 Mood = Literal["good", "warning", "bad", "quiet"]
 
@@ -79,10 +80,18 @@ def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | N
     if peer is None:
         return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", "", _connections(status)), "good")
     state = peer["state"]
+    return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links_of(peer)), mood_of_robot(state))
+
+
+def links_of(peer: Mapping[str, Any]) -> str:
+    """How the replication link to a peer is, and how many of its heartbeats were lost."""
     lost = peer.get("beats_lost")
-    links = ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
-    mood: Mood = "good" if state == "live" else "bad" if state == "dead" else "warning"
-    return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links), mood)
+    return ", ".join(part for part in (peer.get("lane") or "", f"{lost} beat{'s' * (lost > 1)} lost" if lost else "") if part)
+
+
+def mood_of_robot(state: str) -> Mood:
+    """How a robot is doing."""
+    return "good" if state == "live" else "bad" if state == "dead" else "warning"
 
 
 def _connections(status: Mapping[str, Any]) -> str:
@@ -112,13 +121,13 @@ def _component_row(component: Mapping[str, Any], branch: str) -> Row:
         str(component.get("epoch") or ""),
         milliseconds(component.get("lag_ms")),
         freeze,
-        _standby(component),
+        standby_of(component),
         "",
     )
     return Row(cells, mood_of(component))
 
 
-def _standby(component: Mapping[str, Any]) -> str:
+def standby_of(component: Mapping[str, Any]) -> str:
     """The robot that would resume it; whether its program waits there already, where one can."""
     standby, warm = component.get("standby"), component.get("warm")
     if not standby or warm is None:
@@ -136,6 +145,64 @@ def state_of(component: Mapping[str, Any]) -> str:
     if component.get("state") == "running" and component.get("commit_overdue"):
         return f"running, last commit {ago(component.get('commit_age_ms'))}"
     return str(component.get("state") or "")
+
+
+def named(status: Mapping[str, Any], wanted: str) -> Mapping[str, Any]:
+    """The component that a person means: its whole name, or an end of it that fits one alone.
+
+    Raises:
+        AgentRefusedError: none, or more than one.
+    """
+    known = [one for one in status["components"] if sight(one).get("state") != "released"]
+    fitting = [one for one in known if one["name"] == wanted]
+    fitting = fitting or [one for one in known if one["name"].endswith("/" + wanted.lstrip("/"))]
+    if len(fitting) == 1:
+        return fitting[0]
+    names = listed(sorted(str(one["name"]) for one in fitting or known)) or "nothing"
+    sentence = f"{wanted!r} could be {names}; give the whole name" if fitting else f"no component is called {wanted!r}"
+    known_ones = "" if fitting else f"; this team protects {names}"
+    raise AgentRefusedError(sentence + known_ones, "UnknownComponentError")
+
+
+def brief(status: Mapping[str, Any]) -> tuple[str, ...]:
+    """One line on all of it, state first; then one for each component that is not well, and each robot that is silent."""
+    living = [one for one in status["components"] if sight(one).get("state") not in (*OVER_STATES, "absent")]
+    unwell = [one for one in living if is_unwell(one)]
+    silent = [peer for peer in status["peers"] if peer["state"] != "live"]
+    is_well = is_healthy(status)
+    robots = f"{len(status['peers']) + 1 - len(silent)} of {len(status['peers']) + 1} members live"
+    head = f"{'healthy' if is_well else 'DEGRADED'}: {robots}, {len(living) - len(unwell)} of {len(living)} components well"
+    lines = [f"{one['name']}: {'; '.join((state_of(sight(one)), *_remarks_on(one)[:1]))}" for one in unwell]
+    return (head, *lines, *(f"{peer['name']}: {peer['state']}, heard {_heard(peer)}" for peer in silent))
+
+
+def _heard(peer: Mapping[str, Any]) -> str:
+    return "never" if peer.get("last_heard_ms") is None else ago(peer["last_heard_ms"])
+
+
+def details(component: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """All that is known of one component, as lines of a name and a value; what is not known is left out."""
+    seen = sight(component)
+    kept_there, resumed = component.get("kept") or {}, seen.get("resumed") or {}
+    freeze = f"{microseconds(seen.get('freeze_us'))}, at most {microseconds(seen.get('freeze_us_max'))}"
+    told = (
+        ("state", state_of(seen)),
+        ("primary", str(seen.get("primary") or "none")),
+        ("standby", standby_of(seen)),
+        ("home, preferred", ", ".join(filter(None, (seen.get("home"), seen.get("prefer"))))),
+        ("epoch", str(seen.get("epoch") or "")),
+        ("checkpoint", f"{milliseconds(seen.get('lag_ms'))} old" if seen.get("lag_ms") is not None else "none"),
+        ("freeze", freeze if seen.get("engine") != "cooperative" else ""),
+        ("snapshot", f"{size(seen['snapshot_size'])}" if seen.get("snapshot_size") else ""),
+        ("kept here", f"{kept_there['checkpoints']} checkpoints, {size(kept_there['size'])}" if kept_there else ""),
+        ("restores, crashes", f"{seen.get('restores') or 0}, {seen.get('crashes') or 0}"),
+        ("resumed from", f"checkpoint {resumed['sequence']} of {resumed['robot']}" if resumed else ""),
+        ("last outage", milliseconds(seen["outage_ms"]) if seen.get("outage_ms") is not None else ""),
+        ("engine, pid", ", ".join(str(value) for value in (seen.get("engine"), seen.get("pid")) if value)),
+        ("promise", str(seen.get("promise") or "")),
+    )
+    notes = [("note", line) for line in _remarks_on(component)]
+    return [(name, value) for name, value in (*told, *notes) if value]
 
 
 def ending(wait_status: int) -> str:

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from failover.cli.connection import connect
 from failover.cli.output import render
-from failover.cli.output.team_tree import listed, milliseconds
+from failover.cli.output.team_tree import milliseconds, named
 from failover.cli.verbs.components import agreed
 from failover.client.control import Control
 from failover.client.health import is_unwell, sight
@@ -96,14 +96,7 @@ def _fit(agent: Control, wanted: str) -> dict[str, Any]:
     Raises:
         AgentRefusedError: there is none of this name, or it could not be moved safely.
     """
-    components = [one for one in _status(agent)["components"] if one.get("state") != "released"]
-    fitting = [one for one in components if one["name"] == wanted]
-    fitting = fitting or [one for one in components if one["name"].endswith("/" + wanted.lstrip("/"))]
-    if len(fitting) != 1:
-        names = listed(sorted(one["name"] for one in fitting or components)) or "nothing"
-        why = "could be" if fitting else "is no component; this team protects"
-        raise AgentRefusedError(f"{wanted!r} {why} {names}", "UnknownComponentError")
-    (component,) = fitting
+    component = named(_status(agent), wanted)
     seen = sight(component)
     if seen.get("role") != "primary" or seen.get("state") != "running":
         raise AgentRefusedError(f"no drill of {seen['name']}: it is {seen.get('state')}, not running; see failover status")
@@ -111,7 +104,7 @@ def _fit(agent: Control, wanted: str) -> dict[str, Any]:
         notes = [note for one in (seen, component) for note in (*(one.get("lacks") or ()), *(one.get("notes") or ()))]
         why = "; ".join(dict.fromkeys(notes)) or seen.get("promise") or "no other robot holds its checkpoints"
         raise AgentRefusedError(f"no drill of {seen['name']}: it is NOT PROTECTED: {why}", "NotProtected")
-    return seen
+    return dict(seen)
 
 
 def _status(agent: Control) -> dict[str, Any]:

@@ -67,6 +67,39 @@ def answering(value: dict[str, Any]) -> Callable[[Request], Answer]:
 # --- Status ----------------------------------------------------------------------------------------------------------
 
 
+def test_status_of_one_component_tells_all_that_is_known_and_ends_as_that_one_is(agent: Start) -> None:
+    camera = COMPONENT | {"name": "/lab/robot1/camera", "state": "failed", "notes": ["it could not be resumed: no camera"]}
+    namesake = COMPONENT | {"name": "/lab/robot2/camera"}
+    socket = agent(answering(STATUS | {"components": [COMPONENT, camera, namesake]})).path
+    well, unwell = failover("status", "mapper", socket=socket), failover("status", "robot1/camera", socket=socket)
+    assert (well.returncode, unwell.returncode) == (0, 1)
+    assert "/lab/robot1/mapper" in well.stdout and "98 ms old" in well.stdout and "0.91 ms, at most 1.40 ms" in well.stdout
+    assert "camera" not in well.stdout and "no camera" in unwell.stdout
+    nothing, both = failover("status", "nothing", socket=socket), failover("status", "camera", socket=socket)
+    assert nothing.returncode == both.returncode == 1
+    assert "no component is called 'nothing'; this team protects /lab/robot1/camera, /lab/robot1/mapper and" in nothing.stderr
+    assert "'camera' could be /lab/robot1/camera and /lab/robot2/camera; give the whole name" in both.stderr
+
+
+def test_status_in_brief_is_one_line_while_all_is_well(agent: Start) -> None:
+    well = failover("status", "--brief", socket=agent(answering(STATUS)).path)
+    assert (well.returncode, well.stdout) == (0, "healthy: 2 of 2 members live, 1 of 1 components well\n")
+
+
+def test_status_in_brief_names_what_is_not_well(agent: Start) -> None:
+    silent = PEER | {"state": "dead", "last_heard_ms": 14_000}
+    alone = COMPONENT | {"standby": "", "notes": ["no robot stands by: robot2 is silent"]}
+    unwell = failover("status", "--brief", socket=agent(answering(STATUS | {"peers": [silent], "components": [alone]})).path)
+    assert (unwell.returncode, unwell.stdout.splitlines()) == (
+        1,
+        [
+            "DEGRADED: 1 of 2 members live, 0 of 1 components well",
+            "/lab/robot1/mapper: running; no robot stands by: robot2 is silent",
+            "robot2: dead, heard 14 s ago",
+        ],
+    )
+
+
 def test_status_shows_the_team_as_a_tree_and_is_healthy(agent: Start) -> None:
     ran = failover("status", socket=agent(answering(STATUS)).path)
     assert ran.returncode == 0, ran.stderr
