@@ -228,7 +228,7 @@ class Alerts:
         try:
             facts = self._facts(due)
             told = {f"FAILOVER_{key.upper()}": str(value) for key, value in facts.items() if key != "id"}
-            hook = Hook(self._config.command(alert.kind), self._config.limit_s, self._user, msgspec.json.encode(facts))
+            hook = Hook(self._config.command(alert.kind), self._config.limit_s, self._user, msgspec.json.encode(facts) + b"\n")
             began_ns = clock.now_ns()
             failure, said = await self._hooks.carry_out(hook, {"PATH": PATH, **told})
             took_ms = (clock.now_ns() - began_ns) / 1e6
