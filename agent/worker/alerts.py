@@ -329,5 +329,6 @@ def _sight_of(component: Mapping[str, Any]) -> Sight:
 
 
 def _spoken(text: str) -> str:
-    """As text that can be sent anywhere, and not without end."""
-    return text.encode(errors="replace").decode().replace("\0", "?")[:REASON_MAX]
+    """As one line of text that can be sent anywhere, and not without end."""
+    told = text[:REASON_MAX].encode(errors="replace").decode()
+    return "".join(one if one.isprintable() else " " for one in told)

@@ -5,6 +5,7 @@ On a booted machine with the service as it is shipped, and two real users who ar
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 
@@ -53,6 +54,14 @@ while True:
 """
 
 
+ALERTS = """
+[alerts]
+user = "alice"
+degraded_after_s = 1
+on_degraded = ["/bin/sh", "-c", "cat >>/var/alice/alerts"]
+"""
+
+
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A robot with two people on it."""
@@ -60,6 +69,8 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
         for name, program in {"portrait": PORTRAIT, "writer": WRITER}.items():
             (booted.root / f"etc/{name}.py").write_text(program)
         booted.run("install", "-d", "-m755", "-oalice", "/var/alice")  # not sticky: there the kernel itself refuses to follow
+        with (booted.root / "etc/failover/agent.toml").open("a") as settings:
+            settings.write(ALERTS)
         booted.run("systemctl", "start", SERVICE)
         yield booted
 
@@ -67,6 +78,16 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 def as_user(machine: Machine, user: str, script: str) -> tuple[int, str]:
     """Have a user's shell run a script; its exit status, and all that was said."""
     return service.as_user(machine, user, "bash", "-c", script)
+
+
+def test_an_operators_command_is_told_in_a_service_of_its_own_by_an_ordinary_users_rights(machine: Machine, alices: str) -> None:
+    name, alerts = f"/lab/robot1/{alices}", machine.root / "var/alice/alerts"
+    robots.until(lambda: alerts.exists() and name in alerts.read_text(), "the alert: this robot is alone in its team")
+    assert alerts.stat().st_uid == 7001
+    told = [json.loads(line) for line in alerts.read_text().splitlines()]
+    (facts,) = (one for one in told if one["component"] == name)
+    assert (facts["alert"], facts["robot"], facts["epoch"]) == ("degraded", "robot1", 1)
+    assert "alone in its team" in facts["reason"]
 
 
 def test_the_journal_can_be_asked_for_one_component_with_its_epoch(machine: Machine, alices: str) -> None:
