@@ -82,6 +82,7 @@ def test_each_event_is_told_once_by_one_robot_also_over_a_restart_of_its_agent(t
         robots.until(lambda: of(open_to_all, "robot2", "degraded"), "robot2 to tell that it has no standby")
         robots.stop_agent(second)
         robots.start_agent(second)
+        robots.until(lambda: robots.answers(second), "the agent of robot2")
         robots.until(lambda: robots.component(second, "count").get("role") == "primary", "it to be found again")
         time.sleep(2 * LOOK_S)  # it looks, and has nothing to tell
         revived(first, ("main_loop", "worker"))

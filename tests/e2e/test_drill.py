@@ -28,7 +28,7 @@ def drill(robot: RobotMachine, *arguments: str, name: str = "count") -> subproce
     return robots.failover(robot, "drill", name, *arguments)
 
 
-def test_a_component_moves_away_and_back_and_the_report_tells_how_long_it_stood_still(pair: Pair) -> None:
+def test_a_component_moves_away_and_back_with_figures_and_is_left_alone_once_it_is_not_protected(pair: Pair) -> None:
     first, second = pair
     robots.run(first, "count", *COUNTING)
     robots.until_protected(first)
@@ -52,23 +52,11 @@ def test_a_component_moves_away_and_back_and_the_report_tells_how_long_it_stood_
     numbers = counted(first)
     assert numbers == list(range(len(numbers))), "each number once, in order"
 
-    late = drill(first, "--yes", "--at-most-ms", "1")
-    assert late.returncode == 1
-    assert "MISSED: from robot1 to robot2 it stood still for" in late.stdout and "longer than 1 ms" in late.stdout
-    assert robots.component(first, "count")["role"] == "primary", "it is back all the same"
-
-
-def test_what_is_not_protected_is_left_alone(pair: Pair) -> None:
-    first, second = pair
-    robots.run(first, "count", *COUNTING)
-    robots.until_protected(first)
     second.cut_power()
     robots.until(lambda: robots.component(first, "count")["protection"] != "protected", "the loss to be seen")
-    refused = drill(first, "--yes")
-    assert refused.returncode == 1
+    refused, unknown = drill(first, "--yes"), drill(first, "--yes", name="nothing")
+    assert refused.returncode == unknown.returncode == 1
     assert "no drill of /demo/robot1/count: it is NOT PROTECTED: " in refused.stderr
-    assert robots.component(first, "count")["role"] == "primary"
-    unknown = drill(first, "--yes", name="nothing")
     assert "no component is called 'nothing'; this team protects /demo/robot1/count" in unknown.stderr
 
 

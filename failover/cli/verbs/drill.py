@@ -98,7 +98,7 @@ def _fit(agent: Control, wanted: str) -> dict[str, Any]:
     """
     component = named(_status(agent), wanted)
     seen = sight(component)
-    if seen.get("role") != "primary" or seen.get("state") != "running":
+    if seen.get("role") != "primary" or seen.get("state") not in ("running", "degraded"):
         raise AgentRefusedError(f"no drill of {seen['name']}: it is {seen.get('state')}, not running; see failover status")
     if is_unwell(component) or seen.get("protection") != "protected":
         notes = [note for one in (seen, component) for note in (*(one.get("lacks") or ()), *(one.get("notes") or ()))]

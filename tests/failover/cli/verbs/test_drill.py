@@ -1,0 +1,44 @@
+"""A drill's report: what it says of each move, and what counts as missed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from failover.cli.verbs.drill import Leg, Report, _missed, _told
+
+LEG = Leg("robot1", "robot2", 5, 40.0, 0.5, 300.0, 900.0, 98.0, (100, 180))
+
+
+def leg(**changes: Any) -> Leg:
+    return Leg(**{name: changes.get(name, getattr(LEG, name)) for name in LEG.__struct_fields__})
+
+
+@pytest.mark.parametrize(
+    ("one", "at_most_ms", "said"),
+    [
+        (leg(), None, ""),
+        (leg(), 40, ""),
+        (leg(stood_still_ms=40.4), 40, ""),
+        (leg(stood_still_ms=41.0), 40, "from robot1 to robot2 it stood still for 41 ms, longer than 40 ms"),
+        (leg(stood_still_ms=None), None, ""),
+        (leg(stood_still_ms=None), 40, "from robot1 to robot2 it stood still for an unknown time, longer than 40 ms"),
+        (leg(output=(100, 80)), None, "from robot1 to robot2 20 bytes of output were taken back that readers may have seen"),
+    ],
+)
+def test_what_counts_as_missed(one: Leg, at_most_ms: int | None, said: str) -> None:
+    assert _missed(one, at_most_ms) == ([said] if said else [])
+
+
+def test_the_report_ends_with_where_the_component_is() -> None:
+    legs = (leg(), leg(source="robot2", target="robot1", epoch=6, checkpoint_age_ms=120.0))
+    well = _told(Report("/lab/x", "robot1", "robot2", "robot1", "If robot1 is silent for 220 ms, robot2 runs it.", legs, ()))
+    assert well[0].startswith("robot1 → robot2, epoch 5: it stood still 40.0 ms (± 0.5 ms); the order took 300 ms")
+    assert (
+        well[2]
+        == "a real loss would have cost 120 ms of its work, and the silence: If robot1 is silent for 220 ms, robot2 runs it."
+    )
+    assert well[-1] == "/lab/x is back at robot1: all was as promised"
+    bad = _told(Report("/lab/x", "robot1", "robot2", "robot2", "", legs[:1], ("it did not move",)))
+    assert bad[-2:] == ["MISSED: it did not move", "/lab/x runs at robot2"]
