@@ -113,6 +113,10 @@ class ValueMisfitError(FailoverError):
     """A value does not fit the declared type of its item; the item keeps the value that it has."""
 
 
+class ScreenError(FailoverError):
+    """The full screen cannot be shown: there is no terminal, or its library is missing."""
+
+
 class NameFormatError(FailoverError):
     """A name of a robot, a team or a component is not of the documented form."""
 

@@ -66,7 +66,8 @@ DOORS = {
     "starlette": ("page/app.py",),
     "uvicorn": ("page/serve.py",),
     "psutil": ("failover/client/process_use.py",),
-    "rich": ("failover/cli/output/render.py",),
+    "rich": ("failover/cli/output/render.py", "failover/cli/output/top_screen.py"),
+    "textual": ("failover/cli/output/top_screen.py",),
     "shtab": ("failover/cli/completion.py",),
     "zenoh": ("failover/bridges/zenoh_bridge.py",),
 }

@@ -205,6 +205,21 @@ VERBS: Final = (
         "failover.cli.verbs.status:status",
     ),
     Verb(
+        "top",
+        "the team on one screen, live: robots, components, tasks, notes, orders",
+        """
+        Show robots with their links, components with state, age of the newest checkpoint, freeze, processor time and memory (of
+        this robot), their tasks with misses, and the notes of failover status, as long as it runs. Keys: the arrows choose a
+        line; Enter shows why a component is where it is; / filters, s sorts; h hands a component over, b moves it back, x ends
+        it, each after a question; q leaves. It needs a terminal and the extra "tui".
+
+          failover top
+          failover top --every-ms 200
+        """,
+        "failover.cli.arguments.status:top",
+        "failover.cli.verbs.top:top",
+    ),
+    Verb(
         "logs",
         "output of a component, without gap or repetition, from any robot",
         """

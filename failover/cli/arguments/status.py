@@ -1,4 +1,4 @@
-"""status and why: how the team is, and how it came to that."""
+"""status, top and why: how the team is, and how it came to that."""
 
 from __future__ import annotations
 
@@ -13,6 +13,12 @@ def status(room: argparse.ArgumentParser) -> None:
     room.add_argument("-b", "--brief", action="store_true", help="one line, and one for each component that is not well")
     room.add_argument("-w", "--watch", action="store_true", help="show it again and again, until Ctrl-C")
     room.add_argument("--every-ms", metavar="MS", type=positive, default=500, help="with --watch (default: 500)")
+    add_agent(room)
+
+
+def top(room: argparse.ArgumentParser) -> None:
+    """Of ``failover top``."""
+    room.add_argument("--every-ms", metavar="MS", type=positive, default=1000, help="between two looks (default: 1000)")
     add_agent(room)
 
 

@@ -87,12 +87,21 @@ def _team(meter: Meter) -> tuple[dict[str, Any] | None, dict[str, Use | None]]:
     try:
         with Control.open() as agent:
             status = agent.ask("status", team=True)
-            if agent.peer_pid != status.get("lanes_pid"):  # it counts its processes in a PID namespace of its own
-                return status, {}
+            return status, uses_of(agent.peer_pid, status, meter)
     except (NoAgentError, LostAgentError, AgentRefusedError):
         return None, {}
+
+
+def uses_of(agent_pid: int, status: Mapping[str, Any], meter: Meter) -> dict[str, Use | None]:
+    """What the components of the robot that answered use; nothing where its agent counts PIDs in a namespace of its own.
+
+    Args:
+        agent_pid: of the process that answered, as we see it.
+    """
+    if agent_pid != status.get("lanes_pid"):
+        return {}
     here = [one for one in status["components"] if one.get("primary") == status["robot"] and one.get("pid")]
-    return status, {one["name"]: meter.of(one["pid"]) for one in here}
+    return {one["name"]: meter.of(one["pid"]) for one in here}
 
 
 # --- Orders ----------------------------------------------------------------------------------------------------------

@@ -224,6 +224,10 @@ def test_with_copies_that_lost_and_are_not_there(act: str, capsys: pytest.Captur
         assert told(capsys, "lost", act, "mapper", "--state", at) == main.FAILED
 
 
+def test_the_full_screen_without_a_terminal_or_its_library(capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "top") == main.FAILED
+
+
 @pytest.mark.parametrize("argv", USAGE, ids=" ".join)
 def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -234,6 +238,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"page", "bridge", "ps", "task", "trace", "wait-activation", "rights", "program", "lost"}
+    without |= {"page", "bridge", "ps", "task", "trace", "wait-activation", "rights", "program", "lost", "top"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
