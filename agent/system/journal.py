@@ -58,6 +58,7 @@ class JournalHandler(logging.Handler):
 
     def __init__(self, robot: str, address: str = ADDRESS) -> None:
         super().__init__()
+        self.setFormatter(logging.Formatter("%(message)s"))  # the journal has the rest in fields
         self._robot, self._address, self._lost = robot, address, 0
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
 

@@ -324,9 +324,10 @@ def _sight_of(component: Mapping[str, Any]) -> Sight:
     seen_by_all = (seen, *sights(component))
     notes = [str(note) for one in seen_by_all for key in ("notes", "reasons", "lacks") for note in one.get(key) or ()]
     told = [without_output(note) for note in dict.fromkeys(notes)][:NOTES_SHOWN]
-    alone = "" if seen.get("standby") else "no other robot holds a checkpoint of it. "
-    reason = "; ".join(told) or alone + str(seen.get("promise") or "No robot that answered runs it.")
-    return Sight(epoch, _spoken(reason), is_over)
+    promise = str(seen.get("promise") or "no robot that answered runs it")
+    if not seen.get("standby"):
+        told.insert(0, f"no other robot holds a checkpoint of it: {promise}")
+    return Sight(epoch, _spoken("; ".join(told) or promise), is_over)
 
 
 def _spoken(text: str) -> str:

@@ -153,7 +153,7 @@ def named(status: Mapping[str, Any], wanted: str) -> Mapping[str, Any]:
     Raises:
         AgentRefusedError: none, or more than one.
     """
-    known = [one for one in status["components"] if sight(one).get("state") != "released"]
+    known: list[Mapping[str, Any]] = [one for one in status["components"] if sight(one).get("state") != "released"]
     fitting = [one for one in known if one["name"] == wanted]
     fitting = fitting or [one for one in known if one["name"].endswith("/" + wanted.lstrip("/"))]
     if len(fitting) == 1:

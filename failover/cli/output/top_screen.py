@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Final, Protocol
 
 from msgspec import Struct
@@ -12,6 +12,7 @@ from textual import work
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
+from textual.coordinate import Coordinate
 from textual.screen import ModalScreen
 from textual.widgets import DataTable, Footer, Input, Static
 from textual.worker import get_current_worker
@@ -166,7 +167,7 @@ class Top(App[None]):
             for row, (old, new) in enumerate(zip(before, found, strict=True)):
                 for column, cell in enumerate(new.cells):
                     if old.cells[column] != cell or old.mood != new.mood:
-                        table.update_cell_at((row, column), _cell(cell, new), update_width=True)
+                        table.update_cell_at(Coordinate(row, column), _cell(cell, new), update_width=True)
             return
         at = before[table.cursor_row].key if before and table.cursor_row < len(before) else ""
         table.clear()
@@ -249,7 +250,7 @@ class Top(App[None]):
             self.call_from_thread(answered, told)
 
 
-def consequence(verb: str, view: dict[str, Any]) -> str:
+def consequence(verb: str, view: Mapping[str, Any]) -> str:
     """What an order will do, as a question."""
     name, robot, standby = view["name"], view.get("primary") or "no robot", view.get("standby") or "no other robot"
     home = view.get("prefer") or view.get("home") or "where it was started"
