@@ -94,7 +94,6 @@ class OutputLogs:
         for descriptor in opened:
             if descriptor != CLOSED:
                 os.close(descriptor)
-        self._times.close()
 
     def mark(self) -> None:
         """Bytes are about to be written: note when."""

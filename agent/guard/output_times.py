@@ -27,17 +27,15 @@ SIZE_MAX: Final = 256 << 10
 """Bytes: eighteen minutes of a program that writes all the time before the first of its times become coarser."""
 
 NEWEST_KEPT: Final = 100
-NONE: Final = -1
 
 _MARK: Final = struct.Struct("<qQQ")
 
 
 class OutputTimes:
-    """The marks of one component, for the process that writes its logs; closed with `close`."""
+    """The marks of one component, for a process that writes its logs."""
 
     def __init__(self, directory: Path) -> None:
         self._path = directory / NAME
-        self._descriptor = NONE
         self._marked_ns = 0
 
     def mark(self, sizes: tuple[int, int]) -> None:
@@ -47,35 +45,25 @@ class OutputTimes:
             return
         self._marked_ns = now_ns
         with contextlib.suppress(OSError):
-            self._open()
-            os.write(self._descriptor, _MARK.pack(now_ns, *sizes))
-            if self._whole_size() > SIZE_MAX:
+            if _appended(self._path, _MARK.pack(now_ns, *sizes)) > SIZE_MAX:
                 self._thin()
-
-    def close(self) -> None:
-        """Give the file back."""
-        if self._descriptor != NONE:
-            os.close(self._descriptor)
-        self._descriptor = NONE
-
-    def _open(self) -> None:
-        if self._descriptor == NONE:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-            self._descriptor = os.open(self._path, flags, 0o600)
-            self._whole_size()
-
-    def _whole_size(self) -> int:
-        """Of the file, whose last mark a full disk or a power cut may have left unfinished: that one goes."""
-        size = os.fstat(self._descriptor).st_size
-        if size % _MARK.size:
-            os.ftruncate(self._descriptor, size - size % _MARK.size)
-        return size
 
     def _thin(self) -> None:
         marks = _read(self._path)
         kept = [*marks[:-NEWEST_KEPT:2], *marks[-NEWEST_KEPT:]]
         write_whole(self._path, b"".join(_MARK.pack(*mark) for mark in kept), lasts="process")
-        self.close()
+
+
+def _appended(path: Path, mark: bytes) -> int:
+    """Add a mark; the size of the file then. One that a full disk or a power cut left unfinished goes."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
+        size = os.fstat(descriptor).st_size
+        if size % _MARK.size:
+            os.ftruncate(descriptor, size - size % _MARK.size)
+        return size + os.write(descriptor, mark)
+    finally:
+        os.close(descriptor)
 
 
 class Times:

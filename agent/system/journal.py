@@ -50,7 +50,7 @@ def encoded(fields: Mapping[str, str]) -> bytes:
     return bytes(entry)
 
 
-class JournalHandler(logging.Handler):
+class Journal(logging.Handler):
     """Sends each record as one entry. It waits for nothing: what the journal cannot take at once is counted, and told later.
 
     COMPONENT is the record's ``component``, or the name that its sentence begins with; EPOCH its ``epoch``.

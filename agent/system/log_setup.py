@@ -6,7 +6,7 @@ import logging
 import sys
 from typing import Final
 
-from agent.system.journal import JournalHandler, is_ours
+from agent.system.journal import Journal, is_ours
 
 DECISIONS: Final = "failover.decisions"
 """The logger of what a robot decided. Its lines come from a thread of low priority, which may not hold up the main loop's: it has
@@ -17,15 +17,15 @@ FORMAT: Final = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
 
 def set_up_log(level: str, robot: str) -> None:
     """Begin to write lines of that level and above."""
-    logging.basicConfig(level=level.upper(), handlers=[_handler(robot)])
+    logging.basicConfig(level=level.upper(), handlers=[_destination(robot)])
     decisions = logging.getLogger(DECISIONS)
-    decisions.addHandler(_handler(robot))
+    decisions.addHandler(_destination(robot))
     decisions.propagate = False
 
 
-def _handler(robot: str) -> logging.Handler:
+def _destination(robot: str) -> logging.Handler:
     if is_ours():
-        return JournalHandler(robot)
+        return Journal(robot)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter(FORMAT, "%H:%M:%S"))
     return handler

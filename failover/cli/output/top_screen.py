@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final, Protocol
 
 from msgspec import Struct
 from rich.text import Text
-from textual import work
+from textual import on, work
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
@@ -187,7 +187,8 @@ class Top(App[None]):
 
     # --- keys ---
 
-    def on_data_table_row_selected(self, _: DataTable.RowSelected) -> None:
+    @on(DataTable.RowSelected)
+    def line_chosen(self) -> None:
         """Enter on a line."""
         self.action_story()
 

@@ -76,7 +76,6 @@ def test_the_file_does_not_grow_for_ever_and_the_newest_times_stay_exact(tmp_pat
         calendar[0] = (1_000 * S) + number * STEP_NS
         times.mark((number, 0))
         sizes = max(sizes, (tmp_path / output_times.NAME).stat().st_size)
-    times.close()
     assert sizes <= SIZE_MAX + 24
     found = Times(tmp_path)
     assert found.of(1, number - 50, number + 1) == [(at, 1_000 * S + at * STEP_NS) for at in range(number - 50, number + 1)]

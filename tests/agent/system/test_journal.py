@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 from agent.system import journal
-from agent.system.journal import JournalHandler
+from agent.system.journal import Journal
 
 NAME = "/lab/robot1/mapper"
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Iterator[tuple[socket.socket, JournalHandler]]:
+def place(tmp_path: Path) -> Iterator[tuple[socket.socket, Journal]]:
     """A socket as journald has one, and what sends to it."""
     path = str(tmp_path / "socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(path)
-        handler = JournalHandler("robot1", path)
+        handler = Journal("robot1", path)
         yield listener, handler
         handler.close()
 
@@ -44,7 +44,7 @@ def record(message: str, *arguments: object, level: int = logging.INFO, **extra:
     return logging.getLogger("failover.test").makeRecord("failover.test", level, "", 0, message, arguments, None, extra=extra)
 
 
-def test_a_line_is_an_entry_that_names_robot_component_and_epoch(place: tuple[socket.socket, JournalHandler]) -> None:
+def test_a_line_is_an_entry_that_names_robot_component_and_epoch(place: tuple[socket.socket, Journal]) -> None:
     listener, handler = place
     handler.emit(record("%s: %s", NAME, "it resumes", epoch=7))
     assert entry(listener.recv(1 << 16)) == {
@@ -62,7 +62,7 @@ def test_a_line_is_an_entry_that_names_robot_component_and_epoch(place: tuple[so
 
 
 @pytest.mark.parametrize("message", ["two\nlines", "a=b", "COMPONENT=/lab/other", "x\nCOMPONENT=/lab/other\ny", "☃ \ud800", "\n"])
-def test_whatever_a_line_holds_it_is_one_field(place: tuple[socket.socket, JournalHandler], message: str) -> None:
+def test_whatever_a_line_holds_it_is_one_field(place: tuple[socket.socket, Journal], message: str) -> None:
     listener, handler = place
     handler.emit(record("%s", message))
     got = entry(listener.recv(1 << 16))
@@ -71,7 +71,7 @@ def test_whatever_a_line_holds_it_is_one_field(place: tuple[socket.socket, Journ
 
 
 def test_a_journal_that_takes_nothing_is_not_waited_for_and_is_told_how_much_it_missed(
-    place: tuple[socket.socket, JournalHandler],
+    place: tuple[socket.socket, Journal],
 ) -> None:
     listener, handler = place
     for number in range(2_000):  # more than a socket holds; a sender that waited would never come back
