@@ -50,10 +50,10 @@ def test_what_a_takeover_took_back_has_the_instant_at_which_it_was_written_again
         written(logs, b"0123456789")
     logs.truncate((45, 0))
     calendar[0] = 1_020 * S
-    written(logs, b"again")
+    written(logs, b"again, and more than before")
     logs.close()
     times = Times(tmp_path)
-    assert times.of(1, 38, 50) == [(38, 1_003 * S), (40, 1_004 * S), (45, 1_020 * S)]
+    assert times.of(1, 38, 70) == [(38, 1_003 * S), (40, 1_004 * S), (45, 1_020 * S)]
     assert times.since(1_015 * S) == (45, 0)
 
 
