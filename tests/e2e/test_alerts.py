@@ -6,7 +6,6 @@ import contextlib
 import json
 import pwd
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from agent.worker.alerts import LOOK_S
 from failover.core.alerts import KINDS
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
@@ -84,7 +82,6 @@ def test_each_event_is_told_once_by_one_robot_also_over_a_restart_of_its_agent(t
         robots.start_agent(second)
         robots.until(lambda: robots.answers(second), "the agent of robot2")
         robots.until(lambda: robots.component(second, "count").get("role") == "primary", "it to be found again")
-        time.sleep(2 * LOOK_S)  # it looks, and has nothing to tell
         revived(first, ("main_loop", "worker"))
         robots.until(lambda: of(open_to_all, "robot2", "recovered"), "robot2 to tell that it has one again")
         robots.until(lambda: of(open_to_all, "robot1", "split"), "robot1 to tell that its copy lost")

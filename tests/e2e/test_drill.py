@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.e2e import robots, teams
+from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
-from tests.e2e.test_cooperative import COUNTER
 from tests.e2e.test_orders import COUNTING, counted
 
 Pair = tuple[RobotMachine, RobotMachine]
@@ -58,17 +56,3 @@ def test_a_component_moves_away_and_back_with_figures_and_is_left_alone_once_it_
     assert refused.returncode == unknown.returncode == 1
     assert "no drill of /demo/robot1/count: it is NOT PROTECTED: " in refused.stderr
     assert "no component is called 'nothing'; this team protects /demo/robot1/count" in unknown.stderr
-
-
-def test_in_a_team_of_four_a_program_that_keeps_its_state_comes_back_to_its_own_robot(tmp_path: Path) -> None:
-    program = tmp_path / "counter.py"
-    program.write_text(COUNTER)
-    roles = dict.fromkeys(("robot1", "robot2", "robot3"), "robot") | {"hall": "witness"}
-    with teams.acting(tmp_path, roles) as stage:
-        third = stage.members["robot3"]
-        robots.run(third, "mission", sys.executable, str(program), cwd=str(tmp_path), engine="cooperative")
-        robots.until_protected(third, "mission")
-        done = drill(stage.members["robot1"], "--yes", "--json", name="mission")
-        assert done.returncode == 0, done
-        report = json.loads(done.stdout)
-        assert report["legs"][1]["target"] == report["runs_at"] == "robot3"

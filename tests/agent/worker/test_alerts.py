@@ -127,7 +127,7 @@ def test_each_command_runs_once_though_the_worker_process_begins_anew(tmp_path: 
     async def live(robot: Alerts, told: int) -> None:
         robot.begin()
         await until(lambda: note.exists() and len(note.read_text().splitlines()) >= told, "the commands")
-        await until(lambda: not robot._running, "them to end")
+        await until(lambda: not robot._due and not robot._running, "them to end")
         await robot.close()
 
     async def both() -> None:
