@@ -41,7 +41,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
 @asynccontextmanager
 async def screen(robot: RobotMachine, size: tuple[int, int]) -> AsyncIterator[tuple[Top, Pilot[None]]]:
     """The screen of a terminal of that size, once it shows the team."""
-    app = Top(AgentSource(argparse.Namespace(socket=str(robot.socket), every_ms=300)))
+    app = Top(AgentSource(argparse.Namespace(socket=str(robot.socket), every_ms=500)))
     async with app.run_test(size=size) as pilot:
         await until(pilot, lambda: any("count" in line for line in shown(app)), "the team to be shown")
         yield app, pilot
