@@ -170,6 +170,6 @@ def test_every_class_of_error_has_its_cause_and_cure() -> None:
 def test_every_word_of_the_status_is_told() -> None:
     text = (ROOT / "docs" / "guide.md").read_text().split("## 5.")[1].split("## 6.")[0]
     of_components = set(status_view.STATES.values()) - {"absent", "released"}  # these are not shown
-    of_robots = {"unknown", "live", "suspect", "dead"}
+    of_robots = {"unknown", "live", "suspect", "restarting", "dead"}
     words = of_components | of_robots | {"degraded"} | {str(state) for state in LinkState}
     assert [word for word in sorted(words) if not re.search(rf"\*{word}\b", text)] == []

@@ -4,7 +4,7 @@ While a vote record is on its way to the disk, nothing that depends on it leaves
 heartbeats. But "I live" depends on nothing: a heartbeat that is due meanwhile leaves without its entries, with the ``settled`` of
 the last durable one, so that peers still know exactly what they were told before. Echoes extend the leases of the robots that
 hear them. The outbox withholds an echo from a robot whose primacy the waiting vote record gives up, because the vote that follows
-counts on that lease running out.
+counts on that lease running out. It withholds every promise to wait for a robot: that one may be what is on its way to the disk.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ class Outbox(Struct):
     def _stripped(self, beat: Beat) -> Beat:
         given_up = abandoned(self.durable, self._newest or self.durable)
         echoes = tuple(echo for echo in beat.echoes if echo.robot not in given_up)
-        return msgspec.structs.replace(beat, entries=(), echoes=echoes, settled=min(self._settled, beat.counter))
+        settled = min(self._settled, beat.counter)
+        return msgspec.structs.replace(beat, entries=(), echoes=echoes, settled=settled, promises=())
 
     def _free_acts(self) -> tuple[Act, ...]:
         free = []

@@ -87,7 +87,7 @@ media: [{link, cast, because, by_unicast, period_ms, no_slots, slots}]: how fram
         own: listening | running | silent, why; count: K, robots that share the round; place: this robot's among them, from 0
         reference: the robot whose frames give the phase; deaf: [[listener, speaker], …]; seen: not | insert | run | remove
 peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, doubted, notes}]
-    role: robot | server | witness; state: unknown | live | suspect | dead; links: ours, over which it was heard lately
+    role: robot | server | witness; state: unknown | live | suspect | restarting | dead; links: ours, by which it was heard lately
     lane: connected | connecting | refused | down
     doubted: it said lately what it may not say (its notes tell what): its key may be stolen
 doubted_elsewhere: {robot: [peer, …]}: with ``team``, of whom each of the others heard lately what it may not say

@@ -161,11 +161,16 @@ class Thaw(Struct, frozen=True):
 
 
 class SetLease(Struct, frozen=True):
-    """The guard freezes the component when its clock passes ``until_ns``; 0 = no lease. No answer."""
+    """The guard freezes the component when its clock passes ``until_ns``; 0 = no lease. → Leased, where it is asked for.
+
+    Attributes:
+        is_asked: it is shorter than the one that the guard has: the core waits for the word that the guard has taken it.
+    """
 
     component: str
     epoch: int
     until_ns: int
+    is_asked: bool = False
 
 
 class KeepAside(Struct, frozen=True):

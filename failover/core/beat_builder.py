@@ -24,6 +24,7 @@ from failover.core.wire.messages import (
     Beat,
     Echo,
     Entry,
+    Promise,
 )
 
 LOAD_MAX = 255
@@ -91,17 +92,22 @@ class Speaker:
         """Whether something has changed that should not wait for the next beat."""
         return any(urgent(entry, self._said[name][0] if name in self._said else None) for name, entry in entries.items())
 
-    def beat(self, entries: dict[str, Entry], echoes: tuple[Echo, ...]) -> Beat:
+    def beat(
+        self, entries: dict[str, Entry], echoes: tuple[Echo, ...], grace_ms: int = 0, promises: tuple[Promise, ...] = ()
+    ) -> Beat:
         """The next beat. Entries that changed go first, then those that were not said for the longest time."""
         self.counter += 1
-        if not entries and not self._said:
-            return Beat(self._me, self._boot, self.counter, self._settled, echoes=echoes, rule=self._rule)
         changed = {name for name, entry in entries.items() if self._unsettling(entry)}
         if changed or len(entries) != len(self._said):
             self._settled = self.counter
+        empty = Beat(
+            self._me, self._boot, self.counter, self._settled, 0, len(entries), echoes, (), self._rule, grace_ms, promises
+        )
+        if not entries:
+            self._said.clear()
+            return empty
         self._said = {name: said for name, said in self._said.items() if name in entries}
         order = sorted(entries, key=lambda name: (name not in changed, not self._news(entries[name]), self._last(name)))
-        empty = Beat(self._me, self._boot, self.counter, self._settled, 0, len(entries), echoes, rule=self._rule)
         chosen = self._fitting([entries[name] for name in order], empty)
         for name in changed:
             self._said[name] = (entries[name], 0)
@@ -117,6 +123,8 @@ class Speaker:
             echoes,
             chosen,
             self._rule,
+            grace_ms,
+            promises,
         )
 
     def unsaid(self, beat: Beat) -> None:

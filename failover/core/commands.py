@@ -10,7 +10,7 @@ from failover.core.election import majority
 from failover.core.election.pair import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
 from failover.core.transitions import exits, handover, promotion, restarts
-from failover.core.types import ENDED, State
+from failover.core.types import ENDED, MS, State
 
 _RUNNING = frozenset({State.PRIMARY, State.FROZEN})
 
@@ -91,6 +91,9 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
         how = "it runs here" if component.state is State.PRIMARY else f"here it is {component.state}"
         how = "it is started anew in a moment" if restarts.waits(component) else how
         return f"cannot {verb} {name}: {how}; failover stop or release it first, or choose another name"
+    if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):
+        again_s = left_ns // (1_000 * MS) + 1
+        return f"cannot {verb} {name}: {component.primary} has it, and its agent restarts; ask again in {again_s} s"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
         if entry is not None and not vacant(component, turn) and component.state not in ENDED:

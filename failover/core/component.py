@@ -143,6 +143,9 @@ class Component(Struct):
         born: epoch under which the present process was started or restored.
         stood: this copy stood still, or began without a word of the robots that ran it before, since all peers last agreed to it.
         rival_ns: when this copy, which never stopped acting, first heard of the present rival.
+        inherited_ns: this life of the agent found it running under a lease: it acts until then, and no longer before this life
+            has one of its own; 0: it did not, or it has. borrowed_ns: until when its guard may let it act on such a lease; 0: the
+            guard has a shorter one.
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         restart_ns: its program has ended, and is started anew at this instant; 0: it is not. restarts: when that was ordered, the
             last times; restarted: how often in this life of the agent. ended_how: the program, or a start that failed.
@@ -236,6 +239,8 @@ class Component(Struct):
     unprotected: bool = False
     lease_ns: int = 0
     told_ns: int = 0
+    inherited_ns: int = 0
+    borrowed_ns: int = 0
     crashes: deque[int] = field(default_factory=lambda: deque(maxlen=128))
     crashed: int = 0
     restart_ns: int = 0
@@ -382,6 +387,7 @@ class Turn(Struct):
     Attributes:
         before: the vote record as the last step left it.
         late_ns: see `failover.core.event_log.decisions.Facts`.
+        leaving: this agent is about to restart.
     """
 
     now_ns: int
@@ -391,6 +397,7 @@ class Turn(Struct):
     before: VoteRecord
     late_ns: int
     load: int = 0
+    leaving: bool = False
     acts: list[Act] = field(default_factory=list)
     said: list[Decision] = field(default_factory=list)
 

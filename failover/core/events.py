@@ -50,11 +50,23 @@ class TeamChanged(Struct, frozen=True):
     config: Config
 
 
+class Leave(Struct, frozen=True):
+    """This agent is to end, and another one starts at once: its peers are asked to wait. `Node.may_go` says when to end."""
+
+
 class Started(Struct, frozen=True):
     """The act Start is done: the program runs (or, adopted, has been running) and its keeper is ready."""
 
     component: str
     epoch: int
+
+
+class Leased(Struct, frozen=True):
+    """The act SetLease that asked for it is done: the guard has no longer lease than that one."""
+
+    component: str
+    epoch: int
+    until_ns: int
 
 
 class Captured(Struct, frozen=True):
@@ -344,7 +356,9 @@ Event = (
     | Received
     | Unread
     | TeamChanged
+    | Leave
     | Started
+    | Leased
     | Captured
     | Unchanged
     | UnderWay

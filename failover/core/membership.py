@@ -3,7 +3,8 @@
 A peer is *suspect* when heartbeats are missing. It is *dead* when it was silent on all links for longer than any lease it may
 still act on, and for as much longer as its heartbeats have lately come late. Invariants: a peer's counter and boot only grow; a
 lease counts from the question (the instant this robot's heartbeat left), never from the answer; lateness of this robot's own loop
-makes peers look silent and is subtracted before any peer is judged.
+makes peers look silent and is subtracted before any peer is judged; a promise to wait for a peer whose agent restarts is kept to
+its end, whatever is heard since.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from collections import deque
 from msgspec import Struct, field
 
 from failover.core.event_log.decisions import Sighting
-from failover.core.types import COMPONENTS_MAX, MS, Config, PeerView, State
-from failover.core.wire.messages import RULES, Beat, Echo, Entry
+from failover.core.types import COMPONENTS_MAX, MS, Awaited, Config, PeerView, State
+from failover.core.wire.messages import RETURNED, RULES, Beat, Echo, Entry, Promise
 
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
@@ -39,6 +40,9 @@ LATE_BEATS = 64
 
 Each medium has a window of its own, so a recorded frame of a medium that this robot never heard is authentic, and new there.
 """
+
+PROMISES_MAX = 8
+"""In one beat: agents that restart at once beyond that are not waited for."""
 
 SUSPECT_BEATS = 3
 """Beats that may be missing before a peer is called suspect."""
@@ -70,6 +74,9 @@ class Peer(Struct):
         unread_ns: when something last came from it that could not be authenticated, 0 for never since its last beat;
             ``unread_why``: what is wrong.
         loyal_until_ns: `Membership.loyal_until_ns`, counted when something of it changes: it is asked for several times a step.
+        awaited_until_ns: until when we have promised not to replace it, because its agent restarts; ``awaited_ms``: what we
+            granted, without the margin; ``awaited``: (boot, counter) of its newest beat that asked, (boot, 0) if an earlier life
+            of ours heard that. promised_ns: until when it has promised not to replace us.
     """
 
     robot: str
@@ -90,6 +97,10 @@ class Peer(Struct):
     unread_ns: int = 0
     unread_why: str = ""
     loyal_until_ns: int = 0
+    awaited_until_ns: int = 0
+    awaited_ms: int = 0
+    awaited: tuple[int, int] = (0, 0)
+    promised_ns: int = 0
     links: dict[str, int] = field(default_factory=dict)
     entries: dict[str, _Known] = field(default_factory=dict)
 
@@ -155,7 +166,11 @@ class Peer(Struct):
 class Membership:
     """The team, as one robot hears it."""
 
-    def __init__(self, config: Config, boot: int, now_ns: int) -> None:
+    def __init__(self, config: Config, boot: int, now_ns: int, awaited: tuple[Awaited, ...] = ()) -> None:
+        """
+        Args:
+            awaited: promises of an earlier life of ours: kept from now on, which is longer.
+        """
         self._own = (config.robot, boot)
         self._born_ns = now_ns
         self._configure(config)
@@ -165,6 +180,11 @@ class Membership:
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
         for peer in self.peers.values():
             self._count_loyalty(peer)
+        self._awaits = False
+        for one in awaited:
+            if one.robot in self.peers:
+                self._await(self.peers[one.robot], one.ms, now_ns)
+                self.peers[one.robot].awaited = (one.boot, 0)
 
     def _configure(self, config: Config) -> None:
         self._config = config
@@ -179,7 +199,11 @@ class Membership:
         """
         self._configure(config)
         before_ns = now_ns - self._grace_ns
-        left = {robot: peer.loyal_until_ns for robot, peer in self.peers.items() if robot not in config.peers}
+        left = {
+            robot: max(peer.loyal_until_ns, peer.awaited_until_ns)
+            for robot, peer in self.peers.items()
+            if robot not in config.peers
+        }
         self._former_until_ns = {robot: at for robot, at in (self._former_until_ns | left).items() if at > now_ns}
         self.peers = {robot: self.peers.get(robot) or Peer(robot, before_ns) for robot in config.peers}
         for peer in self.peers.values():
@@ -194,10 +218,53 @@ class Membership:
         before = (peer.echoed, peer.heard_us)
         news = peer.take(beat, self._own, link, now_ns, self._rule)
         self._count_loyalty(peer)
+        if beat.grace_ms and not peer.at_odds and (beat.boot, beat.counter) == (peer.boot, peer.counter):
+            self._take_grace(peer, beat, now_ns)
+        if beat.promises and not peer.at_odds:
+            self._take_promises(peer, beat)
         if (peer.echoed, peer.heard_us) != before:
             peer.asked_ns = self._left_ns(peer.echoed)
             peer.heard_us_ns = peer.asked_ns if peer.heard_us == peer.echoed else self._left_ns(peer.heard_us)
         return news
+
+    def _take_grace(self, peer: Peer, beat: Beat, now_ns: int) -> None:
+        """A peer asks to be waited for: granted from the hearing, up to what this robot's operator allows; or it is back."""
+        if beat.grace_ms == RETURNED and beat.boot > peer.awaited[0]:
+            peer.awaited_until_ns = 0
+        grace_ms = min(beat.grace_ms, self._config.restart_grace_ms)
+        if grace_ms > 0:
+            self._await(peer, grace_ms, now_ns)
+            peer.awaited = (beat.boot, beat.counter)
+
+    def _await(self, peer: Peer, grace_ms: int, now_ns: int) -> None:
+        """Promise it; one that was longer stays."""
+        if now_ns < peer.awaited_until_ns:
+            grace_ms = max(grace_ms, peer.awaited_ms)
+        peer.awaited_ms = grace_ms
+        peer.awaited_until_ns = max(peer.awaited_until_ns, now_ns + self._config.awaited_ns(grace_ms))
+        self._awaits = True
+
+    def _take_promises(self, peer: Peer, beat: Beat) -> None:
+        """The promise counts from when our beat left that asked for it."""
+        for promise in beat.promises:
+            if (promise.robot, promise.boot) == self._own and (left_ns := self._left_ns(promise.counter)):
+                grace_ms = min(promise.ms, self._config.restart_grace_ms)
+                peer.promised_ns = max(peer.promised_ns, left_ns + grace_ms * MS)
+
+    def awaited(self, now_ns: int) -> tuple[Awaited, ...]:
+        """The promises that are not over, for the vote record."""
+        if not self._awaits:
+            return ()
+        running = (peer for peer in self.peers.values() if now_ns < peer.awaited_until_ns)
+        kept = tuple([Awaited(peer.robot, peer.awaited[0], peer.awaited_ms) for peer in running])
+        self._awaits = bool(kept)
+        return kept
+
+    def promises(self, kept: tuple[Awaited, ...]) -> tuple[Promise, ...]:
+        """Those that may be told: ``kept`` are on the disk, or will be before the beat leaves."""
+        told = [self.peers[one.robot] for one in kept if one.robot in self.peers]
+        fresh = [peer for peer in told if peer.awaited[0] == peer.boot and peer.awaited[1]]
+        return tuple([Promise(peer.robot, *peer.awaited, peer.awaited_ms) for peer in fresh[:PROMISES_MAX]])
 
     def _time(self, peer: Peer, beat: Beat, now_ns: int) -> None:
         """Learn how late its beats come, as far as that widens the margin: more of it would only be forgotten later.
@@ -228,6 +295,9 @@ class Membership:
             peer.since_ns = min(peer.since_ns + late_ns, now_ns)
             peer.unread_ns = min(peer.unread_ns + late_ns, now_ns) if peer.unread_ns else 0
             self._count_loyalty(peer)
+            if now_ns - late_ns < peer.awaited_until_ns:
+                longest_ns = now_ns + self._config.awaited_ns(peer.awaited_ms)
+                peer.awaited_until_ns = min(peer.awaited_until_ns + late_ns, max(longest_ns, peer.awaited_until_ns))
         self._stranger_ns = min(self._stranger_ns + late_ns, now_ns) if self._stranger_ns else 0
         self._former_until_ns = {robot: at_ns + late_ns for robot, at_ns in self._former_until_ns.items()}
         self._born_ns += late_ns
@@ -257,10 +327,10 @@ class Membership:
         return max(min(UNSTEADY_FACTOR * peer.unsteady_ns, lease_ns) - (self._loyalty_ns - lease_ns), 0)
 
     def next_death_ns(self, now_ns: int) -> int | None:
-        """When the next living peer counts as dead if it stays silent; None if no peer lives."""
+        """When the next peer counts as silent, or as dead, if it stays silent; None if all do."""
         first_ns: int | None = None
         for peer in self.peers.values():
-            until_ns = peer.loyal_until_ns
+            until_ns = peer.loyal_until_ns if peer.loyal_until_ns > now_ns else peer.awaited_until_ns
             if until_ns > now_ns and (first_ns is None or until_ns < first_ns):
                 first_ns = until_ns
         return first_ns
@@ -269,11 +339,17 @@ class Membership:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""
         if robot not in self.peers:
             return now_ns >= self._former_until_ns.get(robot, 0)
-        return now_ns >= self.loyal_until_ns(robot)
+        peer = self.peers[robot]
+        return now_ns >= peer.loyal_until_ns and now_ns >= peer.awaited_until_ns
 
     def alive(self, robot: str, now_ns: int) -> bool:
-        """Heard in this life of ours, and not silent for too long."""
-        return robot in self.peers and self.peers[robot].boot > 0 and not self.dead(robot, now_ns)
+        """Heard in this life of ours, and not silent for too long. One that is waited for is neither alive nor dead."""
+        return robot in self.peers and self.peers[robot].boot > 0 and now_ns < self.peers[robot].loyal_until_ns
+
+    def awaited_ns(self, robot: str, now_ns: int) -> int:
+        """For how long a silent peer is waited for still, because its agent restarts as it announced; 0: it is heard, or dead."""
+        peer = self.peers.get(robot)
+        return max(peer.awaited_until_ns - now_ns, 0) if peer is not None and now_ns >= peer.loyal_until_ns else 0
 
     def echoes(self, now_ns: int) -> tuple[Echo, ...]:
         """Whom we hear, for the next beat. Under majority a peer that has not heard us for long may not act on that."""
@@ -296,7 +372,7 @@ class Membership:
         if robot not in self.peers or self.dead(robot, now_ns):
             return self.dead(robot, now_ns)
         peer = self.peers[robot]
-        return self._deaf(peer, now_ns) and now_ns >= peer.told_ns + self._loyalty_ns
+        return self._deaf(peer, now_ns) and now_ns >= max(peer.told_ns + self._loyalty_ns, peer.awaited_until_ns)
 
     def unheard(self, robot: str) -> bool:
         """Whether a robot has said nothing yet in this life of ours: a peer, or one that the team file does not know."""
@@ -358,9 +434,11 @@ class Membership:
         return tuple([peer for peer in self.peers.values() if peer.boot > 0 and now_ns < peer.loyal_until_ns])
 
     def lease_ns(self, robot: str) -> int:
-        """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease."""
-        asked_ns = self.peers[robot].asked_ns if robot in self.peers else 0
-        return asked_ns + self._config.lease_ns if asked_ns else 0
+        """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease; or its promise."""
+        peer = self.peers.get(robot)
+        if peer is None:
+            return 0
+        return max(peer.asked_ns + self._config.lease_ns if peer.asked_ns else 0, peer.promised_ns)
 
     def views(self, now_ns: int) -> tuple[PeerView, ...]:
         """For the status."""
@@ -388,8 +466,8 @@ class Membership:
     def _state(self, peer: Peer, now_ns: int) -> str:
         if not peer.boot:
             return "unheard"
-        if self.dead(peer.robot, now_ns):
-            return "dead"
+        if now_ns >= peer.loyal_until_ns:
+            return "restarting" if now_ns < peer.awaited_until_ns else "dead"
         return "suspect" if now_ns - peer.heard_ns > SUSPECT_BEATS * self._config.beat_ns else "alive"
 
     def _view(self, peer: Peer, now_ns: int) -> PeerView:
@@ -397,7 +475,17 @@ class Membership:
         state = self._state(peer, now_ns)
         heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._loyalty_ns)
         hears_us = self.lease_ns(peer.robot) > now_ns
-        return PeerView(peer.robot, state, peer.boot, silent_ns, hears_us, peer.load, heard, self.unread(peer.robot, now_ns))
+        return PeerView(
+            peer.robot,
+            state,
+            peer.boot,
+            silent_ns,
+            hears_us,
+            peer.load,
+            heard,
+            self.unread(peer.robot, now_ns),
+            awaited_ns=self.awaited_ns(peer.robot, now_ns),
+        )
 
 
 def _state_name(number: int) -> str:

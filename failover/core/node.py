@@ -25,6 +25,8 @@ from failover.core.events import (
     Failback,
     Handover,
     Inquired,
+    Leased,
+    Leave,
     NothingToCapture,
     Noticed,
     Prefer,
@@ -55,6 +57,7 @@ from failover.core.transitions import exits, failback, handover, promotion, rest
 from failover.core.types import (
     COMPONENTS_MAX,
     ENDED,
+    HOLDING,
     MS,
     ComponentSpec,
     Config,
@@ -66,7 +69,7 @@ from failover.core.types import (
     StatusView,
     VoteRecord,
 )
-from failover.core.wire.messages import Beat, Entry
+from failover.core.wire.messages import RETURNED, Beat, Entry
 
 NS_PER_S = 1_000 * MS
 
@@ -78,6 +81,9 @@ LATE_NS = 5 * MS
 
 REST_NS = MS
 """Between two deadlines: the core looks again at work that waits for another process, after a pause."""
+
+LEAVE_NS = 2_000 * MS
+"""An agent that restarts waits no longer for the promises of its peers: without them it ends all the same, and is replaced."""
 
 LIVES_MAX = 1 << 40
 """A peer that speaks of so many lives of this robot is not believed."""
@@ -108,7 +114,7 @@ class Node:
         self._asked_ns = self._next_beat_ns = now_ns
         self._last_beat_ns = now_ns - URGENT_GAP_NS
         self._durable = vote_record
-        self._team = Membership(config, boot, now_ns)
+        self._team = Membership(config, boot, now_ns, vote_record.awaited)
         self._speaker = Speaker(config.robot, boot, config.rule, len(config.peers) + 1)
         self._watch = Watch()
         self._testimony = Testimony()
@@ -116,6 +122,7 @@ class Node:
         self._components = {record.name: Component.remembered(record) for record in vote_record.records}
         self._found = {one.component: one for one in found}
         self._begun = False
+        self._leaving_ns = self._strays_ns = 0
         self._load = 0
         self._waiting: Beat | None = None
         self._promise = ""
@@ -145,7 +152,7 @@ class Node:
         for component in touched:
             lease.forget_former(component, turn)
             _review(component, turn)
-        changed = begins or bool(touched)
+        changed = begins or bool(touched) or self._team.awaited(now_ns) != self._durable.awaited
         persist = self._persist() if changed else None
         send = self._speak(turn) if changed or now_ns >= self._next_beat_ns else ()
         self._asked_ns = self._deadline_ns()
@@ -175,6 +182,20 @@ class Node:
                 return echo.boot
         return 0
 
+    def may_go(self, now_ns: int) -> bool:
+        """After `Leave`: whether this agent may end now: what runs here may act without it, or waiting longer is in vain.
+
+        It ends only after all orders so far were carried out, those of the worker included: the guards know their leases then.
+        """
+        return self._leaving_ns > 0 and (now_ns >= self._leaving_ns or not self.exposed(now_ns))
+
+    def exposed(self, now_ns: int) -> tuple[str, ...]:
+        """The components here that stand still soon after this agent ends, and are taken over, unless it is back at once."""
+        turn = self._turn(now_ns)
+        held = (component for component in self._components.values() if component.state in HOLDING - {State.FROZEN})
+        running = [component for component in held if not restarts.waits(component)]
+        return tuple(one.name for one in running if one.state is not State.PRIMARY or not lease.outlasts(one, turn))
+
     def waits(self, beat: Beat | None) -> None:
         """The newest beat waits for a slot on each link; None: it is on its way. One that waits when the next is made is lost."""
         self._waiting = beat
@@ -197,7 +218,8 @@ class Node:
         return {name: (one.primary, one.epoch) for name, one in self._components.items() if one.primary and one.epoch}
 
     def _turn(self, now_ns: int) -> Turn:
-        return Turn(now_ns, self._config, self._team, self._speaker.counter + 1, self._durable, self._watch.late_ns, self._load)
+        counter, leaving = self._speaker.counter + 1, self._leaving_ns > 0
+        return Turn(now_ns, self._config, self._team, counter, self._durable, self._watch.late_ns, self._load, leaving)
 
     def _note_promise(self, turn: Turn) -> None:
         """The journal has the team's promise at each change, and a component's while it differs from that."""
@@ -249,6 +271,7 @@ class Node:
         turn.say_of_robot(f"the agent of {turn.me} begins, life {self._boot}")
         for component in self._components.values():
             found = self._found.pop(component.name, None)
+            component.borrowed_ns = found.lease_ns if found is not None else 0
             if component.state is State.PRIMARY:
                 _take_up(component, turn, found)
             elif found is not None and component.state not in ENDED:
@@ -257,6 +280,7 @@ class Node:
             if found is None and not component.held and turn.me in (component.primary, *component.entrusted):
                 component.bare = component.has_begun
         for stray in self._found.values():
+            self._strays_ns = max(self._strays_ns, stray.lease_ns)
             turn.order(acts.Stop(stray.component, stray.epoch))
         self._found.clear()
 
@@ -264,7 +288,9 @@ class Node:
 
     def _take(self, event: Event, turn: Turn) -> list[Component]:
         """Take the event in; returns the components that it may have changed."""
-        if isinstance(event, Tick | TeamChanged):
+        if isinstance(event, Leave):
+            self._leave(turn)
+        if isinstance(event, Tick | TeamChanged | Leave):
             return list(self._components.values())
         if isinstance(event, Received):
             return self._hear(event, turn)
@@ -284,6 +310,17 @@ class Node:
             return []
         _tell(component, turn, event)
         return [component]
+
+    def _leave(self, turn: Turn) -> None:
+        """Ask the peers to wait, if there is something that they could take over, and it is to be waited for."""
+        if self._leaving_ns:
+            return
+        grace_ms = turn.config.restart_grace_ms
+        is_asked = grace_ms > 0 and bool(self.exposed(turn.now_ns))
+        self._leaving_ns = turn.now_ns + (LEAVE_NS if is_asked else 0)
+        turn.leaving, self._next_beat_ns = True, turn.now_ns
+        asks = f"it asks its peers to wait {grace_ms / 1_000:g} s for the next one" if is_asked else "it asks no peer to wait"
+        turn.say_of_robot(f"the agent of {turn.me} is about to restart: {asks}")
 
     def _note(self, event: Noticed, turn: Turn) -> None:
         component = self._components.get(event.component)
@@ -338,12 +375,19 @@ class Node:
         if self._waiting is not None:
             self._speaker.unsaid(self._waiting)
             self._waiting = None
-        beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns))
+        grace_ms = turn.config.restart_grace_ms if turn.leaving else self._returned(turn)
+        promises = self._team.promises(self._durable.awaited) if self._durable.awaited else ()
+        beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns), grace_ms, promises)
         self._load = beat.load
         self._team.asked(beat.counter, turn.now_ns)
         self._last_beat_ns = turn.now_ns
         self._next_beat_ns = turn.now_ns + self._config.beat_ns
         return (beat,)
+
+    def _returned(self, turn: Turn) -> int:
+        """Whether what the peers have promised to an earlier life of this agent is void, in the words of a beat."""
+        is_back = not any(lease.borrows(component, turn) for component in self._components.values())
+        return RETURNED if is_back and turn.now_ns >= self._strays_ns else 0
 
     def _entries(self) -> dict[str, Entry]:
         starts = self._config.by_majority
@@ -351,7 +395,8 @@ class Node:
         return {component.name: entry_of(component) for component in known}
 
     def _persist(self) -> VoteRecord | None:
-        vote_record = VoteRecord(tuple(component.record() for component in self._components.values() if component.epoch))
+        records = tuple(component.record() for component in self._components.values() if component.epoch)
+        vote_record = VoteRecord(records, self._team.awaited(self._now_ns))
         if vote_record == self._durable:
             return None
         self._durable = vote_record
@@ -402,7 +447,13 @@ def _take_up(component: Component, turn: Turn, found: Found | None) -> None:
     component.stood = True
     component.standby = component.entrusted[0] if component.entrusted else ""
     pair.open_line(component, turn)
-    if not found.running:
+    if found.running and lease.inherit(component, turn, found.lease_ns):
+        component.move(Cause.LEASE_BACK)
+        left_s = (found.lease_ns - turn.now_ns) / NS_PER_S
+        turn.say(
+            component, f"the agent of {turn.me} is back; it has run on, and may for {left_s:.1f} s more, until a peer is heard"
+        )
+    elif not found.running:
         status, keeps_state = found.status, component.keeps_state
         exits.exited(component, turn, Exited(component.name, component.epoch, status, keeps_state=keeps_state))
     elif lease.on_lease(component, turn):
@@ -443,6 +494,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             warm_standby.warmed(component, turn, event)
         case Inquired():
             failback.inquired(component, turn, event)
+        case Leased():
+            component.borrowed_ns = 0
         case Stopped():
             if component.state is State.STOPPING:
                 component.move(Cause.CLEARED)

@@ -290,6 +290,8 @@ class Config(Struct, frozen=True, dict=True):
             may have taken it over since, before it claims the component without having heard them.
         seat: this robot's number in the team, which no other member has, and which stays while members come and go; -1: by the
             order of names.
+        restart_grace_ms: how long the peers are asked to wait for this agent when it restarts, and the most that it waits for
+            one of theirs; 0: neither.
     """
 
     robot: str
@@ -312,8 +314,14 @@ class Config(Struct, frozen=True, dict=True):
     archive_ms: int = 10_000
     boot_patience_ms: int = 0
     seat: int = -1
+    restart_grace_ms: int = 0
 
     def __post_init__(self) -> None:
+        if self.restart_grace_ms and not self.lease_ms <= self.restart_grace_ms <= GRACE_MS_MAX:
+            raise RulesError(
+                f"restart_grace_ms = {self.restart_grace_ms}: choose 0, for none, or between lease_ms ({self.lease_ms}) and "
+                f"{GRACE_MS_MAX}"
+            )
         if not 1 <= self.beat_ms <= BEAT_MS_MAX:
             raise RulesError(f"beat_ms = {self.beat_ms}: beats lie between 1 ms and 10 s apart")
         if self.lease_ms < BEATS_IN_LEASE_MIN * self.beat_ms:
@@ -376,6 +384,10 @@ class Config(Struct, frozen=True, dict=True):
         """The same for a peer whose beats come late: see `failover.core.membership.Membership.loyal_until_ns`."""
         return max(self.loyalty_ns, 2 * self.lease_ns)
 
+    def awaited_ns(self, grace_ms: int) -> int:
+        """Silence after which a robot that asked for so much grace is replaced: stretched as the loyalty stretches the lease."""
+        return grace_ms * MS * self.loyalty_ns // self.lease_ns
+
     @functools.cached_property
     def grace_ns(self) -> int:
         """How long a peer that was never heard in this life may be on its way; never less than the loyalty."""
@@ -387,6 +399,9 @@ EPOCH_MAX = 1 << 40
 
 EPOCH_SAID_MAX = EPOCH_MAX - (1 << 30)
 """The words of others raise no epoch above this: from there on a robot could claim each second for 34 years."""
+
+GRACE_MS_MAX = 120_000
+"""No robot waits longer for an agent that restarts: its programs have no standby that would take over meanwhile."""
 
 BEAT_MS_MAX = 10_000
 PERIOD_MS_MAX = 3_600_000
@@ -442,10 +457,24 @@ class Record(Struct, frozen=True):
     ended: tuple[int, int] = (0, 0)
 
 
+class Awaited(Struct, frozen=True):
+    """A promise not to replace a robot whose agent restarts.
+
+    Attributes:
+        boot: life of its agent that was promised it.
+        ms: for so long, and its margin: since its newest beat that asked, and again since a start of ours.
+    """
+
+    robot: str
+    boot: int
+    ms: int
+
+
 class VoteRecord(Struct, frozen=True):
     """All that a robot's rules must not forget: durable before any message that depends on it leaves."""
 
     records: tuple[Record, ...] = ()
+    awaited: tuple[Awaited, ...] = ()
 
 
 class Held(Struct, frozen=True):
@@ -467,19 +496,22 @@ class Found(Struct, frozen=True):
         epoch: under which it was started or last restored, as the guard remembers.
         running: its program is there (perhaps frozen by its guard); False once it has ended.
         status: waitpid's status, when it has ended.
+        lease_ns: until when its guard lets it act; 0: it is held still, or has no lease.
     """
 
     component: str
     epoch: int
     running: bool
     status: int = 0
+    lease_ns: int = 0
 
 
 class PeerView(Struct, frozen=True):
-    """One peer as this robot sees it: ``state`` is alive, suspect, dead or unheard; ``silent_ns`` since its last beat.
+    """One peer as this robot sees it: ``state`` is alive, suspect, restarting, dead, unheard; ``silent_ns`` since its last beat.
 
     ``unread``: why what comes from it cannot be authenticated, if something of that kind came lately. ``refused``: what it said
-    beyond what it may say, a sentence for each reason; ``doubted``: some of it lately.
+    beyond what it may say, a sentence for each reason; ``doubted``: some of it lately. ``awaited_ns``: for how long it is not
+    replaced, because its agent announced that it comes back; 0: it did not, or that is over.
     """
 
     robot: str
@@ -492,6 +524,7 @@ class PeerView(Struct, frozen=True):
     unread: str = ""
     refused: tuple[str, ...] = ()
     doubted: bool = False
+    awaited_ns: int = 0
 
 
 class ComponentView(Struct, frozen=True):

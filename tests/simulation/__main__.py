@@ -9,15 +9,21 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 
+from tests.simulation import planned
 from tests.simulation.chaos import life
 
 FAULTS_A_LIFE = 150
 """Of a long life."""
 
+RESTARTS_A_LIFE = 12
+"""Of a life with planned restarts beside faults."""
+
 
 def main() -> int:
     """Play the seeds; 1 if one broke, with its story."""
     arguments = _parser().parse_args()
+    if arguments.restarts:
+        return _play_restarts(arguments.restarts, arguments.first)
     lives = -(-arguments.faults // FAULTS_A_LIFE) or arguments.seeds
     each = FAULTS_A_LIFE if arguments.faults else 0
     began, broken, faults = time.monotonic(), 0, 0
@@ -42,6 +48,25 @@ def play(seed: int, faults: int, liars: bool = False) -> tuple[int, str]:
         return 0, str(story) or repr(story)
 
 
+def _play_restarts(count: int, first: int) -> int:
+    """Planned restarts, as many in lives of peace as in lives beside faults; 1 if one broke a promise."""
+    began, calm, beside, promised = time.monotonic(), 0, 0, 0
+    for seed in itertools.count(first):
+        is_calm = calm <= beside
+        try:
+            world = planned.calm(seed) if is_calm else life(seed, restarts=RESTARTS_A_LIFE)
+        except AssertionError as story:
+            print(f"seed {seed}, {'in peace' if is_calm else 'beside faults'}: {story}")
+            return 1
+        calm, beside = calm + len(world.restarts) * is_calm, beside + len(world.restarts) * (not is_calm)
+        promised += sum(waited_for for _, waited_for in world.restarts)
+        if calm + beside >= count:
+            break
+    took_s = time.monotonic() - began
+    print(f"{calm} restarts in peace: no move, no pause; {beside} beside faults; {promised} waited for; {took_s:.0f} s, 0 broken")
+    return 0
+
+
 def _played(seeds: range, faults: int, jobs: int, *, liars: bool) -> Iterator[tuple[int, tuple[int, str]]]:
     if jobs == 1:
         yield from ((seed, play(seed, faults, liars)) for seed in seeds)
@@ -57,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--faults", type=int, default=0, help=f"instead: long lives of {FAULTS_A_LIFE} faults, until there were as many"
     )
+    parser.add_argument("--restarts", type=int, default=0, help="instead: lives with planned restarts, until there were as many")
     parser.add_argument("--liars", action="store_true", help="an attacker lies by the key of a member of a team that votes")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first that breaks")

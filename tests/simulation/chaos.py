@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from failover.core import beat_builder
 from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Restart, Rule, Rules, WhenAlone
+from tests.simulation import planned
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
@@ -72,6 +73,7 @@ def life(
     *,
     liars: bool = False,
     restart: Restart = Restart.UNDECLARED,
+    restarts: int = 0,
 ) -> World:
     """Play one seed to its end; raises ``Broken`` when an invariant does not hold.
 
@@ -79,6 +81,7 @@ def life(
         team: of ``TEAMS``; None for what the seed says.
         faults: how many, in a life that is as long as they take and whose programs do not end; 0 for what the seed says.
         restart: of all components, without a limit.
+        restarts: of agents, planned, at random instants; a life is as long as they take at least.
         liars: an attacker has the key of a member, and lies by it until the world is healed.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
@@ -91,12 +94,14 @@ def life(
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
     narrow = NARROW_BEAT_SIZE + ECHO_SIZE * (len(configs) - 2)
     size_max = beat_size_max if seed % NARROW else lambda _: narrow
+    if restarts:
+        configs = planned.with_grace(configs)
     with patch.object(beat_builder, "beat_size_max", size_max):
-        return _live(seed, random, configs, specs, faults, liars=liars)
+        return _live(seed, random, configs, specs, faults, restarts, liars=liars)
 
 
 def _live(
-    seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int, *, liars: bool
+    seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int, restarts: int, *, liars: bool
 ) -> World:
     votes = configs[0].rule is Rule.MAJORITY
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
@@ -108,9 +113,10 @@ def _live(
         _make_harsh(world)
     for name in world.robots:
         world.at(random.randrange(300) * MS, lambda name=name: world.power_on(name))
-    trouble_ns = faults * FAULT_NS or TROUBLE_NS
+    trouble_ns = max(faults * FAULT_NS or TROUBLE_NS, restarts * planned.GAP_NS)
     for _ in range(faults or (random.randrange(4, 16) if votes else random.randrange(1, 9))):
         world.at(random.randrange(trouble_ns), Trouble(world, invariants, random, specs, endless=faults > 0))
+    planned.beside_faults(world, Random(seed ^ 0x9E57A27), restarts, trouble_ns)
     if liars:
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3:

@@ -19,6 +19,7 @@ from failover.core.events import (
     Event,
     Exited,
     Inquired,
+    Leased,
     Restored,
     ShipEnded,
     Started,
@@ -99,6 +100,8 @@ class Deeds:
             case acts.SetLease():
                 program.lease_ns = act.until_ns
                 program.lapsed = program.lapsed and 0 < act.until_ns <= self._world.local(robot)
+                if act.is_asked:
+                    self._world.feed(robot, Leased(act.component, act.epoch, act.until_ns))
             case acts.End():
                 self._world.program_ends(robot.name, act.component, act.signal)
             case acts.LetGo():

@@ -15,7 +15,7 @@ from failover.core.election import lease, majority, pair, votes
 from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.replication import servers, standby, warm_standby
 from failover.core.transitions import exits, handover, restarts
-from failover.core.types import Config, Restart, State
+from failover.core.types import MS, Config, Restart, State
 from failover.core.wire.messages import Entry
 
 Mutant = Callable[[], Any]
@@ -489,6 +489,65 @@ def resumes_what_has_ended() -> Any:
     return patch.object(restarts, "begin", begin)
 
 
+def lease_beyond_the_promise() -> Any:
+    """The guard of a robot whose agent restarts gets a longer lease than its peers have promised to wait."""
+    honest = Membership._take_promises
+
+    def generous(self: Membership, peer: Peer, beat: Any) -> None:
+        before_ns = peer.promised_ns
+        honest(self, peer, beat)
+        if peer.promised_ns > before_ns:
+            peer.promised_ns += self._config.restart_grace_ms * MS // 2
+
+    return patch.object(Membership, "_take_promises", generous)
+
+
+def forgets_its_promise() -> Any:
+    """An agent that begins does not know what the one before it has promised."""
+    honest = Membership.__init__
+
+    def begin(self: Membership, config: Config, boot: int, now_ns: int, awaited: Any = ()) -> None:
+        honest(self, config, boot, now_ns)
+
+    return patch.object(Membership, "__init__", begin)
+
+
+def promise_of_a_minority() -> Any:
+    """An agent that restarts is content with the promise of one member."""
+    honest = majority.granted_ns
+
+    def granted(component: Component, turn: Turn) -> int:
+        promised = [peer.promised_ns for peer in turn.team.peers.values()] if turn.leaving else []
+        return max(honest(component, turn), *promised, 0)
+
+    return patch.object(majority, "granted_ns", granted)
+
+
+def breaks_its_promise() -> Any:
+    """A robot replaces one that it has promised to wait for, as soon as that is silent for a lease and a margin."""
+    honest = Membership.dead
+
+    def dead(self: Membership, robot: str, now_ns: int) -> bool:
+        return now_ns >= self.peers[robot].loyal_until_ns if robot in self.peers else honest(self, robot, now_ns)
+
+    return patch.object(Membership, "dead", dead)
+
+
+def freezes_what_ran_on() -> Any:
+    """An agent that is back holds its programs still until it is heard, though they have a lease."""
+    return patch.object(lease, "inherit", lambda *_: False)
+
+
+def waits_though_it_is_back() -> Any:
+    """A promise lasts to its end, though the robot is back and needs it no more."""
+    return patch.object(node.Node, "_returned", lambda *_: 0)
+
+
+def back_too_soon() -> Any:
+    """An agent says at once that it is back, while its guards still have the long lease."""
+    return patch.object(lease, "borrows", lambda *_: False)
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
@@ -531,8 +590,25 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (gives_its_primacy_up_for_the_pause, "a_robot_lost_in_the_pause_before_a_start_is_replaced"),
     (resumes_what_has_ended, "a_program_that_crashes_right_after_its_start_resumes_nothing_older"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
+    (lease_beyond_the_promise, "an_agent_that_does_not_come_back_is_replaced_after_the_grace"),
+    (breaks_its_promise, "an_agent_that_does_not_come_back_is_replaced_after_the_grace"),
+    (forgets_its_promise, "peers_that_restart_keep_their_promise"),
+    (promise_of_a_minority, "a_promise_of_a_minority_lets_nothing_act"),
+    (freezes_what_ran_on, "an_agent_restarts_as_announced_and_nothing_moves"),
+    (waits_though_it_is_back, "a_robot_that_is_lost_soon_after_its_restart_is_replaced_at_once"),
+    (back_too_soon, "an_agent_that_is_back_and_not_heard_by_all_is_waited_for"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""
+
+
+MUTANTS: tuple[Mutant, ...] = (
+    lease_beyond_the_promise,
+    forgets_its_promise,
+    promise_of_a_minority,
+    breaks_its_promise,
+)
+"""Mistakes that lives with planned restarts catch."""
+
 
 MUTANTS: tuple[Mutant, ...] = (
     impatient_standby,

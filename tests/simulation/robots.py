@@ -73,6 +73,7 @@ class Robot:
         lacks: what it says that it lacks when it is asked; None: something now and then.
         lie: what becomes of its beats on their way, while somebody else has its key.
         lane: the frames of this life.
+        away_ns: its agent is about to restart, and stays away for so long.
         read: robots whose beats it has authenticated in this life; ``unread_ns``: when it last received what it could not.
     """
 
@@ -104,6 +105,7 @@ class Robot:
     lacks: tuple[str, ...] | None = ()
     pending: VoteRecord | None = None
     lie: Lie | None = None
+    away_ns: int | None = None
     told: list[Decision] = field(default_factory=list)
     writing: list[tuple[str, Position]] = field(default_factory=list)
 

@@ -44,6 +44,7 @@ from failover.core.events import Handover, Promote, Run, Stop
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.liars import by_name
+from tests.simulation.planned import with_grace
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
@@ -66,11 +67,14 @@ class Story:
         kind, *members = lines.pop(0) if lines[0][0] in ("team", "votes") else ("team", "robot1", "robot2")
         names, votes = tuple(members), kind == "votes"
         boot_patience_ms = int(lines.pop(0)[1]) if lines[0][0] == "boot-patience" else 0
+        grace_ms = int(lines.pop(0)[1]) if lines[0][0] == "grace" else 0
         if lines[0][0] == "rule":
             self.rules = _rules(lines.pop(0)[1:])
         safe = {COMPONENT} if votes or self.rules.when_alone == "freeze" else set()
         self.invariants = Invariants(safe=safe, votes=votes)
-        self.world = World(1, _voters(names) if votes else pair((), names, boot_patience_ms), (self.invariants, self._count))
+        configs = _voters(names) if votes else pair((), names, boot_patience_ms)
+        configs = with_grace(configs, grace_ms) if grace_ms else configs
+        self.world = World(1, configs, (self.invariants, self._count))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)
             self._play(verb, arguments)
@@ -87,6 +91,8 @@ class Story:
                 world.power_on(robot)
             case "off":
                 world.power_off(robot)
+            case "restart":
+                world.restart(robot, int(arguments[1]) * MS)
             case "agent-dies":
                 world.agent_dies(robot)
             case "run":

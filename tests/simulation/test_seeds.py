@@ -7,7 +7,8 @@ import os
 import pytest
 
 from failover.core.types import Restart
-from tests.simulation.__main__ import FAULTS_A_LIFE
+from tests.simulation import planned
+from tests.simulation.__main__ import FAULTS_A_LIFE, RESTARTS_A_LIFE
 from tests.simulation.chaos import TEAMS, life
 from tests.simulation.invariants import Broken
 from tests.simulation.mutants import AS_THE_SEED_SAYS, CAUGHT_BY, ELECTIVE_MUTANTS, MUTANTS, Mutant, mistaken
@@ -17,6 +18,7 @@ BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
 RESTARTING = SEEDS // 8
+RESTARTING_AGENTS, RESTARTING_BLOCK = SEEDS // 50, 4
 SEEDS_TO_CATCH = 650
 LONG_LIVES_TO_CATCH = 60
 ONCE_BROKEN = (98, 161, 368)
@@ -45,6 +47,15 @@ def test_every_promise_holds_where_programs_are_started_anew_after_their_ends(re
     for seed in range(RESTARTING):
         try:
             life(seed, restart=restart)
+        except Broken as story:
+            raise Broken(f"seed {seed}: {story}") from None
+
+
+@pytest.mark.parametrize("first", range(0, RESTARTING_AGENTS, RESTARTING_BLOCK))
+def test_agents_restart_as_planned_in_peace_unnoticed_and_beside_all_other_faults(first: int) -> None:
+    for seed in range(first, first + RESTARTING_BLOCK):
+        try:
+            planned.calm(seed) if seed == first else life(seed, restarts=RESTARTS_A_LIFE)
         except Broken as story:
             raise Broken(f"seed {seed}: {story}") from None
 

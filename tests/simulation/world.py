@@ -16,11 +16,11 @@ from msgspec.structs import replace
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.events import Event, Exited, Received, Tick, Unread
+from failover.core.events import Event, Exited, Leave, Received, Tick, Unread
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.roster import roster
 from failover.core.node import Node
-from failover.core.types import MS, Config, Found, Held, VoteRecord
+from failover.core.types import MS, Config, Found, Held
 from failover.core.vote_record import decode, encode
 from failover.core.wire.messages import Beat
 from tests.simulation.deeds import Deeds
@@ -58,6 +58,8 @@ class World:
         self.network = Network()
         self.values: dict[Position, int] = {}
         self.log: list[str] = []
+        self.restarts: list[tuple[str, bool]] = []
+        """Planned ones: of whose agent, and whether its peers had promised to wait."""
         self._watchers = watchers
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
@@ -129,7 +131,13 @@ class World:
             Held(component, tuple(positions[-8:]), component in keep) for component, positions in robot.store.items() if positions
         )
         found = tuple(
-            Found(component, program.epoch, program.exit_status is None, program.exit_status or 0)
+            Found(
+                component,
+                program.epoch,
+                program.exit_status is None,
+                program.exit_status or 0,
+                program.lease_ns if self.unfrozen(robot, component) else 0,
+            )
             for component, program in robot.programs.items()
         )
         robot.node = Node(robot.config, robot.boot, decode(robot.vote_record), self.local(robot), held, found)
@@ -140,12 +148,28 @@ class World:
         """Kill the agent and the keepers; guards and programs live on. What was being written is written, or is not."""
         robot = self.robots[name]
         self._tear(robot)
-        robot.node = None
+        robot.node = robot.away_ns = None
         robot.life += 1
         robot.warm.clear()
         for component in robot.serial:
             robot.serial[component] += 1
         self.note(f"{name}: its agent dies")
+
+    def restart(self, name: str, away_ns: int) -> None:
+        """Restart an agent as planned: it announces that, ends when its rules say so, and another one starts a while later."""
+        robot = self.robots[name]
+        if robot.node is not None and robot.away_ns is None:
+            robot.away_ns = away_ns
+            self.note(f"{name}: its agent is about to restart")
+            self.feed(robot, Leave())
+
+    def _leave(self, robot: Robot, away_ns: int) -> None:
+        assert robot.node is not None
+        exposed = robot.node.exposed(self.local(robot))
+        self.restarts.append((robot.name, not exposed))
+        self.note(f"{robot.name}: its agent goes for {away_ns / MS:.0f} ms{f', not waited for: {exposed}' if exposed else ''}")
+        self.agent_dies(robot.name)
+        self.after(away_ns, lambda: self.power_on(robot.name))
 
     def _tear(self, robot: Robot) -> None:
         """A rename, or a new file, that was on its way to the disk: it got there and nobody was told, or it did not."""
@@ -171,8 +195,9 @@ class World:
         """Switch a robot off; so many epochs more have passed when it comes back, as its disk says."""
         self.power_off(name)
         robot = self.robots[name]
-        records = (replace(record, epoch=record.epoch + epochs) for record in decode(robot.vote_record).records)
-        robot.vote_record = encode(VoteRecord(tuple(records)))
+        durable = decode(robot.vote_record)
+        records = tuple(replace(record, epoch=record.epoch + epochs) for record in durable.records)
+        robot.vote_record = encode(replace(durable, records=records))
 
     def power_off(self, name: str) -> None:
         """Take everything that is not on the disk."""
@@ -284,7 +309,9 @@ class World:
         for act in ready.act:
             self._tell(robot.name, act)
             self._deeds.carry_out(robot, act)
-        if robot.inbox:
+        if robot.away_ns is not None and robot.node is not None and robot.node.may_go(self.local(robot)):
+            self._leave(robot, robot.away_ns)
+        elif robot.inbox:
             self.after(0, lambda: self._work(robot))
         elif robot.node is not None:
             self.at(robot.clock.true(robot.node.next_deadline_ns()), lambda: self._work(robot))

@@ -48,6 +48,8 @@ STATES: Final[dict[State, str]] = {
 PRIMARY_STATES: Final = frozenset(
     {State.CLAIMING, State.STARTING, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING, State.TAKING_OVER}
 )
+AWAITED: Final = "its agent restarts, as it announced; {} replaces it in {:.0f} s, if it is not back by then"
+
 PEER_STATES: Final = {"alive": "live", "unheard": "unknown"}
 
 
@@ -156,7 +158,9 @@ def _slots(view: SlotsView) -> dict[str, Any]:
 
 
 def _peer(peer: PeerView, link: PeerConnection | None, told: Told, settings: Settings) -> dict[str, Any]:
-    reason = list(dict.fromkeys(filter(None, (link.reason if link is not None else "", peer.unread, *peer.refused))))
+    awaited_s = peer.awaited_ns / NANOSECONDS_A_MILLISECOND / 1_000
+    awaited = AWAITED.format(settings.config.robot, awaited_s) if peer.awaited_ns else ""
+    reason = list(dict.fromkeys(filter(None, (awaited, link.reason if link is not None else "", peer.unread, *peer.refused))))
     return {
         "name": peer.robot,
         "role": settings.team.robots[peer.robot].role,

@@ -1,6 +1,10 @@
 """Lease: how long a primary may act, and when it stands still.
 
 Invariant: while another robot may start the component, it runs here only before ``lease_ns``, and the guard knows that instant.
+
+An agent that restarts arranges a longer lease before it ends: each robot that could start the component meanwhile has promised
+not to, on its disk, and waits longer than the lease by the margin (`failover.core.membership`). Under ``majority`` that is a
+quorum, under ``pair`` every robot entrusted with it and every other one that is not dead. The next agent finds that lease.
 """
 
 from __future__ import annotations
@@ -9,7 +13,7 @@ from failover.core import acts
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import majority
 from failover.core.election.consent import grants
-from failover.core.types import State
+from failover.core.types import MS, State
 
 TELL_SHARE = 4
 """The guard is told of a new lease when it is longer by this part of a lease: not for every beat. Less is not worth a thaw."""
@@ -17,18 +21,23 @@ TELL_SHARE = 4
 ACTING = frozenset({State.PRIMARY, State.STARTING, State.RECOVERING, State.TAKING_OVER, State.HANDING_OVER})
 """It runs here, or is about to: a restore may take longer than a lease, and so may the last snapshot of a handover."""
 
+OUTLASTS_SHARE = 2
+"""An agent that restarts ends once this part of its grace is left at least: the promises come within a few beats."""
+
 RACE_SHARE = 16
 """The lease that the guard knows counts as over this part of a lease early: a longer one could reach it too late."""
 
 
 def watch(component: Component, turn: Turn) -> None:
     """Count the lease anew; hold the component still when it is over, let it go on when it is back."""
+    if component.inherited_ns and _own_ns(component, turn) > turn.now_ns + turn.config.lease_ns // 2:
+        _give_back(component, turn)
     ran_out = component.told_ns > 0 and turn.now_ns >= component.told_ns - turn.config.lease_ns // RACE_SHARE
     component.lease_ns = counted_ns(component, turn)
     over = on_lease(component, turn) and (ran_out or turn.now_ns >= component.lease_ns)
     if component.state is State.PRIMARY and over:
         component.move(Cause.LEASE_OVER)
-        component.stood = True
+        component.stood, component.inherited_ns = True, 0
         turn.order(acts.Freeze(component.name, component.epoch))
         turn.say(component, f"{turn.me} {Cause.LEASE_OVER}")
     if component.state is State.FROZEN and _may_thaw(component, turn):
@@ -69,7 +78,7 @@ def entrust(component: Component, turn: Turn, robot: str) -> bool:
     if peer is None or not grants(component, peer, turn.me) or turn.team.lease_ns(robot) <= turn.now_ns:
         return False
     component.entrusted = (*component.entrusted, robot)
-    component.lease_ns = component.told_ns = 0
+    component.lease_ns = component.told_ns = component.inherited_ns = 0
     watch(component, turn)
     return True
 
@@ -78,11 +87,58 @@ def counted_ns(component: Component, turn: Turn) -> int:
     """Until when this robot may act; 0 where no other robot may start the component. A lease granted once stays granted."""
     if not on_lease(component, turn):
         return 0
+    own_ns = _own_ns(component, turn)
+    if turn.config.by_majority or component.freezes:
+        return max(component.lease_ns, own_ns)
+    if component.inherited_ns:
+        return component.inherited_ns
+    return max(own_ns, _promised_ns(component, turn)) if turn.leaving else own_ns
+
+
+def _own_ns(component: Component, turn: Turn) -> int:
+    """The same by the words that peers have said in this life of ours alone."""
     if turn.config.by_majority:
-        return max(component.lease_ns, majority.granted_ns(component, turn))
-    if not component.freezes:
-        return turn.now_ns + turn.config.lease_ns
-    return max(component.lease_ns, min(_granted_ns(component, turn, robot) for robot in component.entrusted))
+        return majority.granted_ns(component, turn)
+    if component.freezes:
+        return min(_granted_ns(component, turn, robot) for robot in component.entrusted)
+    is_alone = component.inherited_ns > 0 and not _each_agrees(component, turn)
+    return 0 if is_alone else turn.now_ns + turn.config.lease_ns
+
+
+def _give_back(component: Component, turn: Turn) -> None:
+    """This life has a lease of its own: the guard forgets the longer one, so that a loss from now on is met as ever."""
+    component.inherited_ns = 0
+    component.lease_ns = component.told_ns = _own_ns(component, turn)
+    turn.order(acts.SetLease(component.name, component.epoch, component.lease_ns, is_asked=True))
+
+
+def inherit(component: Component, turn: Turn, lease_ns: int) -> bool:
+    """Have a program that was found running go on under the lease that its guard has; False where it has none, or needs none."""
+    if not on_lease(component, turn) or lease_ns <= turn.now_ns + turn.config.lease_ns // RACE_SHARE:
+        return False
+    component.lease_ns = component.told_ns = component.inherited_ns = lease_ns
+    return True
+
+
+def borrows(component: Component, turn: Turn) -> bool:
+    """Whether its guard may let it act on a lease that an earlier life of this agent arranged."""
+    return turn.now_ns < component.borrowed_ns
+
+
+def outlasts(component: Component, turn: Turn) -> bool:
+    """Whether the program may act long enough without this agent, and no robot that hears us starts it meanwhile."""
+    enough_ns = turn.now_ns + turn.config.restart_grace_ms * MS // OUTLASTS_SHARE
+    if on_lease(component, turn):
+        return component.told_ns >= enough_ns
+    return all(
+        turn.team.lease_ns(peer.robot) >= enough_ns for peer in turn.team.living(turn.now_ns) if turn.config.runs(peer.robot)
+    )
+
+
+def _promised_ns(component: Component, turn: Turn) -> int:
+    """Under pair: until when no robot that hears us, or is entrusted with it, takes it over; 0 where one has promised nothing."""
+    others = {robot for robot in turn.team.peers if turn.config.runs(robot) and not turn.dead(robot)}
+    return min(_granted_ns(component, turn, robot) for robot in others.union(component.entrusted))
 
 
 def first_ns(component: Component, turn: Turn) -> int:
@@ -119,8 +175,12 @@ def _may_thaw(component: Component, turn: Turn) -> bool:
     """Under majority and ``freeze`` a lease; otherwise each robot entrusted agrees by its newest word, or is dead."""
     if component.freezes or turn.config.by_majority:
         return not on_lease(component, turn) or turn.now_ns < component.lease_ns - turn.config.lease_ns // TELL_SHARE
-    heard = (turn.dead(robot) or _granted_ns(component, turn, robot) > turn.now_ns for robot in component.entrusted)
-    return all(heard)
+    return _each_agrees(component, turn)
+
+
+def _each_agrees(component: Component, turn: Turn) -> bool:
+    """Whether each robot entrusted with it consents by its newest word, or is dead."""
+    return all(turn.dead(robot) or _granted_ns(component, turn, robot) > turn.now_ns for robot in component.entrusted)
 
 
 def _tell(component: Component, turn: Turn) -> None:

@@ -166,7 +166,8 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.ending, component.end_signal = False, 0
     component.ordered = False
     component.crashed, component.reason = 0, ""
-    component.lease_ns = component.told_ns = component.took_ns = component.freeze_us = component.still_us = 0
+    component.lease_ns = component.told_ns = component.inherited_ns = 0
+    component.took_ns = component.freeze_us = component.still_us = 0
     component.cpu_us = component.cost_us = 0
     admit(component, turn, "")
     open_line(component, turn)
@@ -444,7 +445,7 @@ def lose(component: Component, turn: Turn, winner: str, entry: Entry) -> None:
         clear_away(component, turn, entry.epoch)
     component.handing = component.flight = None
     component.standby, component.lease_ns, component.told_ns = "", 0, 0
-    component.crashed = 0
+    component.inherited_ns = component.crashed = 0
     _forget_lines_since(component, turn, entry)
     accept(component, turn, winner, entry.epoch)
     component.trusted = entry.standby == turn.me

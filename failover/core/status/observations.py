@@ -29,6 +29,7 @@ class Watch(Struct):
     _late_at_ns: int = 0
     _stalled_ns: int = 0
     _dead: set[str] = field(default_factory=set)
+    _awaited: dict[str, int] = field(default_factory=dict)
 
     def late(self, late_ns: int, loyalty_ns: int, now_ns: int) -> None:
         """A step came ``late_ns`` after the instant that was asked for (below 0: before it)."""
@@ -43,11 +44,22 @@ class Watch(Struct):
             turn.say_of_robot(f"{turn.me} itself stood still for {late_ms} ms; that is not counted as its peers' silence")
         now_ns, dead = turn.now_ns, self._dead
         for robot, peer in turn.team.peers.items():
-            if peer.loyal_until_ns <= now_ns and robot not in dead:
-                dead.add(robot)
-                turn.say_of_robot(_farewell(turn, robot))
+            if peer.loyal_until_ns > now_ns or robot in dead:
+                continue
+            if not turn.dead(robot):
+                self._tell_awaited(turn, robot)
+                continue
+            dead.add(robot)
+            turn.say_of_robot(_farewell(turn, robot))
         if isinstance(event, Received) and event.beat.sender in turn.team.peers:
             self._greet(turn, event)
+
+    def _tell_awaited(self, turn: Turn, robot: str) -> None:
+        peer = turn.team.peers[robot]
+        if self._awaited.get(robot) != peer.boot:
+            self._awaited[robot] = peer.boot
+            left_s = turn.team.awaited_ns(robot, turn.now_ns) / (1_000 * MS)
+            turn.say_of_robot(f"the agent of {robot} restarts, as it announced: {turn.me} waits for it for {left_s:.1f} s")
 
     def _greet(self, turn: Turn, event: Received) -> None:
         beat = event.beat
@@ -66,7 +78,7 @@ class Watch(Struct):
 
 def _farewell(turn: Turn, robot: str) -> str:
     peer = turn.team.peers[robot]
-    limit_ms = (turn.team.loyal_until_ns(robot) - peer.heard_ns) // MS
+    limit_ms = (max(turn.team.loyal_until_ns(robot), peer.awaited_until_ns) - peer.heard_ns) // MS
     if not peer.boot:
         return f"{robot} has not been heard in the {limit_ms} ms since this agent started: {COUNTS_AS_DEAD}"
     links = ", ".join(link for link in sorted(peer.links) if link)

@@ -184,6 +184,14 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(_waits_after_boot(component, turn, left_ns))
     if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
         notes.append(f"waiting: {unread}; failover promote does not wait")
+    if (
+        component.primary
+        and component.state is State.STANDBY
+        and (left_ns := turn.team.awaited_ns(component.primary, turn.now_ns))
+    ):
+        notes.append(
+            f"the agent of {component.primary} restarts, as it announced: {left_ns / NS_PER_S:.0f} s more it is waited for"
+        )
     if component.unprotected:
         notes.append(
             "not protected any more: on_unsupported = stop_protecting; to protect it again: failover release, then protect"

@@ -81,17 +81,21 @@ def _refusal(component: Component, turn: Turn) -> str:
             f": {component.unable}" if component.unable else ""
         )
     if not vacant(component, turn, is_ordered=True):
-        holder = _holder(component, turn)
-        return (
-            f"{holder} lives and has it; ask there"
-            if holder
-            else f"some robots are neither heard nor silent for {_loyalty(turn)} ms yet"
-        )
+        return _why_not_vacant(component, turn)
     if turn.config.by_majority:
         return _no_majority(component, turn)
     if component.flight is not None and component.flight.position is None:
         return f"the agent is taking a snapshot of {name}; try again"
     return ""
+
+
+def _why_not_vacant(component: Component, turn: Turn) -> str:
+    if component.primary and turn.alive(component.primary):
+        return f"{component.primary} lives and has it; ask there"
+    if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):
+        promised = f"{turn.me} has promised to wait for it, and its program may act until then"
+        return f"the agent of {component.primary} restarts; {promised}: ask again in {left_ns / (1_000 * MS):.0f} s"
+    return f"some robots are neither heard nor silent for {_loyalty(turn)} ms yet"
 
 
 def _stands_here(component: Component) -> bool:
@@ -212,10 +216,6 @@ def _loss(component: Component, turn: Turn) -> str:
         return f"{where} from checkpoint {position.sequence}, which {keeper} keeps and sends first; the work since then is lost"
     age = f", {(turn.now_ns - component.stored_ns) / (1_000 * MS):.1f} s old" if component.stored_ns >= 0 else ""
     return f"{where} from checkpoint {position.sequence}{age}; the work since then is lost"
-
-
-def _holder(component: Component, turn: Turn) -> str:
-    return component.primary if component.primary and turn.alive(component.primary) else ""
 
 
 def _loyalty(turn: Turn) -> int:

@@ -12,8 +12,8 @@ from hashlib import blake2b
 import msgspec
 
 from checkpoint.errors import UNDECODABLE
-from failover.core.types import EPOCH_MAX, PEERS_MAX
-from failover.core.wire.messages import Beat, Bulk, Entry
+from failover.core.types import EPOCH_MAX, GRACE_MS_MAX, PEERS_MAX
+from failover.core.wire.messages import RETURNED, Beat, Bulk, Entry, Promise
 from failover.core.wire.names import COMPONENT_SIZE_MAX, ROBOT_SIZE_MAX, text_size
 from failover.errors import FailoverError
 
@@ -62,7 +62,14 @@ def is_sound(beat: Beat) -> bool:
         and 0 <= beat.settled <= beat.counter > 0
         and beat.total >= 0
         and (not beat.entries or all(_sound_entry(entry) for entry in beat.entries))
+        and RETURNED <= beat.grace_ms <= GRACE_MS_MAX
+        and (not beat.promises or all(_sound_promise(promise) for promise in beat.promises))
     )
+
+
+def _sound_promise(promise: Promise) -> bool:
+    is_counted = 0 < promise.boot < NUMBER_MAX and 0 < promise.counter < NUMBER_MAX
+    return is_counted and text_size(promise.robot) <= ROBOT_SIZE_MAX and 0 < promise.ms <= GRACE_MS_MAX
 
 
 def _sound_entry(entry: Entry) -> bool:

@@ -28,6 +28,20 @@ class Echo(msgspec.Struct, frozen=True, array_like=True, gc=False):
     counter: int
 
 
+class Promise(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """The sender does not replace a robot whose agent restarts: its answer to ``Beat.grace_ms``, on its disk before it is said.
+
+    Attributes:
+        boot, counter: the newest beat of that robot that asked for it; the sender waits from when it heard that beat.
+        ms: for so long, and its margin.
+    """
+
+    robot: str
+    boot: int
+    counter: int
+    ms: int
+
+
 class Entry(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One component as the sender of the beat holds it.
 
@@ -106,6 +120,9 @@ class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):
         entries: those that fit; the others follow in the next beats, in turn. The changed ones go first.
         total: how many there are altogether.
         rule: the sender's, as its number in ``RULES``; 0 does not tell.
+        grace_ms: the sender's agent is about to restart and asks not to be replaced for so long; `RETURNED`, or 0 where nothing
+            is told.
+        promises: to the robots that asked.
     """
 
     sender: str
@@ -117,7 +134,12 @@ class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):
     echoes: tuple[Echo, ...] = ()
     entries: tuple[Entry, ...] = ()
     rule: int = 0
+    grace_ms: int = 0
+    promises: tuple[Promise, ...] = ()
 
+
+RETURNED = -1
+"""No guard of the sender has a lease that an earlier life of its agent arranged: promises to an earlier life are void."""
 
 RULES = ("", *Rule)
 """A rule's place in here is its number in a beat."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from agent.main_loop.outbox import NOTHING, Due, Outbox
 from checkpoint.model import Position
 from failover.core.acts import Acknowledge, Act, Ready, SetLease
-from failover.core.types import Record, VoteRecord
-from failover.core.wire.messages import Beat, Echo, Entry
+from failover.core.types import Awaited, Record, VoteRecord
+from failover.core.wire.messages import Beat, Echo, Entry, Promise
 
 BEAT_NS = 20_000_000
 ECHOES = (Echo("robot2", 1, 5), Echo("robot3", 1, 9))
@@ -88,6 +90,17 @@ def test_a_robot_whose_primacy_is_given_up_gets_no_echo_that_would_extend_its_le
     box.take(Ready(NEW), 1)
     (sent,) = box.take(Ready(send=(beat(2, 2),)), BEAT_NS).beats
     assert sent.echoes == (Echo("robot3", 1, 9),)
+
+
+def test_a_promise_that_is_not_on_the_disk_yet_is_not_told() -> None:
+    box, promise = outbox(), Promise("robot2", 3, 5, 20_000)
+    box.take(Ready(VoteRecord(OLD.records, (Awaited("robot2", 3, 20_000),))), 1)
+    promising = replace(beat(2, 2), promises=(promise,))
+    (sent,) = box.take(Ready(send=(promising,)), BEAT_NS).beats
+    assert sent.promises == ()
+    assert box.take(Ready(send=(replace(beat(3, 2), promises=(promise,)),)), BEAT_NS + 1).beats == ()
+    (told,) = box.kept(1, NEW, BEAT_NS + 2).beats
+    assert told.promises == (promise,)
 
 
 def test_an_early_beat_waits_for_the_disk_and_then_goes_whole() -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from failover.core.election.consent import STATES
 from failover.core.events import Received, Tick
 from failover.core.membership import LATE_BEATS, UNSTEADY_BEATS, Membership
 from failover.core.node import Node
-from failover.core.types import MS, Config, State, VoteRecord
-from failover.core.wire.messages import RULES, Beat, Echo, Entry
+from failover.core.types import MS, Awaited, Config, State, VoteRecord
+from failover.core.wire.messages import RETURNED, RULES, Beat, Echo, Entry, Promise
 
 PAIR = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100)
 LOYALTY_MS = PAIR.loyalty_ns // MS
@@ -161,3 +162,77 @@ def test_a_beat_that_waited_while_its_hearer_rested_was_not_late() -> None:
 
     assert patience_ms_after(60, 70, 80, 90) == LOYALTY_MS
     assert patience_ms_after(95) == 100 + 2 * 35
+
+
+# Promises to wait for an agent that restarts
+
+PATIENT = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100, restart_grace_ms=20_000)
+WAIT_MS = PATIENT.awaited_ns(20_000) // MS
+
+
+def asks(counter: int, grace_ms: int = 20_000, boot: int = 1) -> Beat:
+    return Beat("robot2", boot, counter, grace_ms=grace_ms)
+
+
+def test_a_robot_that_asks_is_waited_for_from_its_newest_request_and_is_neither_alive_nor_dead_meanwhile() -> None:
+    team = Membership(PATIENT, 1, 0)
+    team.hear(asks(1), "eth0", 10 * MS)
+    team.hear(asks(2), "eth0", 20 * MS)
+    assert WAIT_MS == 20_000 * LOYALTY_MS // 100, "longer than the grace as the loyalty is longer than the lease"
+    silent, over = (21 + LOYALTY_MS) * MS, (20 + WAIT_MS) * MS
+    assert not team.alive("robot2", silent) and not team.dead("robot2", over - 1) and not team.gone("robot2", over - 1)
+    assert team.dead("robot2", over)
+    assert [view.state for view in team.views(silent)] == ["restarting"]
+    assert team.next_death_ns(silent) == over
+    assert team.awaited(over - 1) == (Awaited("robot2", 1, 20_000),)
+    assert team.awaited(over) == ()
+    assert team.promises((Awaited("robot2", 1, 20_000),)) == (Promise("robot2", 1, 2, 20_000),)
+
+
+def test_no_robot_waits_longer_than_its_operator_allows_nor_for_one_with_another_rule() -> None:
+    short = Membership(replace(PATIENT, restart_grace_ms=1_000), 1, 0)
+    short.hear(asks(1), "eth0", 10 * MS)
+    assert short.awaited(11 * MS) == (Awaited("robot2", 1, 1_000),)
+    for config, beat_ in ((PAIR, asks(1)), (PATIENT, replace(asks(1), rule=RULES.index("majority")))):
+        team = Membership(config, 1, 0)
+        team.hear(beat_, "eth0", 10 * MS)
+        assert team.awaited(11 * MS) == ()
+
+
+def test_a_promise_outlives_a_restart_of_the_one_that_gave_it_a_shorter_request_and_the_membership() -> None:
+    team = Membership(PATIENT, 2, 0, (Awaited("robot2", 1, 20_000),))
+    assert not team.dead("robot2", (WAIT_MS - 1) * MS)
+    assert team.promises(team.awaited(MS)) == (), "the beat that asked is not known to this life"
+    team.hear(asks(9, 500), "eth0", 10 * MS)
+    assert team.awaited(11 * MS) == (Awaited("robot2", 1, 20_000),)
+    team.change(replace(PATIENT, peers=()), 20 * MS)
+    assert not team.dead("robot2", (10 + WAIT_MS) * MS - 1)
+
+
+def test_a_later_life_of_the_robot_gives_the_promise_back_and_the_same_life_does_not() -> None:
+    team = Membership(PATIENT, 1, 0)
+    team.hear(asks(1), "eth0", 10 * MS)
+    team.hear(asks(2, RETURNED), "eth0", 20 * MS)
+    assert team.awaited(21 * MS)
+    team.hear(asks(1, 0, boot=2), "eth0", 30 * MS)
+    assert team.awaited(31 * MS), "its guards still have the long lease, perhaps"
+    team.hear(asks(2, RETURNED, boot=2), "eth0", 40 * MS)
+    assert team.awaited(41 * MS) == ()
+    assert team.dead("robot2", (41 + LOYALTY_MS) * MS)
+
+
+def test_a_promise_lets_act_from_when_the_beat_left_that_asked_and_one_to_an_earlier_life_does_not() -> None:
+    team = Membership(PATIENT, 3, 0)
+    team.asked(7, 100 * MS)
+    team.hear(Beat("robot2", 1, 1, promises=(Promise("robot1", 2, 7, 20_000), Promise("robot3", 3, 7, 20_000))), "eth0", 150 * MS)
+    assert team.lease_ns("robot2") == 0
+    team.hear(Beat("robot2", 1, 2, promises=(Promise("robot1", 3, 7, 20_000),)), "eth0", 160 * MS)
+    assert team.lease_ns("robot2") == 20_100 * MS
+
+
+def test_a_stall_of_our_own_is_not_counted_as_silence_of_a_robot_that_is_waited_for() -> None:
+    team = Membership(PATIENT, 1, 0)
+    team.hear(asks(1), "eth0", 10 * MS)
+    team.forgive(WAIT_MS * MS, (10 + WAIT_MS) * MS)
+    assert not team.dead("robot2", (9 + 2 * WAIT_MS) * MS)
+    assert team.dead("robot2", (10 + 2 * WAIT_MS) * MS)
