@@ -244,6 +244,12 @@ class Membership:
         peer.awaited_until_ns = max(peer.awaited_until_ns, now_ns + self._config.awaited_ns(grace_ms))
         self._awaits = True
 
+    def promise_unasked(self, robot: str, now_ns: int) -> None:
+        """This agent is about to restart, and a peer acts on its word: that one may go on until the next is there."""
+        peer = self.peers[robot]
+        self._await(peer, self._config.restart_grace_ms, now_ns)
+        peer.awaited = (peer.boot, peer.counter)
+
     def _take_promises(self, peer: Peer, beat: Beat) -> None:
         """The promise counts from when our beat left that asked for it."""
         for promise in beat.promises:

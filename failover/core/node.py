@@ -83,7 +83,7 @@ REST_NS = MS
 """Between two deadlines: the core looks again at work that waits for another process, after a pause."""
 
 LEAVE_NS = 2_000 * MS
-"""An agent that restarts waits no longer for the promises of its peers: without them it ends all the same, and is replaced."""
+"""An agent that restarts waits no longer for its peers' promises: without them it ends all the same, and is replaced."""
 
 LIVES_MAX = 1 << 40
 """A peer that speaks of so many lives of this robot is not believed."""
@@ -122,7 +122,8 @@ class Node:
         self._components = {record.name: Component.remembered(record) for record in vote_record.records}
         self._found = {one.component: one for one in found}
         self._begun = False
-        self._leaving_ns = self._strays_ns = 0
+        self._leaving_ns = self._asked_grace_ns = self._strays_ns = 0
+        self._dependents: dict[str, int] = {}
         self._load = 0
         self._waiting: Beat | None = None
         self._promise = ""
@@ -144,6 +145,8 @@ class Node:
         begins = not self._begun
         if begins:
             self._begin(turn)
+        if self._leaving_ns:
+            self._wait_for_those_that_restart(turn)
         touched = self._take(event, turn)
         if isinstance(event, TeamChanged):
             _say_who_belongs(turn, before)
@@ -187,7 +190,10 @@ class Node:
 
         It ends only after all orders so far were carried out, those of the worker included: the guards know their leases then.
         """
-        return self._leaving_ns > 0 and (now_ns >= self._leaving_ns or not self.exposed(now_ns))
+        told = all(
+            robot not in self._team.peers or self._team.peers[robot].heard_us >= at for robot, at in self._dependents.items()
+        )
+        return self._leaving_ns > 0 and (now_ns >= self._leaving_ns or (told and not self.exposed(now_ns)))
 
     def exposed(self, now_ns: int) -> tuple[str, ...]:
         """The components here that stand still soon after this agent ends, and are taken over, unless it is back at once."""
@@ -312,15 +318,32 @@ class Node:
         return [component]
 
     def _leave(self, turn: Turn) -> None:
-        """Ask the peers to wait, if there is something that they could take over, and it is to be waited for."""
+        """Ask the peers to wait; for their promises wait only where there is something that they could take over."""
         if self._leaving_ns:
             return
         grace_ms = turn.config.restart_grace_ms
-        is_asked = grace_ms > 0 and bool(self.exposed(turn.now_ns))
-        self._leaving_ns = turn.now_ns + (LEAVE_NS if is_asked else 0)
+        self._asked_grace_ns = turn.now_ns
+        self._dependents = self._depend_on_us(turn) if grace_ms else {}
+        for robot in self._dependents:
+            self._team.promise_unasked(robot, turn.now_ns)
+        needs_time = grace_ms and (self._dependents or self.exposed(turn.now_ns))
+        self._leaving_ns = turn.now_ns + (LEAVE_NS if needs_time else 0)
         turn.leaving, self._next_beat_ns = True, turn.now_ns
-        asks = f"it asks its peers to wait {grace_ms / 1_000:g} s for the next one" if is_asked else "it asks no peer to wait"
-        turn.say_of_robot(f"the agent of {turn.me} is about to restart: {asks}")
+        how = f"it asks its peers to wait {grace_ms / 1_000:g} s for the next one" if grace_ms else "no robot is asked to wait"
+        turn.say_of_robot(f"the agent of {turn.me} is about to restart: {how}")
+
+    def _depend_on_us(self, turn: Turn) -> dict[str, int]:
+        """Primaries whose lease ends without our echoes, and the beat of ours that each must have heard before we go."""
+        living = {peer.robot for peer in turn.team.living(turn.now_ns)}
+        is_needed = turn.config.by_majority and len(living) < turn.config.quorum
+        held = (one for one in self._components.values() if one.primary in living and (is_needed or one.freezes))
+        return {component.primary: turn.next_counter for component in held}
+
+    def _wait_for_those_that_restart(self, turn: Turn) -> None:
+        """Where all agents of a team are upgraded at once: one whose peer has just gone leaves after that one is back."""
+        limit_ns = self._asked_grace_ns + turn.config.restart_grace_ms * MS
+        if turn.now_ns < limit_ns and any(turn.team.awaited_ns(robot, turn.now_ns) for robot in turn.team.peers):
+            self._leaving_ns = max(self._leaving_ns, turn.now_ns + LEAVE_NS)
 
     def _note(self, event: Noticed, turn: Turn) -> None:
         component = self._components.get(event.component)

@@ -533,6 +533,16 @@ def breaks_its_promise() -> Any:
     return patch.object(Membership, "dead", dead)
 
 
+def leaves_while_its_peer_is_away() -> Any:
+    """An agent that restarts does not wait for a peer whose agent restarts, too."""
+    return patch.object(node.Node, "_wait_for_those_that_restart", lambda *_: None)
+
+
+def leaves_without_a_word() -> Any:
+    """An agent that restarts promises nothing to a primary that acts on its echoes."""
+    return patch.object(node.Node, "_depend_on_us", lambda *_: {})
+
+
 def freezes_what_ran_on() -> Any:
     """An agent that is back holds its programs still until it is heard, though they have a lease."""
     return patch.object(lease, "inherit", lambda *_: False)
@@ -594,6 +604,8 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (breaks_its_promise, "an_agent_that_does_not_come_back_is_replaced_after_the_grace"),
     (forgets_its_promise, "peers_that_restart_keep_their_promise"),
     (promise_of_a_minority, "a_promise_of_a_minority_lets_nothing_act"),
+    (leaves_while_its_peer_is_away, "two_agents_restart_one_after_the_other"),
+    (leaves_without_a_word, "the_peer_of_a_program_that_chose_safety_restarts"),
     (freezes_what_ran_on, "an_agent_restarts_as_announced_and_nothing_moves"),
     (waits_though_it_is_back, "a_robot_that_is_lost_soon_after_its_restart_is_replaced_at_once"),
     (back_too_soon, "an_agent_that_is_back_and_not_heard_by_all_is_waited_for"),

@@ -110,8 +110,7 @@ def calm(seed: int) -> World:
     epoch = seen_at(world, where, spec.name).epoch
     for _ in range(CALM_RESTARTS):
         world.run(world.now_ns + random.randrange(300) * MS)
-        needs_its_peer = not votes and alone is WhenAlone.FREEZE  # the primary stands still while its only peer is away
-        world.restart(where if needs_its_peer else random.choice(list(world.robots)), random.choice(AWAY_MS) * MS)
+        world.restart(random.choice(list(world.robots)), random.choice(AWAY_MS) * MS)
         world.run(world.now_ns + max(AWAY_MS) * MS + GAP_NS)
         if seen_at(world, where, spec.name).epoch != epoch:
             raise Broken("the epoch has changed:\n" + "\n".join(world.log[-40:]))

@@ -9,6 +9,7 @@ from msgspec import Struct, field
 
 from failover.core.component import Turn
 from failover.core.events import Event, Received
+from failover.core.membership import Peer
 from failover.core.types import MS
 
 COUNTS_AS_DEAD = "it counts as dead"
@@ -29,7 +30,7 @@ class Watch(Struct):
     _late_at_ns: int = 0
     _stalled_ns: int = 0
     _dead: set[str] = field(default_factory=set)
-    _awaited: dict[str, int] = field(default_factory=dict)
+    _awaited: set[str] = field(default_factory=set)
 
     def late(self, late_ns: int, loyalty_ns: int, now_ns: int) -> None:
         """A step came ``late_ns`` after the instant that was asked for (below 0: before it)."""
@@ -44,22 +45,26 @@ class Watch(Struct):
             turn.say_of_robot(f"{turn.me} itself stood still for {late_ms} ms; that is not counted as its peers' silence")
         now_ns, dead = turn.now_ns, self._dead
         for robot, peer in turn.team.peers.items():
-            if peer.loyal_until_ns > now_ns or robot in dead:
-                continue
-            if not turn.dead(robot):
-                self._tell_awaited(turn, robot)
+            if peer.awaited_until_ns or self._awaited:
+                self._follow_restart(turn, peer)
+            if peer.loyal_until_ns > now_ns or robot in dead or not turn.dead(robot):
                 continue
             dead.add(robot)
             turn.say_of_robot(_farewell(turn, robot))
         if isinstance(event, Received) and event.beat.sender in turn.team.peers:
             self._greet(turn, event)
 
-    def _tell_awaited(self, turn: Turn, robot: str) -> None:
-        peer = turn.team.peers[robot]
-        if self._awaited.get(robot) != peer.boot:
-            self._awaited[robot] = peer.boot
-            left_s = turn.team.awaited_ns(robot, turn.now_ns) / (1_000 * MS)
-            turn.say_of_robot(f"the agent of {robot} restarts, as it announced: {turn.me} waits for it for {left_s:.1f} s")
+    def _follow_restart(self, turn: Turn, peer: Peer) -> None:
+        robot, left_ns = peer.robot, peer.awaited_until_ns - turn.now_ns
+        if left_ns > 0 and robot not in self._awaited:
+            self._awaited.add(robot)
+            turn.say_of_robot(
+                f"the agent of {robot} is to restart: {turn.me} promises to wait {left_ns / (1_000 * MS):.1f} s for it"
+            )
+        elif left_ns <= 0 and robot in self._awaited:
+            self._awaited.discard(robot)
+            if turn.alive(robot):
+                turn.say_of_robot(f"the agent of {robot} is back: {turn.me} waits for it no longer than ever")
 
     def _greet(self, turn: Turn, event: Received) -> None:
         beat = event.beat
