@@ -24,13 +24,22 @@ from failover.config import strict_toml
 from failover.config import team as team_directory
 from failover.config.quantities import size_bytes, span_ms
 from failover.config.team import Robot, Team
-from failover.core.types import BEAT_MS_MAX, BEATS_IN_LEASE_MIN, COMPONENTS_MAX, CPU_SHARES, PERIOD_MS_MAX, is_cpu_share
+from failover.core.types import (
+    BEAT_MS_MAX,
+    BEATS_IN_LEASE_MIN,
+    COMPONENTS_MAX,
+    CPU_SHARES,
+    GRACE_MS_MAX,
+    PERIOD_MS_MAX,
+    is_cpu_share,
+)
 from failover.core.wire.names import check_component
 from failover.errors import FailoverError, NameFormatError
 
 PATIENCE_S_MAX: Final = 86_400
 """A day. An operator who would wait longer can promote instead."""
 
+GRACE_S_MAX: Final = GRACE_MS_MAX // 1_000
 KEEP_MAX: Final = 10_000
 """Files of one component; each is asked for its age when the agent starts."""
 
@@ -186,6 +195,8 @@ class Config:
         lease_ms: how long a primary acts without being heard, and how long a standby stays loyal to a silent one.
         patience_s: under the majority rule: how long the robots that hold the newest checkpoint are waited for.
         boot_patience_s: under the pair rule: how long a robot that starts waits for the robots that may run a component.
+        restart_grace_s: how long the peers are asked to wait for this agent when it restarts, and the most that it waits for
+            theirs; 0: neither.
         rule: how the team decides to replace a silent robot: pair, majority, or auto: a majority wherever more than two belong.
         when_alone: under the pair rule: while this robot hears no other one, components started here run on, or are held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
@@ -220,6 +231,7 @@ class Config:
     when_alone: Literal["run", "freeze"] = "run"
     patience_s: int = 30
     boot_patience_s: int = 60
+    restart_grace_s: int = 20
     snapshot_period_ms: int = 100
     cpu_share: float = 0
     realtime: bool = True
@@ -272,6 +284,8 @@ class Config:
             raise ValueError(f"patience_s is {self.patience_s}; it must be at least 1 and at most {PATIENCE_S_MAX}")
         if not 0 <= self.boot_patience_s <= PATIENCE_S_MAX:
             raise ValueError(f"boot_patience_s is {self.boot_patience_s}; it must be at least 0 and at most {PATIENCE_S_MAX}")
+        if not 0 <= self.restart_grace_s <= GRACE_S_MAX:
+            raise ValueError(f"restart_grace_s is {self.restart_grace_s}; it must be at least 0 and at most {GRACE_S_MAX}")
         if not 1 <= self.components_per_user <= COMPONENTS_MAX:
             raise ValueError(
                 f"components_per_user is {self.components_per_user}; it must be at least 1 and at most {COMPONENTS_MAX}"

@@ -51,6 +51,7 @@ def team_config(settings: Settings) -> types.Config:
         patience_ms=config.patience_s * 1_000,
         boot_patience_ms=config.boot_patience_s * 1_000,
         seat=settings.me.seat,
+        restart_grace_ms=_grace_ms(config),
     )
 
 
@@ -98,6 +99,12 @@ def retention(config: Config) -> Retention:
     """How much the store keeps for people."""
     size_max = size_bytes(config.keep_size) if config.keep_size else 0
     return Retention(config.keep_checkpoints, span_ms(config.keep_for) // 1_000, size_max)
+
+
+def _grace_ms(config: Config) -> int:
+    """None where it would be shorter than the lease, which a restart has anyway."""
+    grace_ms = config.restart_grace_s * 1_000
+    return grace_ms if grace_ms >= config.lease_ms else 0
 
 
 def _rule(settings: Settings) -> Rule:

@@ -25,7 +25,8 @@ INSECURE: Final = "INSECURE: running without keys: every machine on the network 
 
 DESCRIPTION: Final = """
 Protect the programs of this robot and of its neighbours. Runs in the foreground, logs to standard error, ends on SIGTERM;
-components run on, and the next agent finds them again. The command `failover` gives it orders.
+components run on, and the next agent finds them again. Where systemd restarts it, or on SIGUSR1, the other robots are asked to
+wait for the next one (restart_grace_s), and move nothing. The command `failover` gives it orders.
 
   failover-agent --config /etc/failover/agent.toml           run
   failover-agent check --config /etc/failover/agent.toml     read configuration, team file and key, and say what is wrong

@@ -30,10 +30,12 @@ from agent.main_loop.media import Link, Media
 from agent.main_loop.messages import (
     Alive,
     BeatCounts,
+    Ends,
     Farewell,
     Happened,
     HearKey,
     Inventory,
+    IsRestart,
     Life,
     LinkNow,
     LinksAre,
@@ -53,7 +55,7 @@ from checkpoint.keeper.messages import ChannelClosedError, ChannelError
 from failover.config.team import Robot
 from failover.core import vote_record as core_vote_record
 from failover.core.acts import Act
-from failover.core.events import Event, Received, TeamChanged, Tick
+from failover.core.events import Event, Leave, Received, TeamChanged, Tick
 from failover.core.frames.frame import Part, Portion, Reason, Refused
 from failover.core.frames.lane import FrameLane
 from failover.core.frames.lanes import FrameLanes, medium_of
@@ -71,6 +73,21 @@ SLEEP_LIMIT_S: Final = 0.5
 
 PERSIST_PATIENCE_S: Final = 2.0
 """How long an orderly end waits for the disk."""
+
+ASK_NS: Final = 3 * NANOSECONDS_A_SECOND
+"""How long an end waits for the worker to find out whether it is a restart."""
+
+LEAVE_NS: Final = 5 * NANOSECONDS_A_SECOND
+"""How long a restart waits, beyond the grace, for what the core still waits for, and for this robot's own disk."""
+
+COMES_BACK: Final = signal.SIGUSR1
+"""Told by this, the agent announces that another one starts at once, as it does when systemd restarts it; then it ends."""
+
+STOP_S: Final = 15
+"""How long systemd waits for the next word of an agent that waits for its peers before it restarts."""
+
+SIGNALS_MAX: Final = 64
+"""Read at once; more of them say nothing new."""
 
 GAP_BEATS: Final = 3
 """Periods of silence that count as a gap: one lost beat is none, and a lease is longer."""
@@ -94,6 +111,11 @@ WORKER_TRIES: Final = 5
 """Workers that may die before their first word; then something is wrong that no restart cures."""
 
 STARTED: Final = "protecting this robot and its neighbours"
+
+NOT_AWAITED: Final = (
+    "%s: the other robots have not promised to wait for the next agent: it stands still when its lease is over, and is taken "
+    "over as after a loss"
+)
 
 UNLIKE: Final = (
     "{} has another team.toml: its heartbeats are read, and items of its board are not; copy the same file to both, and start "
@@ -145,7 +167,8 @@ class MainLoop:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = self._rests = False
+        self._ending = self._rests = self._leaves = False
+        self._ends_ns = 0
         self._listens = True
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
@@ -170,7 +193,7 @@ class MainLoop:
         return lambda medium: FrameLane(self._me, settings.team.team, members, boot, round_us, medium, bounds_ways=has_board)
 
     def run(self) -> int:
-        """Beat until SIGTERM or SIGINT. Components live on.
+        """Beat until SIGTERM, SIGINT or `COMES_BACK`. Components live on; where another agent starts at once, they also act on.
 
         Returns:
             0; or the life of this robot that the team remembers and its vote record does not: another one above it must begin.
@@ -186,6 +209,8 @@ class MainLoop:
             now_ns = clock.now_ns()
             if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
                 self._notifier.alive()
+                if self._leaves:
+                    self._notifier.needs(STOP_S)
                 fed_ns = now_ns
         if not self._remembered:
             self._notifier.stopping()
@@ -193,12 +218,12 @@ class MainLoop:
         return self._remembered
 
     def _begin(self) -> None:
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in (signal.SIGTERM, signal.SIGINT, COMES_BACK):
             signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
         self._attend(self._beats.fileno(), self._hear)
         self._attend(self._persister.fileno(), self._note_persisted)
-        self._attend(self._wake.fileno(), self._end_soon)
+        self._attend(self._wake.fileno(), self._heed_signals)
         self._poll.register(self._alarm.fileno(), select.EPOLLIN)
         gc.collect()
         syscalls.give_back()  # before memory is locked: then it would stay
@@ -217,8 +242,35 @@ class MainLoop:
         self._poll.unregister(descriptor)
         del self._inputs[descriptor]
 
-    def _end_soon(self) -> None:
-        self._ending = True
+    def _heed_signals(self) -> None:
+        """End; where another agent starts at once, after the peers have promised to wait. A second signal ends it as it is."""
+        numbers = self._wake.recv(SIGNALS_MAX)
+        if self._ends_ns or self._node is None or signal.SIGINT in numbers:
+            self._ending = True
+        elif signal.SIGTERM in numbers:
+            self._ends_ns = clock.now_ns() + ASK_NS
+            self._worker.send(IsRestart())
+        else:
+            self._leave()
+
+    def _leave(self) -> None:
+        """Announce the restart, until `_may_end`."""
+        grace_ns = self._settings.config.restart_grace_s * NANOSECONDS_A_SECOND
+        self._leaves, self._ends_ns = True, clock.now_ns() + grace_ns + LEAVE_NS
+        self._step(Leave())
+
+    def _may_end(self) -> bool:
+        """Whether an end that was asked for need not wait any more."""
+        if not self._ends_ns or self._node is None:
+            return False
+        now_ns = clock.now_ns()
+        is_over = now_ns >= self._ends_ns
+        if self._leaves and (is_over or (self._node.may_go(now_ns) and not self._outbox.waiting)):
+            exposed = self._node.exposed(now_ns)
+            if exposed:
+                log.warning(NOT_AWAITED, ", ".join(exposed))
+            return True
+        return is_over
 
     def _open_board(self) -> None:
         """Map the board that the worker has made; a robot without its board still protects its programs."""
@@ -274,6 +326,8 @@ class MainLoop:
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
                 self._step(Tick())
+        if self._ends_ns:
+            self._ending = self._ending or self._may_end()
 
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
@@ -456,6 +510,10 @@ class MainLoop:
                 self._media.take(links, clock.now_ns())
             case TeamIs(robots):
                 self._take_team(robots)
+            case Ends(is_restart):
+                if is_restart and not self._leaves:
+                    self._leave()
+                self._ending = self._ending or not self._leaves
             case Alive():
                 pass
             case _:
@@ -642,7 +700,7 @@ class MainLoop:
         self._alarm.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)
-        log.info("robot %s ends; its components live on", self._me)
+        log.info("robot %s %s; its components live on", self._me, "restarts" if self._leaves else "ends")
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:

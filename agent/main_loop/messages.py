@@ -49,7 +49,9 @@ ACTS: Final[dict[str, Any]] = {
     )
 }
 EVENTS: Final[dict[str, Any]] = {
-    kind.__name__: kind for kind in get_args(events.Event) if kind not in (events.Tick, events.Received, events.TeamChanged)
+    kind.__name__: kind
+    for kind in get_args(events.Event)
+    if kind not in (events.Tick, events.Received, events.TeamChanged, events.Leave)
 }
 
 _encoder = msgspec.msgpack.Encoder()
@@ -197,12 +199,22 @@ class Told(msgspec.Struct, frozen=True, tag=True):
     media: tuple[MediumView, ...] = ()
 
 
+class IsRestart(msgspec.Struct, frozen=True, tag=True):
+    """Main loop to worker: the service is told to end; does systemd start it again at once? Answer: `Ends`."""
+
+
+class Ends(msgspec.Struct, frozen=True, tag=True):
+    """Worker to main loop: the answer to `IsRestart`."""
+
+    is_restart: bool
+
+
 class Farewell(msgspec.Struct, frozen=True, tag=True):
     """Main loop to worker: the agent ends; components live on."""
 
 
-ToWorker = Order | Life | Told | Farewell
-ToMainLoop = Happened | Inventory | SpeakKey | HearKey | LinksAre | TeamIs | Alive | Ask
+ToWorker = Order | Life | Told | IsRestart | Farewell
+ToMainLoop = Happened | Inventory | SpeakKey | HearKey | LinksAre | TeamIs | Alive | Ask | Ends
 
 
 def order(act: Act) -> Order:

@@ -32,6 +32,10 @@ class Notifier:
         """Feed the watchdog; called by the loop itself and by nothing else."""
         self.tell("WATCHDOG=1")
 
+    def needs(self, seconds: int) -> None:
+        """An end may take so many seconds more from now, whatever the unit allows. Source: sd_notify(3), EXTEND_TIMEOUT_USEC."""
+        self.tell(f"EXTEND_TIMEOUT_USEC={seconds * 1_000_000}")
+
     def stopping(self) -> None:
         """An orderly end has begun."""
         self.tell("STOPPING=1")

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from pathlib import Path
 from typing import Final, Literal
 
@@ -24,6 +25,9 @@ STARTED: Final = "SYSTEMD_EXEC_PID"
 
 STOP_S: Final = 5
 """How long a shutdown waits for a component to obey SIGTERM; one that is frozen never does, and the default is 90 s."""
+
+ASK_S: Final = 1.5
+"""How long systemd may take to answer a question; it has more to do just then."""
 
 Kind = Literal["guard", "keeper", "hook", "directory"]
 
@@ -60,12 +64,28 @@ def in_a_unit(program: str, kind: Kind, name: str) -> list[str]:
     Args:
         program: what `starter` found.
     """
-    service = own_service(Path("/proc/self/cgroup").read_text(encoding="utf-8", errors="surrogateescape"))
+    service = own_service(_own_cgroups())
     order = (f"Before={service}",) if service else ()
     properties = [f"--property={one}" for one in (*PROPERTIES[kind], *order)]
     unit = f"--unit=failover-{kind}-{name}"
     begun = "oneshot" if kind == "hook" else "exec"  # systemd-run waits until that has come about: the end of a hook
     return [program, "--quiet", "--collect", f"--service-type={begun}", unit, f"--slice={SLICE}", *properties, "--"]
+
+
+def is_restarted() -> bool:
+    """Whether systemd ends this process's service in order to start it again: it is carrying out such a job.
+
+    A stop, a shutdown, and a signal that came from elsewhere are none. Source: systemctl(1), ``list-jobs``.
+    """
+    systemctl, unit = shutil.which("systemctl"), own_service(_own_cgroups())
+    if not starter() or systemctl is None or not unit:
+        return False
+    asked = [systemctl, "list-jobs", "--no-legend", "--no-pager", "--plain", "--full", unit]
+    try:
+        found = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=ASK_S, stdin=subprocess.DEVNULL)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return any(line.split()[1:3] == [unit, "restart"] for line in found.stdout.splitlines())
 
 
 def own_service(cgroups: str) -> str:
@@ -74,5 +94,10 @@ def own_service(cgroups: str) -> str:
         controllers, path = line.split(":", 2)[1:]
         if controllers in ("", "name=systemd"):
             units = [part for part in path.split("/") if part.endswith(".service")]
-            return units[-1] if units else ""
+            if units:  # else systemd does not use this hierarchy, or the process is in none of its services
+                return units[-1]
     return ""
+
+
+def _own_cgroups() -> str:
+    return Path("/proc/self/cgroup").read_text(encoding="utf-8", errors="surrogateescape")

@@ -26,8 +26,10 @@ from agent.main_loop import messages
 from agent.main_loop.messages import (
     Alive,
     Ask,
+    Ends,
     Farewell,
     HearKey,
+    IsRestart,
     Life,
     LinkNow,
     LinksAre,
@@ -40,7 +42,7 @@ from agent.main_loop.messages import (
 from agent.system import syscalls
 from agent.system.crash import end_worker_on_mistake
 from agent.system.log_setup import set_up_log
-from agent.system.systemd_units import starter
+from agent.system.systemd_units import is_restarted, starter
 from agent.worker.control.queries import QUESTIONS, Questions
 from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import ControlServer
@@ -299,8 +301,14 @@ class Switchboard:
             case Life():
                 if not self._begun.done():
                     self._begun.set_result(message)
+            case IsRestart():
+                self._looking = asyncio.create_task(self._look_whether_it_restarts())
+                self._looking.add_done_callback(end_worker_on_mistake)
             case Farewell():
                 self._end.set()
+
+    async def _look_whether_it_restarts(self) -> None:
+        self._say(Ends(await asyncio.to_thread(is_restarted)))
 
     def answered(self, act: acts.Answer) -> None:
         """The core has decided about a command."""

@@ -276,7 +276,8 @@ class Worker(Switchboard):
             component.keeper.names = self._names_of_brought(component.name)
             self.supervisor(component.name).adopt(component, epoch)
             running = standing.state in ("running", "frozen")
-            found.append(Found(component.name, epoch, running, standing.exit_status or 0))
+            lease_ns = standing.lease_until_ns if standing.state == "running" else 0
+            found.append(Found(component.name, epoch, running, standing.exit_status or 0, lease_ns))
             log.info("%s: found again, pid %d, %s", component.name, component.pid, standing.state)
         return tuple(found)
 

@@ -13,7 +13,7 @@ import pytest
 from tests.e2e import machines, robots
 from tests.e2e.machines import Machine
 from tests.e2e.service import SERVICE, component, make_team, started, status, two_robots
-from tests.e2e.test_systemd_power import expect_it_to_go_on_at, protected
+from tests.e2e.test_systemd_power import expect_it_to_go_on_at, expect_nothing_to_move, protected
 
 PACKAGE: Final = os.environ.get("FAILOVER_TEST_PACKAGE", "")
 SYSTEM: Final = os.environ.get("FAILOVER_TEST_DEBIAN", "")
@@ -74,6 +74,12 @@ def test_two_clean_machines_protect_a_program_by_the_package(tmp_path: Path) -> 
         protected(first, "cut")
         first.end()
         expect_it_to_go_on_at(second, "cut")
+
+
+def test_the_package_is_replaced_under_a_program_of_a_pair_and_nothing_moves(tmp_path: Path) -> None:
+    with two_robots(tmp_path, install, Path(SYSTEM)) as (first, second):
+        protected(first, "stays")
+        expect_nothing_to_move(first, second, "stays", "dpkg", "--install", "/root/failover.deb")
 
 
 def test_the_package_brings_a_command_pages_headers_and_completions(machine: Machine) -> None:

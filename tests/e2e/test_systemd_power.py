@@ -68,3 +68,29 @@ def test_a_machine_that_is_shut_down_in_order_is_replaced_by_the_other(pair: tup
     first.process.wait(machines.PATIENCE_S)
     expect_it_to_go_on_at(second, "shut")
     expect_it_to_go_on_at(second, "polite")
+
+
+def expect_nothing_to_move(first: Machine, second: Machine, name: str, *command: str) -> None:
+    """A command there has the agent restart: the program acts on as the same process under the same epoch, without a gap."""
+    seen, agent = component(first, name), first.property(SERVICE, "MainPID")
+    first.run(*command)
+    robots.until(lambda: first.property(SERVICE, "MainPID") not in (agent, "0"), "the next agent")
+    robots.until(lambda: component(first, name).get("protection") == "protected", "it to be protected again")
+    before = len(counted(first, name))
+    robots.until(lambda: len(counted(first, name)) > before + MORE, "the count to go on")
+    numbers, found = counted(first, name), component(first, name)
+    assert numbers == list(range(len(numbers)))
+    assert [found[key] for key in ("pid", "epoch", "primary", "restores")] == [
+        seen[key] for key in ("pid", "epoch", "primary", "restores")
+    ]
+    assert component(second, name)["role"] == "standby"
+    told = " ".join(first.run("failover", "why", name).stdout.split())
+    assert "the agent of robot1 is back; it has run on" in told and "freezes it" not in told, told
+
+
+def test_a_restart_of_the_service_moves_nothing_and_a_stop_is_a_loss(pair: tuple[Machine, Machine]) -> None:
+    first, second = pair
+    protected(first, "stays")
+    expect_nothing_to_move(first, second, "stays", "systemctl", "restart", SERVICE)
+    first.run("systemctl", "stop", SERVICE)
+    expect_it_to_go_on_at(second, "stays")

@@ -44,6 +44,9 @@ from failover.core.types import ComponentSpec, Resumption
 KILLED: Final = 9
 """The wait status of a program whose guard was lost: as of one that was killed."""
 
+LAST_WORD_S: Final = 1.0
+"""How long the end of the worker waits for a guard that is being told of a lease."""
+
 log = logging.getLogger("failover.component")
 
 
@@ -74,6 +77,8 @@ class Supervisor:
     _queue: asyncio.Queue[Act | asyncio.Future[None]] = field(default_factory=asyncio.Queue)
     """A future is done once everything before it has been carried out, or was in vain."""
     _tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    _at_guard: set[asyncio.Task[None]] = field(default_factory=set)
+    """Those of them that tell the guard of a lease, or have it hold the program still."""
     _cleared: asyncio.Event = field(default_factory=asyncio.Event)
     """Not while a copy is being ended that is none of ours any more."""
     _coming: Component | None = None
@@ -106,7 +111,9 @@ class Supervisor:
         if isinstance(act, acts.Restore):
             self.around.order.begins(self.name)
         if isinstance(act, acts.SetLease | acts.Freeze):
-            self._task(self._at_once(act))
+            telling = self._task(self._at_once(act))
+            self._at_guard.add(telling)
+            telling.add_done_callback(self._at_guard.discard)
         elif isinstance(act, acts.Warm):
             self._warm(act)
         elif isinstance(act, acts.Cool):
@@ -171,7 +178,9 @@ class Supervisor:
             raise AgentError(f"cannot let {self.name} go: {trouble}") from trouble
 
     async def close(self) -> None:
-        """Let everything go; the program runs on."""
+        """Let everything go; the program runs on, and its guard has been told of the last lease."""
+        if self._at_guard:
+            await asyncio.wait(self._at_guard, timeout=LAST_WORD_S)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -306,6 +315,8 @@ class Supervisor:
                 self._notice(f"it stands still here, as process {component.pid}", component)
                 return
             await component.lease(act.until_ns)
+            if act.is_asked:
+                self.around.tell(events.Leased(self.name, act.epoch, act.until_ns))
             if self._is_thaw_owed:
                 await self._thaw_under_its_lease(component)
         except TROUBLE as trouble:
