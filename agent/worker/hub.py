@@ -243,7 +243,7 @@ class Switchboard:
         finally:
             self._questions.pop(number, None)
 
-    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer:
+    async def command(self, make: Callable[[int], events.Command | events.Drain]) -> acts.Answer:
         """Have the core decide; its answer."""
         number = next(self._numbers)
         answer: asyncio.Future[acts.Answer] = asyncio.get_running_loop().create_future()

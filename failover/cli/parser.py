@@ -328,6 +328,33 @@ VERBS: Final = (
         "failover.cli.verbs.components:prefer",
     ),
     Verb(
+        "drain",
+        "before maintenance: move everything away from a robot, and let nothing new run there",
+        """
+        What the robot runs moves to its standbys, one planned move after the other: nothing is lost. Nothing new is started
+        there, also after a restart of its agent or of the robot, until failover undrain. The robot goes on to vote and to keep
+        checkpoints; it takes a component over only where no other robot could. This command waits until each component runs
+        elsewhere, and says what cannot move, and why. Give this order at any robot, as root.
+
+          failover drain robot1
+          failover drain robot1 --timeout 0      # do not wait
+        """,
+        "failover.cli.arguments.components:drain",
+        "failover.cli.verbs.drain:drain",
+    ),
+    Verb(
+        "undrain",
+        "after maintenance: let a robot run components again",
+        """
+        Components come back to it by the rules: those that prefer it (failover prefer), by failover failback, and whatever is
+        started there. Give this order at any robot, as root.
+
+          failover undrain robot1
+        """,
+        "failover.cli.arguments.components:undrain",
+        "failover.cli.verbs.drain:undrain",
+    ),
+    Verb(
         "lost",
         "where two copies of a component ran: the state of the one that lost",
         """

@@ -34,6 +34,7 @@ verb           arguments                                                result, 
 ``handover``   ``name`` *must*, ``to`` ""                               ``{name, to, epoch, took_ms, moved, sentence}``
 ``failback``   ``name`` *must*, ``to`` "": the target expected          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
+``drain``      ``robot`` *must*, ``on`` true                            ``{robot, drained, sentence}``; for root
 ``team``       ``act`` *must*: add or remove, ``robot`` *must*,         ``{team, robots, change, waiting}``: members that take it
                ``member``: {beats, bulk, role, public_key}              when they are back; for root
 ``promote``    ``name`` *must*, ``robot`` = newest checkpoint's,         ``{name, to, epoch, promoted, sentence, risks}``; unless
@@ -64,6 +65,7 @@ STATUS: Final = """
 robot, team, role, pid, lanes_pid, version: of this agent; life: count of its starts
 insecure: links are neither authenticated nor encrypted
 realtime: the main loop runs at real-time priority with its memory locked
+drained: an operator has drained this robot
 rule, promise: the rule by which the team decides, and one sentence: what holds if this robot dies now
 fencing: one sentence: what freezes a program that may not act, and what this robot does not have for the worst case
 rights: one sentence: by which rules and whose groups rights are decided here, and what is wrong; "" without rights.toml
@@ -86,9 +88,10 @@ media: [{link, cast, because, by_unicast, period_ms, no_slots, slots}]: how fram
         deaf, peers: [{robot, seen, missed, delay_us, transit_us}]}: see `failover.core.frames.terms.SlotsView`; None: no slots
         own: listening | running | silent, why; count: K, robots that share the round; place: this robot's among them, from 0
         reference: the robot whose frames give the phase; deaf: [[listener, speaker], …]; seen: not | insert | run | remove
-peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, doubted, notes}]
+peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, doubted, drained, notes}]
     role: robot | server | witness; state: unknown | live | suspect | restarting | dead; links: ours, by which it was heard lately
     lane: connected | connecting | refused | down
+    drained: it is to run nothing, as an operator ordered; of this robot itself: drained above
     doubted: it said lately what it may not say (its notes tell what): its key may be stolen
 doubted_elsewhere: {robot: [peer, …]}: with ``team``, of whom each of the others heard lately what it may not say
 peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it

@@ -93,7 +93,13 @@ class Speaker:
         return any(urgent(entry, self._said[name][0] if name in self._said else None) for name, entry in entries.items())
 
     def beat(
-        self, entries: dict[str, Entry], echoes: tuple[Echo, ...], grace_ms: int = 0, promises: tuple[Promise, ...] = ()
+        self,
+        entries: dict[str, Entry],
+        echoes: tuple[Echo, ...],
+        grace_ms: int = 0,
+        promises: tuple[Promise, ...] = (),
+        *,
+        drained: bool = False,
     ) -> Beat:
         """The next beat. Entries that changed go first, then those that were not said for the longest time."""
         self.counter += 1
@@ -101,7 +107,18 @@ class Speaker:
         if changed or len(entries) != len(self._said):
             self._settled = self.counter
         empty = Beat(
-            self._me, self._boot, self.counter, self._settled, 0, len(entries), echoes, (), self._rule, grace_ms, promises
+            self._me,
+            self._boot,
+            self.counter,
+            self._settled,
+            0,
+            len(entries),
+            echoes,
+            (),
+            self._rule,
+            grace_ms,
+            promises,
+            drained,
         )
         if not entries:
             self._said.clear()
@@ -125,6 +142,7 @@ class Speaker:
             self._rule,
             grace_ms,
             promises,
+            drained,
         )
 
     def unsaid(self, beat: Beat) -> None:

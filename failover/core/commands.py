@@ -77,6 +77,8 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
     name = component.name
     if not turn.config.runs(turn.me):
         return f"cannot {verb} {name}: {turn.me} runs nothing; ask at a robot"
+    if turn.drained:
+        return f"cannot {verb} {name}: {turn.me} is drained; failover undrain {turn.me} first, or ask at another robot"
     if spent := exhaustion(component, turn.me):
         return f"cannot {verb} {name}: {spent}"
     heard, voters = 1 + len(turn.team.living(turn.now_ns)), len(turn.config.peers) + 1

@@ -176,6 +176,7 @@ class Component(Struct):
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
             something went wrong, ``cold`` says what.
+        drain_ns: on the primary of a drained robot: when its standby is asked next whether it could go on there.
         return_ns: on a primary: when the preferred robot is asked whether it could go on there; ``unfit``: what it lacks.
     """
 
@@ -232,6 +233,7 @@ class Component(Struct):
     warm: bool = False
     cold: str = ""
     return_ns: int = 0
+    drain_ns: int = 0
     unfit: tuple[str, ...] = ()
     stored_ns: int = -1
     resumed_ns: int = -1
@@ -387,7 +389,7 @@ class Turn(Struct):
     Attributes:
         before: the vote record as the last step left it.
         late_ns: see `failover.core.event_log.decisions.Facts`.
-        leaving: this agent is about to restart.
+        leaving: this agent is about to restart. drained: this robot is to run nothing.
     """
 
     now_ns: int
@@ -398,6 +400,7 @@ class Turn(Struct):
     late_ns: int
     load: int = 0
     leaving: bool = False
+    drained: bool = False
     acts: list[Act] = field(default_factory=list)
     said: list[Decision] = field(default_factory=list)
 
@@ -439,6 +442,12 @@ class Turn(Struct):
     def alive(self, robot: str) -> bool:
         """Whether a peer is alive."""
         return self.team.alive(robot, self.now_ns)
+
+    def is_drained(self, robot: str) -> bool:
+        """Whether a robot is to run nothing, by its newest word."""
+        if robot == self.me:
+            return self.drained
+        return robot in self.team.peers and self.team.peers[robot].drained
 
     def gone(self, robot: str) -> bool:
         """Whether a peer cannot act any more on anything that we told it."""

@@ -345,6 +345,13 @@ class Prefer(Struct, frozen=True):
     decided: int = 0
 
 
+class Drain(Struct, frozen=True):
+    """Operator: this robot is to run nothing: all that it runs moves to others, and no other comes here; or no longer so."""
+
+    request: int
+    is_on: bool = True
+
+
 Command = Run | Release | Stop | Handover | Promote | Failback | Prefer
 """``by``: uid of the user who gives the order; None: one who may give any. Its right is looked at when it is obeyed.
 
@@ -375,5 +382,6 @@ Event = (
     | Inquired
     | Exited
     | Noticed
+    | Drain
     | Command
 )

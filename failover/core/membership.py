@@ -94,6 +94,7 @@ class Peer(Struct):
     at_odds: int = 0
     total: int = 0
     load: int = 0
+    drained: bool = False
     unread_ns: int = 0
     unread_why: str = ""
     loyal_until_ns: int = 0
@@ -134,7 +135,7 @@ class Peer(Struct):
             return ()
         self._echoes(beat, own)
         if is_newest:
-            self.settled, self.total, self.load = beat.settled, beat.total, beat.load
+            self.settled, self.total, self.load, self.drained = beat.settled, beat.total, beat.load, beat.drained
         return tuple([entry for entry in beat.entries if self._news(entry, beat.counter)]) if beat.entries else ()
 
     def timed(self, late_ns: int) -> None:
@@ -491,6 +492,7 @@ class Membership:
             heard,
             self.unread(peer.robot, now_ns),
             awaited_ns=self.awaited_ns(peer.robot, now_ns),
+            drained=peer.drained,
         )
 
 

@@ -20,6 +20,7 @@ from failover.core.events import (
     CaptureFailed,
     Command,
     Committed,
+    Drain,
     Event,
     Exited,
     Failback,
@@ -53,7 +54,7 @@ from failover.core.peer_claims import Testimony
 from failover.core.replication import servers, standby, warm_standby
 from failover.core.status import guarantee, view
 from failover.core.status.observations import Watch
-from failover.core.transitions import exits, failback, handover, promotion, restarts
+from failover.core.transitions import drain, exits, failback, handover, promotion, restarts
 from failover.core.types import (
     COMPONENTS_MAX,
     ENDED,
@@ -114,6 +115,7 @@ class Node:
         self._asked_ns = self._next_beat_ns = now_ns
         self._last_beat_ns = now_ns - URGENT_GAP_NS
         self._durable = vote_record
+        self._drained = vote_record.drained
         self._team = Membership(config, boot, now_ns, vote_record.awaited)
         self._speaker = Speaker(config.robot, boot, config.rule, len(config.peers) + 1)
         self._watch = Watch()
@@ -155,7 +157,7 @@ class Node:
         for component in touched:
             lease.forget_former(component, turn)
             _review(component, turn)
-        changed = begins or bool(touched) or self._team.awaited(now_ns) != self._durable.awaited
+        changed = begins or bool(touched) or self._is_undurable(now_ns)
         persist = self._persist() if changed else None
         send = self._speak(turn) if changed or now_ns >= self._next_beat_ns else ()
         self._asked_ns = self._deadline_ns()
@@ -225,7 +227,9 @@ class Node:
 
     def _turn(self, now_ns: int) -> Turn:
         counter, leaving = self._speaker.counter + 1, self._leaving_ns > 0
-        return Turn(now_ns, self._config, self._team, counter, self._durable, self._watch.late_ns, self._load, leaving)
+        return Turn(
+            now_ns, self._config, self._team, counter, self._durable, self._watch.late_ns, self._load, leaving, self._drained
+        )
 
     def _note_promise(self, turn: Turn) -> None:
         """The journal has the team's promise at each change, and a component's while it differs from that."""
@@ -296,7 +300,9 @@ class Node:
         """Take the event in; returns the components that it may have changed."""
         if isinstance(event, Leave):
             self._leave(turn)
-        if isinstance(event, Tick | TeamChanged | Leave):
+        if isinstance(event, Drain):
+            self._drain(event, turn)
+        if isinstance(event, Tick | TeamChanged | Leave | Drain):
             return list(self._components.values())
         if isinstance(event, Received):
             return self._hear(event, turn)
@@ -316,6 +322,17 @@ class Node:
             return []
         _tell(component, turn, event)
         return [component]
+
+    def _drain(self, event: Drain, turn: Turn) -> None:
+        if event.is_on and not turn.config.runs(turn.me):
+            turn.order(acts.Answer(event.request, False, f"cannot drain {turn.me}: it runs nothing anyway"))
+            return
+        self._drained = turn.drained = event.is_on
+        for component in self._components.values():
+            component.drain_ns, component.unfit = turn.now_ns, ()
+        is_so = "is drained: what it runs moves to others" if event.is_on else "is drained no more: it may run components again"
+        turn.say_of_robot(f"{turn.me} {is_so}, as an operator ordered")
+        turn.order(acts.Answer(event.request, True, f"{turn.me} {is_so}"))
 
     def _leave(self, turn: Turn) -> None:
         """Ask the peers to wait; for their promises wait only where there is something that they could take over."""
@@ -400,7 +417,7 @@ class Node:
             self._waiting = None
         grace_ms = turn.config.restart_grace_ms if turn.leaving else self._returned(turn)
         promises = self._team.promises(self._durable.awaited) if self._durable.awaited else ()
-        beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns), grace_ms, promises)
+        beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns), grace_ms, promises, drained=self._drained)
         self._load = beat.load
         self._team.asked(beat.counter, turn.now_ns)
         self._last_beat_ns = turn.now_ns
@@ -419,11 +436,15 @@ class Node:
 
     def _persist(self) -> VoteRecord | None:
         records = tuple(component.record() for component in self._components.values() if component.epoch)
-        vote_record = VoteRecord(records, self._team.awaited(self._now_ns))
+        vote_record = VoteRecord(records, self._team.awaited(self._now_ns), self._drained)
         if vote_record == self._durable:
             return None
         self._durable = vote_record
         return vote_record
+
+    def _is_undurable(self, now_ns: int) -> bool:
+        """Whether something of the robot as a whole is to be remembered, and is not on the disk."""
+        return (self._team.awaited(now_ns), self._drained) != (self._durable.awaited, self._durable.drained)
 
     def _deadline_ns(self) -> int:
         instants = [self._next_beat_ns]
@@ -589,5 +610,5 @@ def _review_held(component: Component, turn: Turn) -> None:
         standby.choose_standby(component, turn)
         standby.capture(component, turn)
         servers.advance(component, turn)
-        failback.review(component, turn)
+        (drain if turn.drained else failback).review(component, turn)
     handover.advance(component, turn)

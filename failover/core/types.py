@@ -475,6 +475,7 @@ class VoteRecord(Struct, frozen=True):
 
     records: tuple[Record, ...] = ()
     awaited: tuple[Awaited, ...] = ()
+    drained: bool = False
 
 
 class Held(Struct, frozen=True):
@@ -511,7 +512,7 @@ class PeerView(Struct, frozen=True):
 
     ``unread``: why what comes from it cannot be authenticated, if something of that kind came lately. ``refused``: what it said
     beyond what it may say, a sentence for each reason; ``doubted``: some of it lately. ``awaited_ns``: for how long it is not
-    replaced, because its agent announced that it comes back; 0: it did not, or that is over.
+    replaced, because its agent announced that it comes back; 0: it did not, or that is over. ``drained``: it is to run nothing.
     """
 
     robot: str
@@ -525,6 +526,7 @@ class PeerView(Struct, frozen=True):
     refused: tuple[str, ...] = ()
     doubted: bool = False
     awaited_ns: int = 0
+    drained: bool = False
 
 
 class ComponentView(Struct, frozen=True):
@@ -570,7 +572,10 @@ class ComponentView(Struct, frozen=True):
 
 
 class StatusView(Struct, frozen=True):
-    """Everything ``failover status`` shows, seen from one robot. ``healthy`` is False when anything failed or is degraded."""
+    """Everything ``failover status`` shows, seen from one robot. ``healthy`` is False when anything failed or is degraded.
+
+    ``drained``: an operator has drained this robot.
+    """
 
     robot: str
     boot: int
@@ -579,3 +584,4 @@ class StatusView(Struct, frozen=True):
     healthy: bool
     peers: tuple[PeerView, ...]
     components: tuple[ComponentView, ...]
+    drained: bool = False

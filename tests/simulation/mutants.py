@@ -14,7 +14,7 @@ from failover.core.component import Component, Turn
 from failover.core.election import lease, majority, pair, votes
 from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.replication import servers, standby, warm_standby
-from failover.core.transitions import exits, handover, restarts
+from failover.core.transitions import drain, exits, handover, restarts
 from failover.core.types import MS, Config, Restart, State
 from failover.core.wire.messages import Entry
 
@@ -558,6 +558,25 @@ def back_too_soon() -> Any:
     return patch.object(lease, "borrows", lambda *_: False)
 
 
+def forgets_that_it_is_drained() -> Any:
+    """A robot is drained until its agent restarts."""
+    honest = node.Node._persist
+
+    def persist(self: node.Node) -> Any:
+        drained, self._drained = self._drained, False
+        try:
+            return honest(self)
+        finally:
+            self._drained = drained
+
+    return patch.object(node.Node, "_persist", persist), patch.object(node.Node, "_is_undurable", lambda *_: False)
+
+
+def drained_all_the_same() -> Any:
+    """What runs at a drained robot stays there."""
+    return patch.object(drain, "review", lambda *_: None)
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
@@ -600,6 +619,9 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (gives_its_primacy_up_for_the_pause, "a_robot_lost_in_the_pause_before_a_start_is_replaced"),
     (resumes_what_has_ended, "a_program_that_crashes_right_after_its_start_resumes_nothing_older"),
     (tireless_giver, "a_chain_that_is_not_taken_is_offered_again_after_a_pause"),
+    (drained_all_the_same, "a_drained_robot_gives_away_what_it_runs_and_takes_nothing"),
+    (drained_all_the_same, "a_drained_robot_is_the_last_to_take_a_component_over"),
+    (forgets_that_it_is_drained, "a_drained_robot_gives_away_what_it_runs_and_takes_nothing"),
     (lease_beyond_the_promise, "an_agent_that_does_not_come_back_is_replaced_after_the_grace"),
     (breaks_its_promise, "an_agent_that_does_not_come_back_is_replaced_after_the_grace"),
     (forgets_its_promise, "peers_that_restart_keep_their_promise"),

@@ -40,7 +40,7 @@ import msgspec
 from msgspec.structs import replace
 
 from failover.core import acts
-from failover.core.events import Handover, Promote, Run, Stop
+from failover.core.events import Drain, Handover, Promote, Run, Stop
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.liars import by_name
@@ -93,6 +93,8 @@ class Story:
                 world.power_off(robot)
             case "restart":
                 world.restart(robot, int(arguments[1]) * MS)
+            case "drain" | "undrain":
+                world.command(robot, Drain(world.request(), verb == "drain"))
             case "agent-dies":
                 world.agent_dies(robot)
             case "run":

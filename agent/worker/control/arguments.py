@@ -160,6 +160,13 @@ class PromoteArguments(msgspec.Struct, forbid_unknown_fields=True):
     epoch: Epoch = 0
 
 
+class DrainArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``drain``."""
+
+    robot: str
+    on: bool = True
+
+
 class PreferArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``prefer``."""
 

@@ -43,7 +43,7 @@ SIGHT_PATIENCE_S: Final = 2.0
 LIVING: Final = ("live", "suspect")
 """States of peers that are asked: on a busy machine three beats may be late at any time."""
 
-WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "start", "stop")
+WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "start", "stop", "drain")
 """What takes a program, its output, or a word that others obey."""
 
 DECISIONS_AT_ONCE: Final = 50
@@ -73,7 +73,7 @@ class Lines(Protocol):
     errands: Errands
 
     async def ask(self, what: Any) -> Told: ...
-    async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
+    async def command(self, make: Callable[[int], events.Command | events.Drain]) -> acts.Answer: ...
     def hindrance(self, peer: str) -> str: ...
     def picture(self, told: Told) -> dict[str, Any]: ...
 

@@ -37,6 +37,7 @@ RIGHT_OF: Final = {
     "failback": "operate",
     "prefer": "operate",
     "promote": "operate",
+    "drain": "operate",
     "release": "operate",
     "start": "operate",
     "stop": "operate",

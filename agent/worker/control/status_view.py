@@ -100,6 +100,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "descriptors": {"main_loop": _descriptors(life.main_loop), "worker": _descriptors(os.getpid())},
         "fencing": fencing_status.sentence(fencing_status.watchdog()),
         "healthy": view.healthy if view else False,
+        "drained": view.drained if view else False,
         "notes": notes,
         "links": ours.interfaces,
         "media": [_medium(one) for one in told.media],
@@ -172,6 +173,7 @@ def _peer(peer: PeerView, link: PeerConnection | None, told: Told, settings: Set
         "lane": str(link.state if link is not None else LinkState.DOWN),
         "beats_lost": told.beats.lost.get(peer.robot, 0),
         "doubted": peer.doubted,
+        "drained": peer.drained,
         "notes": reason,
     }
 

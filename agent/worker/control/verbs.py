@@ -15,11 +15,12 @@ from agent.errors import RefusedError
 from agent.hook_kinds import check_told
 from agent.system import clock
 from agent.system.adopted_process import Guest
-from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for
+from agent.system.permissions import Caller, asking, check_right, guest_of, inheritance_for, may
 from agent.worker.components import prerequisites
 from agent.worker.components.paths import Places
 from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.arguments import (
+    DrainArguments,
     HandoverArguments,
     LogsArguments,
     NameArguments,
@@ -78,6 +79,7 @@ class Verbs(Questions):
             "protect": self.protect,
             "logs": self.logs,
             "promote": self.promote,
+            "drain": self.drain,
             **{name: functools.partial(self._order, name) for name in self.orders()},
         }
 
@@ -89,6 +91,7 @@ class Verbs(Questions):
             **self.orders(),
             "piece": self._output_relay.piece,
             "promoted": promoted,
+            "drained": self._drained,
             "lacks": self.lacks,
         }
 
@@ -333,6 +336,30 @@ class Verbs(Questions):
         view = await self._view(wanted.name)
         told = {"name": wanted.name, "to": wanted.robot, "epoch": view["epoch"], "sentence": answer.sentence}
         return {**told, "promoted": wanted.sure, "risks": list(answer.risks)}
+
+    async def drain(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Have a robot give away all that it runs, and take nothing new; or let it run components again."""
+        wanted, members = arguments_of(DrainArguments, "drain", arguments), self._worker.settings.team.robots
+        if wanted.robot not in members:
+            raise RefusedError(f"cannot drain {wanted.robot!r}: the team knows {', '.join(sorted(members))}")
+        order, uid = {"robot": wanted.robot, "on": wanted.on}, say.caller.uid
+        if wanted.robot == self._worker.settings.config.robot:
+            return await self._drained(order, uid)
+        return await self._worker.errands.send(wanted.robot, "drained", order, uid)
+
+    async def _drained(self, arguments: dict[str, Any], by: int) -> dict[str, Any]:
+        """Drain this robot, or no longer: for root, or for whom the rules let operate at its path."""
+        wanted, settings = arguments_of(DrainArguments, "drain", arguments), self._worker.settings
+        if (gate := self._rules()) is not None:
+            await gate.check(by, RIGHT_OF["drain"], f"/{settings.team.team}/{settings.config.robot}")
+        elif not may(by, None):
+            raise RefusedError(
+                f"cannot drain {settings.config.robot}: only root may, or whom rights.toml lets", "PermissionError"
+            )
+        answer = await self._worker.command(lambda number: events.Drain(number, wanted.on))
+        if not answer.ok:
+            raise RefusedError(answer.sentence)
+        return {"robot": settings.config.robot, "drained": wanted.on, "sentence": answer.sentence}
 
     async def _newest_at(self, name: str) -> str:
         """The living robot with the newest checkpoint; this one, or the lesser name, of several."""

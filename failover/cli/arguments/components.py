@@ -1,4 +1,4 @@
-"""run, protect, release, stop, logs, handover, failback, drill, promote, prefer: one component of a team."""
+"""run, protect, release, stop, logs, handover, failback, drill, promote, prefer: one component; drain, undrain: a robot's."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from failover.cli.arguments.resources import (
     add_shared_memory,
 )
 from failover.cli.arguments.shared import add_agent, add_name, add_pid, ago, positive, signal_number
+
+DRAIN_S: Final = 300.0
+"""How long ``failover drain`` waits: a large program on a slow link takes minutes."""
 
 HOOKS: Final = {
     "before_capture": "before the agent takes a whole snapshot of it, and before the last one of a handover",
@@ -139,4 +142,18 @@ def prefer(room: argparse.ArgumentParser) -> None:
     """Of ``failover prefer``."""
     add_name(room)
     room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
+    add_agent(room)
+
+
+def drain(room: argparse.ArgumentParser) -> None:
+    """Of ``failover drain``."""
+    undrain(room)
+    room.add_argument(
+        "--timeout", type=float, default=DRAIN_S, metavar="S", help="seconds to wait for the moves (default: %(default)g)"
+    )
+
+
+def undrain(room: argparse.ArgumentParser) -> None:
+    """Of ``failover undrain``."""
+    room.add_argument("robot", metavar="ROBOT", help="a robot of the team")
     add_agent(room)

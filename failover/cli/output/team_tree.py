@@ -77,10 +77,14 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
 
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:
+    mood: Mood
     if peer is None:
-        return Row((f"{name} (here)", str(status.get("role") or ""), "live", "", "", "", "", "", _connections(status)), "good")
-    state = peer["state"]
-    return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links_of(peer)), mood_of_robot(state))
+        state, mood = ("live, drained", "warning") if status.get("drained") else ("live", "good")
+        return Row((f"{name} (here)", str(status.get("role") or ""), state, "", "", "", "", "", _connections(status)), mood)
+    state, mood = peer["state"], mood_of_robot(peer["state"])
+    if peer.get("drained"):
+        state, mood = f"{state}, drained", "warning" if mood == "good" else mood
+    return Row((name, str(peer.get("role") or ""), state, "", "", "", "", "", links_of(peer)), mood)
 
 
 def links_of(peer: Mapping[str, Any]) -> str:

@@ -120,7 +120,7 @@ def starters(component: Component, turn: Turn) -> Iterator[str]:
     """The living robots that would start it from the beginning."""
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(component.name)
-        if entry is not None and entry.flags & STARTS:
+        if entry is not None and entry.flags & STARTS and not peer.drained:
             yield peer.robot
 
 

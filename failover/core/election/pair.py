@@ -268,13 +268,13 @@ def living_entries(component: Component, turn: Turn) -> list[tuple[str, Entry]]:
 
 
 def may_start_afresh(component: Component, turn: Turn) -> bool:
-    """Configured to run, and no checkpoint of it was ever given away or is here, perhaps one that cannot be used just now.
+    """Configured to run here, not drained, and no checkpoint of it was ever given away or is here, perhaps an unusable one.
 
     Checkpoints known before a claim of our own in vain, or before the loss of a disk, still count; but where all robots are back
     and have none, all checkpoints are lost.
     """
     is_new = not component.has_begun or _is_nowhere(component, turn)
-    return component.autostart and component.spec is not None and is_new
+    return component.autostart and component.spec is not None and is_new and not turn.drained
 
 
 def _is_nowhere(component: Component, turn: Turn) -> bool:
@@ -289,13 +289,14 @@ def _has_none(component: Component, turn: Turn, robot: str, peer: Peer) -> bool:
 
 def first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:
     rivals = [robot for robot, entry in entries if entry.position == mine and turn.config.runs(robot)]
-    own = placing(component, turn.me, turn.load)
-    return all(own < placing(component, robot, turn.team.peers[robot].load) for robot in rivals)
+    own = placing(component, turn, turn.me)
+    return all(own < placing(component, turn, robot) for robot in rivals)
 
 
-def placing(component: Component, robot: str, load: int) -> tuple[bool, int, Weight]:
-    """Of robots that could run it equally well the least of these does: preferred, least loaded, lesser name."""
-    return robot != component.rules.prefer, load, weight(robot)
+def placing(component: Component, turn: Turn, robot: str) -> tuple[bool, bool, int, Weight]:
+    """Of robots that could run it equally well the least of these does: not drained, preferred, least loaded, lesser name."""
+    load = turn.load if robot == turn.me else turn.team.peers[robot].load
+    return turn.is_drained(robot), robot != component.rules.prefer, load, weight(robot)
 
 
 def _right_to_act_alone(component: Component, turn: Turn) -> bool:

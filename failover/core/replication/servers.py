@@ -102,7 +102,7 @@ def _heir(component: Component, turn: Turn) -> str:
         return ""
     able = [peer for peer in turn.team.living(turn.now_ns) if turn.config.runs(peer.robot)]
     able = [peer for peer in able if peer.robot == component.primary or not component.waits]
-    order = sorted(able, key=lambda peer: (peer.robot != component.primary, placing(component, peer.robot, peer.load)))
+    order = sorted(able, key=lambda peer: (peer.robot != component.primary, placing(component, turn, peer.robot)))
     return order[0].robot if order else ""
 
 

@@ -40,7 +40,9 @@ written, all of its memory is read meanwhile."""
 
 
 def choose_standby(component: Component, turn: Turn) -> None:
-    """The operator's choice, else where it would move back to, else the least loaded living robot, else the lesser name.
+    """The operator's choice, else one that is not drained, else where it would move back to, else the least loaded living robot.
+
+    Of those the lesser name.
 
     Under ``freeze`` it stays for good.
     """
@@ -55,15 +57,20 @@ def choose_standby(component: Component, turn: Turn) -> None:
     if able:
         home = component.rules.prefer or (component.spec.home if component.spec else "")
 
-        def placing(peer: Peer) -> tuple[bool, bool, int, Weight]:
-            return not turn.config.runs(peer.robot), peer.robot != home, peer.load, weight(peer.robot)
+        def placing(peer: Peer) -> tuple[bool, bool, bool, int, Weight]:
+            return not turn.config.runs(peer.robot), peer.drained, peer.robot != home, peer.load, weight(peer.robot)
 
-        component.standby = min(able, key=placing).robot
+        chosen = min(able, key=placing).robot
+        if chosen == component.standby:
+            return
+        component.standby = chosen
         component.due_ns = turn.now_ns
         turn.say(component, f"{component.standby} is its standby")
 
 
 def _stays(component: Component, turn: Turn) -> bool:
+    if turn.is_drained(component.standby) and any(not peer.drained for peer in _robots(component, turn)):
+        return component.freezes and not turn.config.by_majority
     if not turn.config.by_majority:
         return turn.alive(component.standby) or component.freezes
     if not turn.alive(component.standby) or objects(component, turn.team.peers[component.standby], turn.me):

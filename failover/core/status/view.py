@@ -11,7 +11,7 @@ from failover.core.peer_claims import Testimony
 from failover.core.replication import standby
 from failover.core.replication.warm_standby import is_warm
 from failover.core.status import guarantee
-from failover.core.transitions import failback, restarts
+from failover.core.transitions import drain, failback, restarts
 from failover.core.types import MS, ComponentView, Protection, State, StatusView
 
 NS_PER_S = 10**9
@@ -35,7 +35,9 @@ def status(components: dict[str, Component], turn: Turn, boot: int, testimony: T
     bad = bad or any(view.cold or view.unstored for view in views) or any(one.is_exhausted for one in components.values())
     bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread or peer.doubted for peer in peers)
     lost = any(peer.state == "dead" for peer in peers)
-    return StatusView(turn.me, boot, str(turn.config.rule), guarantee.team(turn), not bad and not lost, peers, views)
+    return StatusView(
+        turn.me, boot, str(turn.config.rule), guarantee.team(turn), not bad and not lost, peers, views, turn.drained
+    )
 
 
 def _is_nothing(component: Component) -> bool:
@@ -176,6 +178,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.holding and component.lost_ns >= STALE_NS:
         lost_s = component.lost_ns / NS_PER_S
         notes.append(f"it resumed at {turn.me} from its last checkpoint and lost {lost_s:.1f} s of its work")
+    if moving := drain.note(component, turn):
+        notes.append(moving)
     if staying := failback.note(component):
         notes.append(staying)
     if component.unstored and component.state is State.STANDBY:

@@ -23,7 +23,7 @@ UNFIT_PAUSE: Final = 30
 def review(component: Component, turn: Turn) -> None:
     """Ask the preferred robot, once it keeps up and some time has passed."""
     prefer = component.rules.prefer
-    if prefer in ("", turn.me) or prefer != component.standby or turn.now_ns < component.return_ns:
+    if prefer in ("", turn.me) or prefer != component.standby or turn.now_ns < component.return_ns or turn.is_drained(prefer):
         return
     if component.acked is not None and component.flight is None and turn.alive(prefer):
         component.return_ns = turn.now_ns + PAUSE * turn.config.retry_ms * MS
@@ -32,12 +32,14 @@ def review(component: Component, turn: Turn) -> None:
 
 def inquired(component: Component, turn: Turn, event: Inquired) -> None:
     """The robot has answered: go there, or wait and say why."""
-    if component.state is not State.PRIMARY or (event.epoch, event.to) != (component.epoch, component.rules.prefer):
+    wanted = component.standby if turn.drained else component.rules.prefer
+    if component.state is not State.PRIMARY or (event.epoch, event.to) != (component.epoch, wanted):
         return
     if event.lacks:
-        component.return_ns = turn.now_ns + UNFIT_PAUSE * turn.config.retry_ms * MS
+        component.return_ns = component.drain_ns = turn.now_ns + UNFIT_PAUSE * turn.config.retry_ms * MS
         if event.lacks != component.unfit:
-            turn.say(component, f"it does not return to {event.to}, which could not resume it: {'; '.join(event.lacks)}")
+            how = "move" if turn.drained else "return"
+            turn.say(component, f"it does not {how} to {event.to}, which could not resume it: {'; '.join(event.lacks)}")
     component.unfit = event.lacks
     if not event.lacks:
         handover.begin(component, turn, event.to, 0)

@@ -33,6 +33,8 @@ def resume_here(component: Component, turn: Turn, request: int) -> None:
         _answer(turn, request, False, f"{turn.me} holds no checkpoint of {component.name}")
     elif not turn.config.runs(turn.me):
         _answer(turn, request, False, f"{turn.me} runs nothing; ask at a robot")
+    elif turn.drained:
+        _answer(turn, request, False, f"{turn.me} is drained; failover undrain {turn.me} first, or ask at another robot")
     elif component.is_exhausted:
         _answer(turn, request, False, exhaustion(component, turn.me))
     elif not vacant(component, turn) or (turn.config.by_majority and not majority.is_free(component, turn)):
@@ -95,6 +97,8 @@ def _refusal(component: Component, turn: Turn, target: str) -> str:
         return f"{component.name} runs at {turn.me} and has no standby to go to; wait until it has one"
     if not turn.config.runs(target):
         return f"cannot move {component.name} to {target}: it runs nothing; name a robot"
+    if turn.is_drained(target):
+        return f"{target} is drained; failover undrain {target} lets it run components again"
     if target not in turn.config.peers:
         return f"cannot move {component.name} to {target!r}: the team knows {', '.join((turn.me, *turn.config.peers))}"
     if target != component.standby or not turn.alive(target):

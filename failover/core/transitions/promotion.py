@@ -68,6 +68,8 @@ def _refusal(component: Component, turn: Turn) -> str:
     me, name = turn.me, component.name
     if not turn.config.runs(me):
         return f"{me} runs nothing; name a robot with --robot"
+    if turn.drained:
+        return f"{me} is drained; failover undrain {me} first, or name another robot"
     if spent := exhaustion(component, me):
         return spent
     if component.state in _ENDED_WELL:

@@ -123,6 +123,7 @@ class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):
         grace_ms: the sender's agent is about to restart and asks not to be replaced for so long; `RETURNED`, or 0 where nothing
             is told.
         promises: to the robots that asked.
+        drained: the sender is to run nothing: an operator has drained it.
     """
 
     sender: str
@@ -136,6 +137,7 @@ class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):
     rule: int = 0
     grace_ms: int = 0
     promises: tuple[Promise, ...] = ()
+    drained: bool = False
 
 
 RETURNED = -1

@@ -24,6 +24,8 @@ UNDER_AN_AGENT = {
     "prefer": ["x", "y"],
     "promote": ["x"],
     "drill": ["x"],
+    "drain": ["x"],
+    "undrain": ["x"],
 }
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")

@@ -301,6 +301,39 @@ def test_a_verb_says_in_a_sentence_what_came_of_it(agent: Start, words: list[str
     assert json.loads(failover(*words, "--json", socket=stand_in.path).stdout) == answer
 
 
+def component_at(robot: str, **more: Any) -> dict[str, Any]:
+    return {"name": "/a", "primary": robot, "role": "standby", "state": "running", "epoch": 1, "notes": [], **more}
+
+
+def draining(agent: Start, *pictures: list[dict[str, Any]]) -> StandIn:
+    """An agent that drains a robot, and then sees the team like this, one picture a question, the last one for good."""
+    left = list(pictures)
+
+    def answer(request: Request) -> Any:
+        if request.verb == "drain":
+            return answering({"robot": "r1", "drained": True, "sentence": "r1 is drained"})(request)
+        return answering({"components": left.pop(0) if len(left) > 1 else left[0]})(request)
+
+    return agent(answer)
+
+
+def test_a_drain_waits_until_each_component_runs_elsewhere(agent: Start) -> None:
+    stand_in = draining(agent, [component_at("r1")], [component_at("r1")], [component_at("r2")])
+    ran = failover("drain", "r1", socket=stand_in.path)
+    assert (ran.returncode, ran.stdout) == (0, "/a runs at r2\nr1 is drained\n")
+    assert stand_in.asked[0].arguments == {"robot": "r1"}
+
+
+def test_a_drain_says_what_cannot_move_and_why(agent: Start) -> None:
+    stays = component_at("r1", notes=["r1 is drained, and it stays: no other robot that is heard keeps its checkpoints"])
+    path = draining(agent, [stays]).path
+    ran = failover("drain", "r1", "--timeout", "0.3", socket=path)
+    assert ran.returncode == 1
+    assert "r1 is drained, and still runs /a: r1 is drained, and it stays: no other robot that is heard" in ran.stderr
+    shown = failover("drain", "r1", "--timeout", "0.3", "--json", socket=path)
+    assert shown.returncode == 1 and list(json.loads(shown.stdout)["left"]) == ["/a"]
+
+
 WOULD = {"name": "/a", "to": "r2", "epoch": 4, "promoted": False, "sentence": "/a would resume at r2", "risks": ["r1 may live"]}
 
 
@@ -367,7 +400,7 @@ def test_an_agent_that_goes_away_is_an_error_and_not_a_hang(agent: Start) -> Non
 
 AGENT_VERBS = [
     ["run", "--", "x"], ["protect", "1"], ["release", "x"], ["stop", "x"], ["status"], ["logs", "x"], ["why"], ["handover", "x"],
-    ["prefer", "x", "r"], ["promote", "x"],
+    ["prefer", "x", "r"], ["promote", "x"], ["drain", "r"], ["undrain", "r"],
 ]  # fmt: skip
 
 
