@@ -1040,7 +1040,8 @@ static inline void fb_remove_(const fb_board *board, int own)
     if (pwrite(own, &gone, 8, FB_GENERATION_AT_) != 8)
         return;
     for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder)) {
-        if (strcmp(entry->d_name, "private") != 0 && strcmp(entry->d_name, "schedule") != 0 && strncmp(entry->d_name, "own+", 4) != 0 && strncmp(entry->d_name, "peer-", 5) != 0)
+        if (strcmp(entry->d_name, "private") != 0 && strcmp(entry->d_name, "schedule") != 0 && strncmp(entry->d_name, "own+", 4) != 0 && strncmp(entry->d_name, "peer-", 5) != 0 &&
+            strncmp(entry->d_name, "guest-", 6) != 0)
             continue;
         snprintf(path, sizeof path, "%s/%s", board->directory, entry->d_name);
         int file = open(path, O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK);

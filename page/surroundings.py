@@ -14,7 +14,7 @@ import msgspec
 
 from failover.boards import directory
 from failover.boards.board import Board, board
-from failover.boards.overview import overview
+from failover.boards.overview import Overview
 from failover.core.board.json_values import plain
 from failover.drivers.here import here
 from failover.drivers.lookup import whole_tree
@@ -49,6 +49,7 @@ class Surroundings:
 
     def __init__(self) -> None:
         self._board: Board | None = None
+        self._overview: Overview | None = None
         self._board_again_s = 0.0
 
     def look(self, status: Mapping[str, Any] | None) -> Around:
@@ -64,13 +65,14 @@ class Surroundings:
         """Leave the board."""
         if self._board is not None:
             self._board.close()
-            self._board = None
+            self._board = self._overview = None
 
     def _items(self) -> Rows:
         try:
             if self._board is None:
                 self._board = self._opened()
-            return [_item(one) for one in overview(self._board)] if self._board is not None else []
+                self._overview = Overview(self._board) if self._board is not None else None
+            return [_item(one) for one in self._overview.look()] if self._overview is not None else []
         except (FailoverError, OSError):
             self.close()
             return []

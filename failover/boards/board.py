@@ -27,6 +27,7 @@ from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
 from failover.core.board.banks import Place, Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
+from failover.core.naming import worlds
 from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
 
 COMPONENT_VARIABLE: Final = "FAILOVER_COMPONENT"
@@ -53,6 +54,8 @@ class _Opened:
         self.directory = place.resolve() if place.exists() else place
         self.own, self.index = directory.enter(self.directory, name)
         self.robot = self.own.header.robot
+        world = worlds.checked(os.environ.get(worlds.VARIABLE, ""))
+        self._prefix = directory.GUEST_PREFIX + worlds.guest(world) if world else directory.PEER_PREFIX
         self.pid = os.getpid()
         self.files = [self.own]
         self.peers: dict[str, MappedFile] = {}
@@ -70,22 +73,22 @@ class _Opened:
                 self.files.append(MappedFile.open(path))
 
     def peer(self, robot: str) -> MappedFile:
-        """Another robot's file.
+        """Another robot's file, or a guest's.
 
         Raises:
             BoardError: there is none; names those that there are.
         """
         file = self.peers.get(robot)
         if file is None or file.is_gone:
-            path = self.directory / f"{directory.PEER_PREFIX}{robot}"
-            try:
-                if "/" in robot:
-                    raise FileNotFoundError
-                file = self.peers[robot] = MappedFile.open(path, writable=False)
-            except FileNotFoundError:
-                known = ", ".join((self.robot, *self.peer_names()))
-                raise BoardError(f"there is no robot {robot!r} on the board {self.directory}; it has {known}") from None
+            file = self.peers[robot] = self._opened_peer(robot)
         return file
+
+    def _opened_peer(self, robot: str) -> MappedFile:
+        for prefix in (self._prefix, directory.GUEST_PREFIX) if "/" not in robot else ():
+            with contextlib.suppress(FileNotFoundError):
+                return MappedFile.open(self.directory / f"{prefix}{robot}", writable=False)
+        known = ", ".join((self.robot, *self.peer_names(), *self.guest_names()))
+        raise BoardError(f"there is no robot {robot!r} on the board {self.directory}; it has {known}")
 
     def agents(self) -> MappedFile:
         """The file in which the agent tells what it knows of the team.
@@ -103,9 +106,19 @@ class _Opened:
                 ) from None
         return self._agents
 
+    def path_of(self, robot: str) -> Path:
+        """Where another robot's file is."""
+        return self.directory / f"{self._prefix}{robot}"
+
     def peer_names(self) -> list[str]:
-        """The other robots."""
-        prefix = directory.PEER_PREFIX
+        """The other robots: of the team, or of the simulated world in which this process lives."""
+        return self._names(self._prefix)
+
+    def guest_names(self) -> list[str]:
+        """Simulated robots, as programs of the real world call them."""
+        return self._names(directory.GUEST_PREFIX) if self._prefix == directory.PEER_PREFIX else []
+
+    def _names(self, prefix: str) -> list[str]:
         return sorted(path.name.removeprefix(prefix) for path in self.directory.glob(f"{prefix}*"))
 
     def leave(self) -> None:
@@ -268,13 +281,23 @@ class Board:
         with self.guard:
             opened = self.ensured()
             found = {opened.robot: RobotState(layout.STATES[layout.RUN], 0, opened.own.header.rank)}
-            now = boottime.now_ns(self.skew_ns)
-            for robot in opened.peer_names():
-                with contextlib.suppress(BoardGoneError):
-                    header = opened.peer(robot).read_header()
-                    age = now - header.heard_ns if header.heard_ns else None
-                    found[robot] = RobotState(layout.STATES[header.state], age, header.rank)
-            return found
+            return found | self._states(opened, opened.peer_names())
+
+    def guests(self) -> dict[str, RobotState]:
+        """Simulated robots beside the real ones; none for a program that lives in their world: there `robots` has them."""
+        with self.guard:
+            opened = self.ensured()
+            return self._states(opened, opened.guest_names())
+
+    def _states(self, opened: _Opened, robots: list[str]) -> dict[str, RobotState]:
+        found = {}
+        now = boottime.now_ns(self.skew_ns)
+        for robot in robots:
+            with contextlib.suppress(BoardGoneError):
+                header = opened.peer(robot).read_header()
+                age = now - header.heard_ns if header.heard_ns else None
+                found[robot] = RobotState(layout.STATES[header.state], age, header.rank)
+        return found
 
     def living(self) -> list[str]:
         """This robot, and those that are running."""
@@ -302,7 +325,7 @@ class Board:
         return table[component]
 
     def snapshot(self) -> dict[str, dict[str, Reading]]:
-        """Robot → item → reading, of all that was ever put; each value whole, all ages at one instant."""
+        """Robot → item → reading, of all that was ever put, without guests; each value whole, all ages at one instant."""
         with self.guard:
             opened = self.ensured()
             found = [(opened.robot, one) for file in opened.files for one in _all_found(file)]
@@ -440,7 +463,7 @@ class Board:
         there = self._where(opened, name)
         if there is not None:
             return there[1]
-        for robot in opened.peer_names():
+        for robot in (*opened.peer_names(), *opened.guest_names()):
             record = opened.peer(robot).record(name)
             if record is not None:
                 return record
@@ -491,6 +514,7 @@ def board(place: str | os.PathLike[str] | None = None, name: str = "") -> Board:
 
     Args:
         place: its directory; None: ``$FAILOVER_BOARD``, the agent's, or one that this user's programs share without an agent.
+            In a simulated world (``$FAILOVER_WORLD``) the other robots are the simulated ones.
         name: of this program, for a person who looks which programs use the board; "": its component's, or its file's.
 
     Raises:

@@ -34,6 +34,8 @@ OWN_NAME: Final = "own"
 PRIVATE_NAME: Final = "private"
 AGENT_NAME: Final = "agent"
 PEER_PREFIX: Final = "peer-"
+GUEST_PREFIX: Final = "guest-"
+"""Of simulated robots: no agent receives for them, and only programs of their world take them for robots of the team."""
 
 TURNS: Final = 1000
 """Of making or opening a board that others make and remove at the same time."""
@@ -316,6 +318,7 @@ def _remove(directory: Path, own: int) -> None:
         directory / SCHEDULE_NAME,
         *directory.glob(f"{OWN_NAME}+*"),
         *directory.glob(f"{PEER_PREFIX}*"),
+        *directory.glob(f"{GUEST_PREFIX}*"),
     ):
         dismiss(path)
     (directory / OWN_NAME).unlink(missing_ok=True)

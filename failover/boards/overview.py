@@ -6,7 +6,6 @@ import contextlib
 from typing import Any, Final
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from failover.boards import boottime
 from failover.boards.board import Board
@@ -15,8 +14,9 @@ from failover.boards.item import values_for
 from failover.boards.mapping import MappedFile
 from failover.core.board import ages, layout
 from failover.core.board.banks import get_carefully
+from failover.core.board.item_values import Values
 from failover.core.board.layout import Record
-from failover.errors import BoardError, BoardGoneError, NeverWrittenError, ValueMisfitError
+from failover.errors import BoardError, BoardGoneError, ItemError, NeverWrittenError, ValueMisfitError
 
 AREAS: Final = {layout.PRIVATE: "private", layout.OWN: "own", layout.PEER: "peer"}
 
@@ -58,63 +58,102 @@ class Seen(Struct, frozen=True, kw_only=True):
     transit_us: int = 0
 
 
+class Overview:
+    """A board that is looked at again and again: what only a change of a table changes is read once."""
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._known: dict[str, tuple[MappedFile, int, list[_Row]]] = {}
+
+    def look(self) -> list[Seen]:
+        """Every item of every robot, this robot's first, guests last; a damaged one says so and does not hide the others.
+
+        Raises:
+            BoardError: the board itself cannot be read.
+        """
+        board = self._board
+        with board.guard:
+            opened = board.ensured()
+            files = [(opened.robot, file) for file in opened.files]
+            for robot in (*opened.peer_names(), *opened.guest_names()):
+                with contextlib.suppress(BoardGoneError):
+                    files.append((robot, opened.peer(robot)))
+            now_ns = boottime.now_ns(board.skew_ns)
+            known = {str(file.path): self._rows(robot, file) for robot, file in files}
+            self._known = known
+            return [_seen(row, now_ns) for _, _, rows in known.values() for row in rows]
+
+    def _rows(self, robot: str, file: MappedFile) -> tuple[MappedFile, int, list[_Row]]:
+        generation = file.generation
+        known = self._known.get(str(file.path))
+        if known is not None and known[0] is file and known[1] == generation and generation % 2 == 0:
+            return known
+        return file, generation, [_Row(robot, file, record) for record in file.records()]
+
+
+class _Row:
+    """One item, and where it lies."""
+
+    __slots__ = ("declared", "file", "place", "record", "values", "why")
+
+    def __init__(self, robot: str, file: MappedFile, record: Record) -> None:
+        self.file, self.record, self.place = file, record, file.place(record)
+        self.declared: dict[str, Any] = {
+            "robot": robot,
+            "item": record.name,
+            "id": record.id,
+            "area": next(word for flag, word in AREAS.items() if file.header.flags & flag),
+            "type": record.text or f"bytes[{record.size}]",
+            "size": record.size,
+            "period": record.period,
+            "phase": record.phase,
+            "banks": record.banks,
+        }
+        self.values: Values | None = None
+        self.why = ""
+        try:
+            self.values = values_for(record, None)
+        except (BoardError, ItemError) as error:
+            self.why = str(error)
+
+
 def overview(board: Board) -> list[Seen]:
-    """Every item of every robot, this robot's first; a damaged one says so and does not hide the others.
-
-    Raises:
-        BoardError: the board itself cannot be read.
-    """
-    with board.guard:
-        opened = board.ensured()
-        files = [(opened.robot, file) for file in opened.files]
-        for robot in opened.peer_names():
-            with contextlib.suppress(BoardGoneError):
-                files.append((robot, opened.peer(robot)))
-        now_ns = boottime.now_ns(board.skew_ns)
-        return [_seen(robot, file, record, now_ns) for robot, file in files for record in file.records()]
+    """`Overview.look`, once."""
+    return Overview(board).look()
 
 
-def _seen(robot: str, file: MappedFile, record: Record, now_ns: int) -> Seen:
-    area = next(word for flag, word in AREAS.items() if file.header.flags & flag)
-    seen = Seen(
-        robot=robot,
-        item=record.name,
-        id=record.id,
-        area=area,
-        type=record.text or f"bytes[{record.size}]",
-        size=record.size,
-        period=record.period,
-        phase=record.phase,
-        banks=record.banks,
-        writer=0 if area == "peer" else file.word32(record.at + layout.PID_FIELD),
-        refused=file.words[(record.at + layout.REFUSED_FIELD) // 8],
-        frames=file.words[(record.at + layout.FRAMES_FIELD) // 8],
-        lost=file.words[(record.at + layout.LOST_FIELD) // 8],
-        transit_us=file.word32(record.at + layout.TRANSIT_FIELD),
-    )
-    return _with_value(seen, file, record, now_ns)
-
-
-def _with_value(seen: Seen, file: MappedFile, record: Record, now_ns: int) -> Seen:
-    place = file.place(record)
-    bound_ns = record.bound_ns or place.words[place.formula]
-    seen = replace(seen, bound_ns=bound_ns)
+def _seen(row: _Row, now_ns: int) -> Seen:
+    record, words, place = row.record, row.file.words, row.place
+    bound_ns = record.bound_ns or words[place.formula]
+    counted: dict[str, Any] = {
+        "bound_ns": bound_ns,
+        "writer": 0 if row.declared["area"] == "peer" else row.file.word32(record.at + layout.PID_FIELD),
+        "refused": words[(record.at + layout.REFUSED_FIELD) // 8],
+        "frames": words[(record.at + layout.FRAMES_FIELD) // 8],
+        "lost": words[(record.at + layout.LOST_FIELD) // 8],
+        "transit_us": row.file.word32(record.at + layout.TRANSIT_FIELD),
+    }
     try:
         found = get_carefully(place, FENCE)
     except NeverWrittenError:
-        return seen
+        return Seen(**row.declared, **counted)
     except BoardError as error:
-        return replace(seen, complaint=str(error))
+        return Seen(**row.declared, **counted, complaint=str(error))
     age_ns = max(now_ns - found.stamp_ns, 0)  # it may be put after the look at the clock
     most_ns = ages.age_max_ns(age_ns, found.error_us)
-    seen = replace(
-        seen,
+    value, complaint = None, row.why
+    if row.values is not None:
+        try:
+            value = row.values.unpack(found.value)
+        except (ValueMisfitError, BoardError) as error:
+            complaint = str(error)
+    return Seen(
+        **row.declared,
+        **counted,
         put=found.number,
+        value=value,
         age_ns=age_ns,
         age_max_ns=None if most_ns == ages.UNBOUNDED_NS else most_ns,
         stale=ages.is_stale(most_ns, bound_ns),
+        complaint=complaint,
     )
-    try:
-        return replace(seen, value=values_for(record, None).unpack(found.value))
-    except (ValueMisfitError, BoardError) as error:
-        return replace(seen, complaint=str(error))

@@ -114,7 +114,7 @@ class Actor:
         self._routes[envelope.sender] = (max(envelope.boot, known), whose)
         if len(self._routes) > SENDERS_MAX:
             self._routes.popitem(last=False)
-        if not self._is_meant(envelope.to):
+        if not self.is_meant(envelope.to):
             here = f"this is {self._declaration.path}, and not {envelope.to}: look the name up anew"
             return [refusal(envelope, "wrong_driver", here)]
         if fault := self.refused(envelope, whose):
@@ -139,7 +139,7 @@ class Actor:
         """Why a message is not taken that came this way; None if it is. Asked as it comes: later the way may be forgotten."""
         return None
 
-    def _is_meant(self, to: str) -> bool:
+    def is_meant(self, to: str) -> bool:
         """Whether a name is this driver's; an address is: the message has come there."""
         found = self._meant.get(to)
         if found is None:

@@ -19,6 +19,7 @@ failover.run(Pwm)
 from __future__ import annotations
 
 import inspect
+import os
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Literal, TypeVar, overload
@@ -27,7 +28,7 @@ import msgspec
 from msgspec import Struct
 
 from failover.core.messaging.pacing import Coalesce
-from failover.core.naming import names
+from failover.core.naming import names, worlds
 from failover.errors import DriverError, NameFormatError
 from failover.kept_state.component import DECLARED, RUNNER
 
@@ -134,7 +135,8 @@ def driver(
     """Declare a class that speaks for one device; `failover.run` runs it. Attributes that are `failover.kept` survive.
 
     Args:
-        path: where the device is in the team's tree of names: ``University/Lab/Robotino/Engines/3/PWM``.
+        path: where the device is in the team's tree of names: ``University/Lab/Robotino/Engines/3/PWM``; in a simulated world
+            (``$FAILOVER_WORLD``) below that.
         alias: one free text or several by which it may be called, too.
         rate_hz: the most commands a second that the device takes; None: as many as come.
         labels: whatever others may want to know.
@@ -145,7 +147,8 @@ def driver(
     """
     aliases = (alias,) if isinstance(alias, str) else tuple(alias)
     try:
-        normal, aliases = names.path(path), tuple(names.alias(one) for one in aliases)
+        world = worlds.checked(os.environ.get(worlds.VARIABLE, ""))
+        normal, aliases = worlds.within(world, names.path(path)), tuple(names.alias(one) for one in aliases)
     except NameFormatError as error:
         raise DriverError(f"cannot declare a driver: {error}") from error
     if rate_hz is not None:

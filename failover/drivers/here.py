@@ -23,11 +23,13 @@ from typing import Final
 
 import xxhash
 from msgspec import Struct
+from msgspec.structs import replace
 
 from failover.boards import locks
 from failover.boards.directory import SHARED_MEMORY, this_robot
 from failover.config import team as team_file
 from failover.config.team import Team, split_address
+from failover.core.naming import worlds
 from failover.core.naming.tree import Claims
 from failover.errors import DriverError, TeamFileError
 
@@ -55,6 +57,7 @@ class Here(Struct, frozen=True):
         secret: this robot's CURVE key, Z85; "" without a team.
         alone: why other robots are not reached, one sentence; "" if they are.
         rules: the team directory, where rights.toml may lie.
+        world: where this process lives, see `failover.core.naming.worlds`.
     """
 
     robot: str
@@ -63,6 +66,7 @@ class Here(Struct, frozen=True):
     secret: str = ""
     alone: str = ""
     rules: Path = SYSTEM_TEAM
+    world: str = ""
 
     @property
     def public(self) -> str:
@@ -95,17 +99,19 @@ def here() -> Here:
 
     Raises:
         DriverError: the directory cannot be used, or the files contradict each other.
+        NameFormatError: $FAILOVER_WORLD names no simulated world.
     """
     directory = Path(os.environ.get(DIRECTORY) or SHARED_MEMORY / f"failover-u{os.geteuid()}-drivers")
     _prepare(directory)
     place = Path(os.environ.get(TEAM) or SYSTEM_TEAM)
+    world = worlds.checked(os.environ.get(worlds.VARIABLE, ""))
     try:
-        return _of_team(directory, place)
+        return replace(_of_team(directory, place), world=world)
     except (TeamFileError, OSError) as error:
         if os.environ.get(TEAM):
             raise DriverError(f"cannot use the team that {TEAM} names: {error}") from error
         alone = f"there is no key for other robots: {error}"
-        return Here(os.environ.get(ROBOT) or this_robot(), directory, alone=alone, rules=place)
+        return Here(os.environ.get(ROBOT) or this_robot(), directory, alone=alone, rules=place, world=world)
 
 
 def _of_team(directory: Path, place: Path) -> Here:
@@ -195,9 +201,18 @@ def refuse_second(here: Here, path: str) -> None:
 
 
 def lives(here: Here, path: str) -> bool:
-    """Whether a process of this robot is the driver of a path."""
+    """Whether a process of this robot is the driver of a path, and of no other."""
+    return _is_held(here.file(path, "lock"))
+
+
+def is_served(calls: str) -> bool:
+    """Whether a process takes messages at this file of a driver, ``….calls``."""
+    return _is_held(Path(calls).with_suffix(".lock"))
+
+
+def _is_held(lock: Path) -> bool:
     try:
-        descriptor = os.open(here.file(path, "lock"), os.O_RDWR | os.O_CLOEXEC)
+        descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
     except OSError:
         return False
     try:

@@ -66,12 +66,12 @@ class Lookup:
 
         def place() -> Place | None:
             try:
-                return self._tree().resolve(name)
+                return self._tree().resolve(name, self._here.world)
             except NameUnknownError:
                 return None
 
         found = self._found(place)
-        return found.resolve(name)
+        return found.resolve(name, self._here.world)
 
     def _tree(self) -> Tree:
         return self._scan.tree(time.monotonic_ns())

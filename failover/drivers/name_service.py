@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import msgspec
@@ -40,7 +40,7 @@ def new_boot() -> int:
 
 
 class NameService:
-    """Registers one record as long as it is open. `resolve` and `tree` may be called from any thread."""
+    """Registers what a process speaks for as long as it is open. `resolve` and `tree` may be called from any thread."""
 
     def __init__(
         self,
@@ -48,10 +48,12 @@ class NameService:
         record: Record,
         terms: Terms = Terms(),  # noqa: B008  frozen
         epoch: Callable[[], int] = lambda: 0,
+        others: Sequence[Record] = (),
     ) -> None:
         """
         Args:
             epoch: of the primacy under which the driver runs now; 0 without an agent.
+            others: what else this process speaks for.
 
         Raises:
             NameFormatError: the record cannot be registered.
@@ -79,6 +81,8 @@ class NameService:
         )
         try:
             self.record = self._scan.put(record, self._now_ns())
+            for other in others:
+                self._scan.put(other, self._now_ns())
         except BaseException:
             self._close()
             raise
@@ -135,7 +139,8 @@ class NameService:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
         with self._lock:
-            self._scan.remove(self.record.path, self._now_ns(), urgent=True)
+            for path in list(self._scan.own.entries):
+                self._scan.remove(path, self._now_ns(), urgent=True)
             until_ns = self._scan.next_ns() + FAREWELL_NS
         while (now_ns := self._now_ns()) < until_ns:
             self._turn(now_ns, until_ns)

@@ -29,7 +29,8 @@ from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import TEXT_MAX, Encoding, Envelope, Hop
 from failover.core.messaging.mailbox import WINDOW
 from failover.core.naming.tree import Place
-from failover.drivers.here import Here, here, lives
+from failover.drivers.here import Here, here, is_served
+from failover.drivers.local import SCHEME
 from failover.drivers.lookup import lookup
 from failover.drivers.route import Route
 from failover.drivers.sending import EXPIRED, SECOND_NS, Posting, refused, sending
@@ -266,7 +267,8 @@ class Proxy:
         said = f"{self.path} did not answer {verb!r} within {timeout_s:g} s"
         if busy:
             return f"{said}: it is busy: {busy}"
-        if self.place.robot == self.here.robot and not lives(self.here, self.path):
+        address = self._sending.route.address
+        if address.startswith(SCHEME) and not is_served(address.removeprefix(SCHEME)):
             return f"{said}: its process has ended; start it again"
         return f"{said}; it may still carry it out"
 

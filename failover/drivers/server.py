@@ -10,8 +10,8 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import msgspec
 from msgspec import Struct
@@ -26,6 +26,7 @@ from failover.core.naming.records import Record, pack
 from failover.core.naming.scan import Terms
 from failover.core.naming.tables import BODY_SIZE_MAX
 from failover.core.naming.tree import robot_of
+from failover.core.naming.worlds import is_simulated
 from failover.drivers import local
 from failover.drivers.actor import Actor, Whose
 from failover.drivers.call_rights import CallRights
@@ -153,7 +154,7 @@ class Serving:
             self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             stack.callback(os.close, self._wake)
             self._open(declaration, stack)
-            self.service = NameService(self.here, self.record_of(declaration), terms, epoch)
+            self.service = NameService(self.here, self.record_of(declaration), terms, epoch, self._others())
             stack.callback(self.service.close)
             self.instance, self._actor = self._made(cls, declaration, f"{self.here.robot}/{self._name}")
             self._actor.fence = self._fence
@@ -172,6 +173,10 @@ class Serving:
         keeping = Keeping(cls, declaration)
         stack.callback(keeping.close)
         return keeping
+
+    def _others(self) -> Sequence[Record]:
+        """What this process registers besides its own record."""
+        return ()
 
     def _made(self, cls: type, declaration: Declaration, who: str) -> tuple[Any, Actor]:
         """The driver, and what hands it its messages."""
@@ -216,6 +221,7 @@ class Serving:
         """With the schemas of its verbs, if a record has room for them; else with their names."""
         record = Record(
             declaration.path,
+            kind="simulated" if is_simulated(declaration.path) else "driver",
             addresses=tuple(self._addresses),
             aliases=declaration.aliases,
             verbs=declaration.schemas(),
@@ -234,7 +240,7 @@ class Serving:
             [f"only programs of this user on {self.here.robot} reach it: {self.here.alone}"] if self.here.alone else []
         )
 
-    def __enter__(self) -> Serving:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -280,8 +286,20 @@ class Serving:
             for ready in self._poller.wait(self._wait_ns()):
                 if (read := self._readers.get(ready)) is not None:  # an earlier one of this turn may have closed it
                     read()
-            self._send(self._actor.handle(self.now_ns))
-            self._actor.sample(self._publish, self.now_ns)
+            self._act()
+
+    def _act(self) -> None:
+        """Carry out what is due now."""
+        self._send(self._actor, self._actor.handle(self.now_ns))
+        self._actor.sample(self._publish, self.now_ns)
+
+    def _addressed(self, to: str) -> Actor | None:
+        """Who is to get a message; None: nothing here has that name."""
+        return self._actor
+
+    def _due_ns(self, now_ns: int) -> int | None:
+        """How long until something is to be done although nothing comes; None: for ever."""
+        return self._actor.wait_ns(now_ns)
 
     def _wait_ns(self) -> int | None:
         """How long the next wait may take. ZeroMQ's descriptor tells of news once, and an answer that left may have used it."""
@@ -291,7 +309,7 @@ class Serving:
                 if not self._sockets.has_message(self._team):
                     break
             return 0
-        return self._actor.wait_ns(self.now_ns())
+        return self._due_ns(self.now_ns())
 
     def _woken(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -359,17 +377,26 @@ class Serving:
                 envelopes.refusal(envelope, "wrong_sender", f"{envelope.sender!r} is no process of {robot}, whose key this is"),
             )
             return
-        if fault := self._actor.turned_away(envelope):  # before its rights: those of the copy that acts count
+        actor = self._addressed(envelope.to)
+        if actor is None:
+            why = f"nothing that {self.service.record.path} speaks for is called {envelope.to[:200]!r}: look the name up anew"
+            self._publish(whose, envelopes.refusal(envelope, "wrong_driver", why))
+            return
+        if fault := actor.turned_away(envelope):  # before its rights: those of the copy that acts count
             said = envelopes.refusal(envelope, fault.kind, fault.sentence)
             self._publish(whose, msgspec.structs.replace(said, epoch=self._epoch_told))
             return
         uid = None if isinstance(whose, Peer) else whose.uid
         if not envelope.verb.startswith("_") or envelope.verb == "_subscribe":
-            denied = self._rights.refusal(uid, robot, envelope.by)
+            denied = self._rights_of(actor).refusal(uid, robot, envelope.by)
             if denied:
                 self._publish(whose, envelopes.refusal(envelope, "denied", denied))
                 return
-        self._send(self._actor.came(envelope, whose, now_ns, len(content)))
+        self._send(actor, actor.came(envelope, whose, now_ns, len(content)))
+
+    def _rights_of(self, actor: Actor) -> CallRights:
+        """Who may call it."""
+        return self._rights
 
     def _note_encoding(self, whose: Whose, encoding: Encoding) -> None:
         if encoding != "json":
@@ -380,9 +407,9 @@ class Serving:
         elif self._encodings:
             self._encodings.pop(whose, None)
 
-    def _send(self, answers: list[Envelope]) -> None:
+    def _send(self, actor: Actor, answers: list[Envelope]) -> None:
         for one in answers:
-            whose = self._actor.route(one.to)
+            whose = actor.route(one.to)
             if whose is not None:
                 self._publish(whose, msgspec.structs.replace(one, epoch=self._epoch_told) if self._epoch_told else one)
 

@@ -170,7 +170,7 @@ class Follower:
             try:
                 yield robot, opened.peer(robot)
             except BoardError as error:
-                path = opened.directory / f"{directory.PEER_PREFIX}{robot}"
+                path = opened.path_of(robot)
                 if path.exists():  # else it went in this moment
                     self._complain(path, error)
 

@@ -51,7 +51,7 @@ def rows(answer: Mapping[str, Any], text_of: Any) -> list[Row]:
     found = []
     for name, robot in answer["robots"].items():
         is_here = name == answer["robot"]
-        state = "this robot" if is_here else robot["state"]
+        state = "this robot" if is_here else "simulated" if robot.get("simulated") else robot["state"]
         age = "" if is_here or robot["age_ms"] is None else span(_ns(robot["age_ms"]))
         found.append(Row((name, "", age, "", "", state), "good" if robot["state"] == "run" else "warning"))
         items = [item for item in answer["items"] if item["robot"] == name]

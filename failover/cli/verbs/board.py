@@ -86,8 +86,11 @@ def _rates(before: list[Seen], after: list[Seen], passed_s: float) -> dict[tuple
 
 def _answer(opened: Board, seen: list[Seen], rates: dict[tuple[str, str], float]) -> dict[str, Any]:
     """The answer that ``--json`` prints."""
+    guests = opened.guests()
     robots = {
-        name: {"state": robot.state, "age_ms": ms(robot.age_ns), "rank": robot.rank} for name, robot in opened.robots().items()
+        name: {"state": robot.state, "age_ms": ms(robot.age_ns), "rank": robot.rank}
+        | ({"simulated": True} if name in guests else {})
+        for name, robot in (opened.robots() | guests).items()
     }
     return {
         "robot": opened.robot,
@@ -114,7 +117,7 @@ def _split(path: str, opened: Board) -> tuple[str, str]:
         BoardError: there is no such robot; names the nearest.
     """
     robot, _, item = path.rpartition("/")
-    robots = list(opened.robots())
+    robots = [*opened.robots(), *opened.guests()]
     if robot and robot not in robots:
         raise BoardError(f"there is no robot {robot!r} on this board{near(robot, robots)}; it has {', '.join(robots)}")
     return robot or opened.robot, item

@@ -14,7 +14,7 @@ from typing import Final
 from msgspec import Struct
 
 from checkpoint.sentences import near
-from failover.core.naming import names
+from failover.core.naming import names, worlds
 from failover.core.naming.names import Kind
 from failover.core.naming.records import Record, numeric, unpack
 from failover.core.naming.tables import Table
@@ -67,9 +67,10 @@ class Claims(Struct, frozen=True):
     def refusal(self, path: str, robot: str) -> str:
         """Why a robot may not claim a path; "" if it may.
 
-        A path with a robot's name as a step is that robot's subtree. What belongs to no robot, any may claim.
+        A path with a robot's name as a step is that robot's subtree. What belongs to no robot, any may claim, and what is
+        simulated belongs to none.
         """
-        if not self.robots or any(_is_under(path, first) for first in self.paths.get(robot, ())):
+        if not self.robots or worlds.is_simulated(path) or any(_is_under(path, first) for first in self.paths.get(robot, ())):
             return ""
         owners = [step for step in path.split("/") if step in self.robots]
         if not owners or robot in owners:
@@ -80,6 +81,11 @@ class Claims(Struct, frozen=True):
 def robot_of(origin: str) -> str:
     """The robot on which an origin runs."""
     return origin.partition("/")[0]
+
+
+def _is_in(world: str, path: str) -> bool:
+    """Whether an alias of a path is one for who lives in a world: a simulated thing is no real one's namesake."""
+    return _is_under(path, world) if world else not worlds.is_simulated(path)
 
 
 def _is_under(path: str, first: str) -> bool:
@@ -113,8 +119,11 @@ class Tree:
     def __len__(self) -> int:
         return len(self._paths)
 
-    def resolve(self, text: str) -> Place:
+    def resolve(self, text: str, world: str = "") -> Place:
         """What answers to a name of any kind.
+
+        Args:
+            world: of the one who asks: paths are below it, and aliases of what is there; "": the real one.
 
         Raises:
             NameFormatError: the text is no name.
@@ -122,7 +131,7 @@ class Tree:
             NameAmbiguousError: several do; lists their paths.
         """
         name = names.parse(text)
-        places = self.claimants(text)
+        places = self.claimants(text, world)
         able = [place for place in places if not place.refused]
         if not able:
             because = places[0].refused if places else "no process that was heard lately has registered it"
@@ -137,12 +146,14 @@ class Tree:
             able = [place for place in able if place.record.path in lives]
         return able[0] if name.kind is Kind.PATH else self._paths[able[0].record.path][0]
 
-    def claimants(self, text: str) -> Sequence[Place]:
+    def claimants(self, text: str, world: str = "") -> Sequence[Place]:
         """All that a name may mean, the preferred one of each path first; raises as `names.parse`."""
         name = names.parse(text)
-        if name.kind is Kind.PATH or name.text in self._paths:
-            return self._paths.get(name.text, ())
-        return self._others.get((name.kind, name.text), ())
+        path = name.text if name.kind is Kind.ADDRESS else worlds.within(world, name.text)
+        if name.kind is Kind.PATH or path in self._paths:
+            return self._paths.get(path, ())
+        others = self._others.get((name.kind, name.text), ())
+        return others if name.kind is Kind.ADDRESS else [one for one in others if _is_in(world, one.record.path)]
 
     def under(self, prefix: str = "") -> list[Place]:
         """Every claim of a path that is the prefix or lies under it, in natural order of the paths; "" for all."""
