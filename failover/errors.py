@@ -181,6 +181,10 @@ class PageError(FailoverError):
     """The operators' page cannot be served as it was asked for, or a request of it is refused; the message says what to do."""
 
 
+class SimulationError(FailoverError):
+    """A simulation of robots cannot begin or go on; the message says why, and what to do."""
+
+
 class ProgramError(FailoverError):
     """Something about a program that is sent to a robot does not work, and nothing changed; the message says what to do."""
 

@@ -36,6 +36,7 @@ PURE_FILES = (
     *(f"checkpoint/{name}.py" for name in PURE_CHECKPOINT),
     "failover/core/",
     "failover/state/",
+    "failover/simulators/world/",
 )
 """Here nothing opens, asks the time, rolls dice or waits: values in, values out."""
 
@@ -279,6 +280,7 @@ DATACLASSES = {
     "failover/config/programs.py": "read from TOML by its fields",
     "failover/config/rights.py": "read from TOML by its fields",
     "failover/config/team.py": "read from TOML by its fields",
+    "failover/simulators/files.py": "read from TOML by its fields",
     "failover/state/record_libraries.py": "programs have some",
     "failover/config/strict_toml.py": "reads TOML into them",
     "failover/config/choices.py": "what is read from TOML is made of them",

@@ -30,6 +30,7 @@ PLACES: Final = """
 Files and environment:
   $FAILOVER_SOCKET                 the agent's control socket; without it $XDG_RUNTIME_DIR/failover/control.sock if that is
                                    there, else /run/failover/control.sock
+  $FAILOVER_WORLD                  Simulated: paths and robots' names mean those of failover simulate
   /etc/failover/agent.toml         the agent's configuration, every key with its default
   /etc/failover/team               who belongs (team.toml, the same on every robot) and this robot's secret key;
                                    $FAILOVER_TEAM names another place
@@ -577,6 +578,23 @@ VERBS: Final = (
         """,
         "failover.cli.arguments.bridges:bridge",
         "failover.cli.verbs.bridges:zenoh",
+    ),
+    Verb(
+        "simulate",
+        "simulated robots: their devices as drivers, their items on the board, a controller each",
+        """
+        Simulate robots in labs: motors, wheels, ultrasonic sensors, batteries (docs/simulation.md). Their devices are drivers
+        below Simulated/, their items are on this robot's board, and a program with FAILOVER_WORLD=Simulated takes them for the
+        real ones. Controllers act 20 times a second, sensors measure 10 times. Without --for it runs until Ctrl-C, then tells
+        lateness, processor time and memory. Exit status 1: a controller missed a deadline of 50 ms. No agent is needed.
+
+          failover simulate
+          failover simulate --robots 80 --labs 4 --for 10min --json
+          failover simulate --world amur-7
+          failover simulate --robots 8 --pace max --for 60
+        """,
+        "failover.cli.arguments.simulate:simulate",
+        "failover.cli.verbs.simulate:simulate",
     ),
     Verb(
         "page",

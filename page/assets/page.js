@@ -20,7 +20,8 @@ const el = (tag, props = {}, ...children) => {
 const set = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 const mark = (node, name, value) => { if (node.getAttribute(name) !== value) node.setAttribute(name, value); };
 const rows = (kind) => [...table].filter(([key]) => key.startsWith(kind + ":")).map(([key, fields]) => [key.slice(kind.length + 1), fields]);
-const compare = (a, b) => a[0].localeCompare(b[0], "en", { numeric: true });
+const order = new Intl.Collator("en", { numeric: true });
+const compare = (a, b) => order.compare(a[0], b[0]);
 const ms = (value) => value == null ? "–" : value < 1000 ? `${+value.toFixed(value < 10 ? 2 : 0)} ms` : value < 120000 ? `${(value / 1000).toFixed(1)} s` : `${Math.round(value / 60000)} min`;
 const size = (value) => { for (const unit of ["B", "KB", "MB"]) { if (value < 1000) return `${+value.toFixed(1)} ${unit}`; value /= 1000; } return `${value.toFixed(1)} GB`; };
 const clock = (date) => date.toDateString() === new Date().toDateString() ? date.toLocaleTimeString("en-GB") : date.toLocaleString("en-GB");
@@ -29,7 +30,7 @@ const list = (values) => values.length ? values.join(", ") : "–";
 const link = (kind, name) => `#/${kind}/${encodeURIComponent(name)}`;
 
 const SIGNS = { protected: ["●", "good"], degraded: ["▲", "warn"], alone: ["◆", "warn"], failed: ["✕", "bad"], unknown: ["?", "bad"], dead: ["✕", "bad"],
-  live: ["●", "good"], suspect: ["▲", "warn"], ended: ["–", "quiet"], unreachable: ["?", "warn"], waiting: ["○", "quiet"], running: ["●", "good"], idle: ["–", "warn"] };
+  live: ["●", "good"], suspect: ["▲", "warn"], ended: ["–", "quiet"], unreachable: ["?", "warn"], waiting: ["○", "quiet"], running: ["●", "good"], idle: ["–", "warn"], simulated: ["◌", "quiet"] };
 const sign = (word) => SIGNS[word] || ["○", "quiet"];
 
 // --- The table, and what is drawn of it ---------------------------------------------------------------------------------
@@ -75,7 +76,8 @@ const away = (why) => { at("away").hidden = !why; set(at("away"), why && `What y
 const nodes = new Map();   // key → its treeitem
 const treeOf = () => {
   const team = table.get("team") || {}, found = [{ key: "team", name: team.team || "team", word: team.healthy ? "well" : "look here", sign: team.healthy ? SIGNS.live : SIGNS.degraded, level: 1 }];
-  const components = rows("component").sort(compare), tasks = rows("task").sort(compare), drivers = rows("driver").sort(compare);
+  const components = rows("component").sort(compare), tasks = rows("task").sort(compare), named = rows("driver").sort(compare);
+  const drivers = named.filter(([, own]) => own.kind !== "simulated");
   const robots = rows("robot").sort((a, b) => b[1].here - a[1].here || compare(a, b));
   const branch = (list, level) => {
     for (const [name, one] of list) {
@@ -91,6 +93,19 @@ const treeOf = () => {
   }
   const orphans = components.filter(([, one]) => !table.has(`robot:${one.primary}`));
   if (orphans.length) { found.push({ key: "robot:", name: "at no robot", word: "", sign: SIGNS.unknown, level: 2 }); branch(orphans, 3); }
+  return found.concat(simulatedNodes(named.filter(([, own]) => own.kind === "simulated")));
+};
+const simulatedNodes = (list) => {   // below the team, a node for each step of their paths, closed until a person opens it
+  const found = [];
+  let before = [];
+  for (const [path, own] of list) {
+    const steps = path.split("/");
+    let depth = 0;
+    while (depth < steps.length - 1 && steps[depth] === before[depth]) depth++;
+    for (; depth < steps.length - 1; depth++) found.push({ key: `place:${steps.slice(0, depth + 1).join("/")}`, name: steps[depth], word: depth ? "" : "robots that are not there", sign: sign("simulated"), level: depth + 2, closed: true });
+    found.push({ key: `driver:${path}`, name: steps.at(-1), word: `simulated, ${own.refused ? "refused" : own.reach}`, sign: sign(own.reach), level: steps.length + 1 });
+    before = steps;
+  }
   return found;
 };
 const taskNode = (name, own, level) => ({ key: `task:${name}`, name, word: `task, ${own.state}`, sign: sign(own.state), level });
@@ -116,7 +131,7 @@ const drawTree = () => {
     parents.length = counts.length = one.level;
     let group = node.querySelector(":scope > [role=group]");
     if (wanted[index + 1]?.level > one.level) {
-      if (!group) { group = el("ul", { role: "group" }); node.append(group); mark(node, "aria-expanded", "true"); }
+      if (!group) { group = el("ul", { role: "group" }); node.append(group); mark(node, "aria-expanded", String(!one.closed)); }
     } else if (group) { group.remove(); node.removeAttribute("aria-expanded"); }
     parents.push(group); counts.push(0);
   }
@@ -131,7 +146,7 @@ const focusNode = (node) => {
   for (const other of at("tree").querySelectorAll("[tabindex='0']")) other.tabIndex = -1;
   node.tabIndex = 0; node.focus();
 };
-const go = (node) => { const [kind, ...rest] = node.dataset.key.split(":"); location.hash = kind === "team" || !rest[0] ? "#/" : link(kind, rest.join(":")); };
+const go = (node) => { const [kind, ...rest] = node.dataset.key.split(":"); if (kind === "place") return mark(node, "aria-expanded", String(node.getAttribute("aria-expanded") === "false")); location.hash = kind === "team" || !rest[0] ? "#/" : link(kind, rest.join(":")); };
 at("tree").addEventListener("click", (event) => { 
   const node = event.target.closest("[role=treeitem]"), open = node?.getAttribute("aria-expanded");
   if (!node) return;
@@ -293,7 +308,7 @@ const driverView = (path) => {
   }
   return { key, node: [el("h2", {}, path), list_, why, forms], update() {
     const one = table.get(key) || {};
-    setFacts([["Robot", one.robot], ["Reach", one.reach], ["Also called", list(one.aliases || [])], ["Versions", list(one.versions || [])]]);
+    setFacts([["Robot", one.kind === "simulated" ? `${one.robot}, which simulates it` : one.robot], ["Reach", one.reach], ["Also called", list(one.aliases || [])], ["Versions", list(one.versions || [])]]);
     set(why, one.refused || one.why_not || ""); forms.hidden = !!one.why_not;
   } };
 };

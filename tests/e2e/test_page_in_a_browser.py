@@ -314,6 +314,35 @@ def test_a_text_of_too_little_contrast_and_a_button_without_a_name_are_seen(brow
         assert any("pale" in one for one in found) and any("BUTTON has no name" in one for one in found)
 
 
+# --- Simulated robots ------------------------------------------------------------------------------------------------------
+
+
+def test_simulated_robots_stand_in_a_branch_of_their_own_which_a_person_opens(
+    browser: Browser, page_of_two: Served, ledger: Path, tmp_path: Path
+) -> None:
+    environment = {**os.environ, "FAILOVER_DRIVERS": str(ledger.parent / "drivers"), "FAILOVER_ROBOT": "robot1"}
+    words = [sys.executable, "-m", "failover", "simulate", "--world", "amur-7", "--board", str(tmp_path / "board")]
+    with subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as simulation, context_of(browser) as context:
+        try:
+            window = logged_in(context, page_of_two, "anna")
+            for step in ("Simulated", "RSUH", "lab1", "AMUR-7", "Engine", "US"):
+                row = item(window, f"^{step}(,|$)").last
+                row.wait_for(timeout=pages.PATIENCE_S * 1000)
+                assert row.get_attribute("aria-expanded") == "false"
+                row.focus()
+                window.keyboard.press("ArrowRight")
+            item(window, "^8, simulated, live").wait_for()
+            item(window, "^Camera, simulated, live").wait_for()
+            item(window, "^Battery, simulated, live").click()
+            window.get_by_role("button", name="read").click()
+            window.get_by_text(re.compile('"?volts"?')).first.wait_for()
+            item(window, "^8, simulated").scroll_into_view_if_needed()
+            picture(window, "simulated")
+        finally:
+            simulation.terminate()
+            simulation.wait(pages.PATIENCE_S)
+
+
 # --- A takeover ---------------------------------------------------------------------------------------------------------------
 
 

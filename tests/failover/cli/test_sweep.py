@@ -71,6 +71,12 @@ PROGRAMS = (
     ),
 )
 DRIVERS = (["names"], ["call", "engine", "read"], ["send", "engine", '{"verb": "read"}'], ["path", "x"], ["graph"])
+SIMULATIONS = (
+    *(["--world", file] for file in ("missing", "directory", "junk", "sparse", "empty", "missing/world.toml")),
+    *(["--robots", "257"], ["--robots", "3", "--labs", "4"], ["--robots", "9", "--labs", "65"], ["--pace", "max"]),
+    ["--world", "amur-7", "--robots", "2"],
+    *(["--for", "1", "--board", at] for at in ("junk", "junk/board", "nowhere/board")),
+)
 PAGES = (
     *(
         ["--listen", address]
@@ -87,6 +93,8 @@ USAGE = (
     *(["bridge", *rest] for rest in ([], ["dds"], ["zenoh", "--rate", "0"])),
     *(["board", "replay", "x", "--pace", pace] for pace in ("0", "nan", "fast")),
     ["task", "run", "--signal", "BELL", "x", "period_ms=20", "--", "true"],
+    *(["simulate", "--robots", count] for count in ("0", "-1", "many")),
+    *(["simulate", *rest] for rest in (["--for", "0"], ["--for", "soon"], ["--pace", "0"], ["--pace", "nan"], ["--seed", "-1"])),
     *(["board", "fly"], ["board", "get"], ["board", "--every-ms", "0"], ["board", "import", "f", "--robot", "a"]),
     *(["check", pid] for pid in NO_PIDS),
     ["check", "1", "--table"],
@@ -220,6 +228,12 @@ def test_with_a_bridge_that_leads_nowhere(options: list[str], capsys: pytest.Cap
     assert told(capsys, "bridge", "zenoh", "--board", "nowhere", *options) == main.FAILED
 
 
+@pytest.mark.parametrize("options", SIMULATIONS, ids=" ".join)
+def test_with_a_world_that_cannot_be(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "simulate", *options) == main.FAILED
+    assert not Path("nowhere").exists()
+
+
 @pytest.mark.parametrize("act", ["inspect", "restore", "remove"])
 def test_with_copies_that_lost_and_are_not_there(act: str, capsys: pytest.CaptureFixture[str]) -> None:
     for at in ("nowhere", "directory", "junk"):
@@ -240,6 +254,6 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"page", "bridge", "ps", "task", "trace", "wait-activation", "rights", "program", "lost", "top"}
+    without |= {"page", "bridge", "simulate", "ps", "task", "trace", "wait-activation", "rights", "program", "lost", "top"}
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}
