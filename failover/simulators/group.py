@@ -66,6 +66,7 @@ class Group:
                 guests.append(Guest(self.place, spec.world.prefix, robot.name, items_of(robot), group))
                 stack.callback(guests[-1].close)
             self._guests.append(guests)
+        self._tell()  # who finds the robots finds their values
 
     # --- Ticks ------------------------------------------------------------------------------------------------------------
 
@@ -75,10 +76,14 @@ class Group:
 
     def tick(self) -> None:
         """The world moves on, and tells."""
-        for life, guests in zip(self.lives, self._guests, strict=True):
+        for life in self.lives:
             life.turn()
+        self._tell()
+
+    def _tell(self) -> None:
+        for life, guests in zip(self.lives, self._guests, strict=True):
             for robot, values in life.values():
-                guests[robot].put(values, life.tick)
+                guests[robot].put(values, life.tick + 1)
 
     def act(self, due_ns: int = 0, deadline_ns: int = 0) -> None:
         """Each robot's controller, one after the other; ``due_ns``: CLOCK_MONOTONIC of this process; 0: in no real time."""

@@ -329,8 +329,7 @@ def test_simulated_robots_stand_in_a_branch_of_their_own_which_a_person_opens(
                 row = item(window, f"^{step}(,|$)").last
                 row.wait_for(timeout=pages.PATIENCE_S * 1000)
                 assert row.get_attribute("aria-expanded") == "false"
-                row.focus()
-                window.keyboard.press("ArrowRight")
+                row.locator(".name").first.click()
             item(window, "^8, simulated, live").wait_for()
             item(window, "^Camera, simulated, live").wait_for()
             item(window, "^Battery, simulated, live").click()

@@ -116,7 +116,7 @@ class Life:
         for robot, one in enumerate(self.robots):
             engines = duties[robot, : one.engines].tobytes() + speeds[robot, : one.engines].tobytes()
             found = [pose[robot].tobytes(), engines]
-            if self.is_sensing or self.tick == 1:
+            if self.is_sensing:
                 found += [ranges[robot, : one.us].tobytes()] if one.us else []
                 found += [battery[robot].tobytes()] if one.battery is not None else []
             for value in found:
