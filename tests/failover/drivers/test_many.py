@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 import failover
+from failover.core.naming.tree import Place
 from failover.drivers.declare import declaration_of
 from failover.drivers.here import Here
 from failover.drivers.lookup import lookup, whole_tree
@@ -107,12 +108,9 @@ def test_a_message_to_what_is_not_there_is_refused_by_name(here: Here) -> None:
             astray.call("read", timeout=1)
 
 
-def moved(place: object, path: str) -> object:
-    """A place as a caller may remember it that is there no more."""
-    import msgspec
-
-    record = msgspec.structs.replace(place.record, path=path)  # type: ignore[attr-defined]
-    return msgspec.structs.replace(place, record=record)
+def moved(place: Place, path: str) -> Place:
+    """As a caller may remember what is there no more."""
+    return replace(place, record=replace(place.record, path=path))
 
 
 def test_rights_are_those_of_each_path(here: Here, tmp_path: Path) -> None:
