@@ -636,15 +636,6 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
 
 
 MUTANTS: tuple[Mutant, ...] = (
-    lease_beyond_the_promise,
-    forgets_its_promise,
-    promise_of_a_minority,
-    breaks_its_promise,
-)
-"""Mistakes that lives with planned restarts catch."""
-
-
-MUTANTS: tuple[Mutant, ...] = (
     impatient_standby,
     lease_from_the_answer,
     forgetful_vote_record,
