@@ -62,6 +62,9 @@ WAITING_MAX: Final = 256
 KEPT_S: Final = 3_600
 """An alert that waits for longer, because the agent was off, is of no use any more."""
 
+SETTLED_NS: Final = 10 * 10**9
+"""After a start the peers have been heard by then: a component that no robot knows is over."""
+
 NOTES_SHOWN: Final = 3
 """Of a component, in a reason."""
 
@@ -109,6 +112,7 @@ class Alerts:
         self._saved = b""
         self._running = 0
         self._news = asyncio.Event()
+        self._began_ns = clock.now_ns()
         self._taken_over: dict[str, int] = {}
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -117,7 +121,7 @@ class Alerts:
         kept = self._read()
         self._watch.troubles = {name: msgspec.structs.replace(one, well_ns=0, is_told=True) for name, one in kept.told.items()}
         now_s = clock.wall_ns(clock.now_ns()) / 1e9
-        self._due.extend(one for one in kept.due if now_s - one.at_s <= KEPT_S)
+        self._due.extend(one for one in kept.due if abs(now_s - one.at_s) <= KEPT_S)
         self._task(self._look())
         self._task(self._run_due())
 
@@ -186,6 +190,8 @@ class Alerts:
                 asked |= peers
         view = await self._questions.joined(asked & peers)
         told = {one["name"]: _sight_of(one) for one in view["components"] if self._tells_of(one, living)}
+        if clock.now_ns() - self._began_ns < SETTLED_NS:
+            return told
         others = (name for name in self._watch.troubles if name not in told)
         return told | {name: Sight(self._watch.troubles[name].epoch, is_over=True) for name in others}
 
@@ -272,7 +278,7 @@ class Alerts:
             return msgspec.json.decode(self._path.read_bytes(), type=Kept)
         except FileNotFoundError:
             return Kept()
-        except (OSError, msgspec.MsgspecError) as error:
+        except (OSError, ValueError, RecursionError) as error:  # ValueError: of msgspec, and of bytes that are no text
             log.warning("%s cannot be used, so what was told before may be told again: %s", self._path, in_words(error))
             return Kept()
 

@@ -77,7 +77,9 @@ def test_of_one_that_no_robot_runs_the_first_of_its_holders_tells(tmp_path: Path
     assert tells_of(tmp_path, team, robot) == expected
 
 
-def test_what_was_told_is_followed_where_it_runs_now_and_outlives_the_worker_process(tmp_path: Path) -> None:
+def test_what_was_told_is_followed_where_it_runs_now_and_outlives_the_worker_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def first_life() -> None:
         alone = component("primary", "robot2", standby="", protection="none", notes=["no robot stands by"])
         robot = alerts(tmp_path, Known(alone, {"robot1": "dead"}), degraded_after_s=1, on_degraded=["true"])
@@ -98,11 +100,16 @@ def test_what_was_told_is_followed_where_it_runs_now_and_outlives_the_worker_pro
     moved = component("standby", "robot1", protection="none")
     well = component("primary", "robot1", standby="robot2")
     assert asyncio.run(second_life(Known(moved, {"robot1": "live"}, {"robot1": well}))) == ["recovered"]
-    assert asyncio.run(second_life(Known({}, {"robot1": "live"}))) == ["recovered"], "it was released"
+    asyncio.run(first_life())
+    released = Known({}, {"robot1": "live"})
+    assert asyncio.run(second_life(released)) == [], "the peers may not have been heard yet"
+    monkeypatch.setattr(module, "SETTLED_NS", 0)
+    assert asyncio.run(second_life(released)) == ["recovered"], "it was released"
 
 
-def test_a_file_that_cannot_be_read_is_no_reason_to_tell_nothing(tmp_path: Path) -> None:
-    (tmp_path / FILE_NAME).write_bytes(b"\xff not ours")
+@pytest.mark.parametrize("content", [b"\xff not ours", b'{"told":{"\xff":1}}', b'{"x":' + b"[" * 100_000])
+def test_a_file_that_cannot_be_read_is_no_reason_to_tell_nothing(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / FILE_NAME).write_bytes(content)
 
     async def begun() -> int:
         robot = alerts(tmp_path, Known({}, {}))
