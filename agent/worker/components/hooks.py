@@ -178,7 +178,8 @@ class Hooks(Struct, frozen=True):
                 content = base64.b64encode(hook.told).decode()
                 options += ["--property=StandardInput=data", f"--property=StandardInputData={content}"]
             way = in_a_unit(self.starter, "hook", name)
-            command, variables, wanted = [*way[:-1], *options, "--", *command], dict(os.environ), {}
+            words = (command[0], *(word.replace("$", "$$") for word in command[1:]))  # systemd would put variables' values there
+            command, variables, wanted = [*way[:-1], *options, "--", *words], dict(os.environ), {}
         reading, writing = os.pipe()
         standard_input = asyncio.subprocess.DEVNULL
         try:

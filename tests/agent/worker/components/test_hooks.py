@@ -113,3 +113,14 @@ def test_how_long_its_output_stays_open_does_not_count_against_its_limit(monkeyp
     outcome = asyncio.run(Hooks().run("before_start", hook, Occasion("/lab/x", "robot1", 1, 64, STARTED)))
     assert outcome.failure == ""
     os.kill(int(outcome.last_line), signal.SIGKILL)
+
+
+def test_systemd_puts_no_variable_into_the_words_of_a_hook(tmp_path: Path) -> None:
+    """A shell that is one of its words would take a value for a part of its script."""
+    starter, note = tmp_path / "systemd-run", tmp_path / "words"
+    starter.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" >{note}\n')
+    starter.chmod(0o700)
+    hook = Hook(("/bin/sh", "-c", 'echo "${FAILOVER_COMPONENT}" $HOME'), 5.0)
+    asyncio.run(Hooks(str(starter)).run("before_start", hook, Occasion("/lab/x", "robot1", 1, 64, STARTED)))
+    words = note.read_text().splitlines()
+    assert words[words.index("/bin/sh") :] == ["/bin/sh", "-c", 'echo "$${FAILOVER_COMPONENT}" $$HOME']
