@@ -394,11 +394,11 @@ class Supervisor:
             occasion = await self._occasions.before_resume(act, descriptors[-1], outage_ns)
             laps.lap("preparing")
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
+            self.component = component  # before anything is waited for: leases and freezes reach it
             acts_ns = component.let_go_ns or clock.now_ns()
             self.figures.resumed = await asyncio.to_thread(_resumed_from, descriptors[-1], act.position, acts_ns)
         finally:
             close_all(tuple(descriptors))
-        self.component = component
         self.figures.restores += 1
         self.figures.commits = Commits()  # of another process: its numbers begin anew
         self.figures.reasons = ()

@@ -15,6 +15,7 @@ from agent.config import ComponentConfig
 from agent.errors import GuardError
 from agent.system.clock import Laps
 from agent.worker.components import prerequisites, resume
+from agent.worker.components import supervisor as supervisor_module
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings
 from agent.worker.components.keeper_client import Following
@@ -206,6 +207,44 @@ def test_a_takeover_that_what_waited_cannot_carry_out_starts_the_program_anew(
         assert tried == [waiting, None]
 
     asyncio.run(run())
+
+
+def test_a_freeze_reaches_a_restored_program_while_its_snapshot_is_read_for_the_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing, guard = cast(Any, None), Told()
+    guard.runs = True
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        store = cast(Any, SimpleNamespace(open_chain=lambda *_: [-1]))
+
+        async def soon(*_: object) -> None:
+            pass
+
+        async def resumed(*_: object) -> tuple[Component, int]:
+            return cast(Component, SimpleNamespace(let_go_ns=1, freeze=guard.freeze, pid=1)), 0
+
+        around = Surroundings(nothing, store, Records(tmp_path), lambda _: None, nothing, soon, nothing)
+        supervisor = Supervisor(NAME, around, epoch=3)
+
+        def read(*_: object) -> None:
+            order = acts.Freeze(NAME, 3)
+            asyncio.run_coroutine_threadsafe(supervisor._at_once(order), loop).result()
+            raise OSError("the rest is not of interest here")
+
+        monkeypatch.setattr(Supervisor, "_stop", soon)
+        monkeypatch.setattr(Supervisor, "_resumed", resumed)
+        monkeypatch.setattr(Supervisor, "_notice", lambda *_: None)
+        monkeypatch.setattr(supervisor_module, "_resumed_from", read)
+        monkeypatch.setattr(supervisor_module.clock, "age_ns", lambda _: 0)
+        monkeypatch.setattr(supervisor_module, "close_all", lambda _: None)
+        monkeypatch.setattr(type(supervisor._occasions), "before_resume", soon)
+        with pytest.raises(OSError, match="not of interest"):
+            await supervisor._restore(acts.Restore(NAME, 3, Position(1, 1, b"d"), None))
+
+    asyncio.run(run())
+    assert not guard.runs
 
 
 class Guarded:
