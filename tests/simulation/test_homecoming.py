@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from failover.core.events import Handover, Prefer
-from failover.core.types import MS, ComponentSpec, Launch
+from failover.core.types import MS, ComponentSpec, Launch, Rules
 from tests.simulation.deeds import LACK
 from tests.simulation.invariants import seen_at
 from tests.simulation.teams import elective, pair
@@ -80,3 +80,17 @@ def test_the_robot_where_it_was_started_stands_by_after_a_handover_so_that_it_ca
     (away,) = later(world, 1_000)
     assert away != "robot3"
     assert seen_at(world, away, PART).standby == "robot3", "though another robot's name is less"
+
+
+def test_where_it_runs_on_the_robot_that_its_operator_chose_as_standby_another_one_stands_by() -> None:
+    rules = Rules(standby="robot2")
+    world = World(1, elective(3, (ComponentSpec(PART, home="robot1", launch=Launch(("part",)), rules=rules),)))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(2_000 * MS)
+    (first,) = world.acting(PART)
+    if first != "robot2":
+        assert seen_at(world, first, PART).standby == "robot2"
+        world.command(first, Handover(world.request(), PART, "robot2"))
+    assert later(world, 2_000) == ["robot2"]
+    assert seen_at(world, "robot2", PART).standby == "robot1"

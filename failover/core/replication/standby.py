@@ -44,11 +44,11 @@ def choose_standby(component: Component, turn: Turn) -> None:
 
     Of those the lesser name.
 
-    Under ``freeze`` it stays for good.
+    The operator's choice says nothing where it runs on that very robot. Under ``freeze`` it stays for good.
     """
     if component.standby and _stays(component, turn):
         return
-    wanted = component.rules.standby
+    wanted = component.rules.standby if component.rules.standby != turn.me else ""
     able = [
         peer
         for peer in turn.team.living(turn.now_ns)
