@@ -16,7 +16,7 @@ from failover.cli.output import render
 from failover.cli.output.team_tree import milliseconds, named
 from failover.cli.verbs.components import agreed
 from failover.client.control import Control
-from failover.client.health import is_unwell, sight
+from failover.client.health import OVER_STATES, is_unwell, sight
 from failover.errors import AgentRefusedError, FailoverError
 
 PATIENCE_S: Final = 60.0
@@ -79,9 +79,14 @@ def drill(arguments: argparse.Namespace) -> int:
                 missed += _missed(legs[-1], arguments.at_most_ms)
         except FailoverError as error:
             missed.append(f"{error}")
+        except KeyboardInterrupt:
+            print(render.spoken(_interrupted(name, home)), file=sys.stderr)
+            raise
         runs_at = _runs_at(agent, name)
-    if runs_at != home:
-        missed.append(f"{name} is not back at {home}: once it is protected, give failover failback {name}")
+    if runs_at and runs_at != home:
+        missed.append(f"{name} is not back at {home}: once it is protected, give failover handover {name} --to {home}")
+    elif not runs_at:
+        missed.append(f"no robot that answers runs {name} now; see failover status {name}")
     report = Report(name, home, standby, runs_at, before.get("promise") or "", tuple(legs), tuple(dict.fromkeys(missed)))
     if arguments.json:
         render.as_json(msgspec.to_builtins(report) | {"kept": not report.missed})
@@ -115,6 +120,13 @@ def _seen(agent: Control, name: str) -> dict[str, Any]:
     """The component as the robot sees it that runs it; empty where no robot that answers does."""
     found = next((one for one in _status(agent)["components"] if one["name"] == name), None)
     return dict(sight(found)) if found is not None else {}
+
+
+def _interrupted(name: str, home: str) -> str:
+    return (
+        f"\nfailover: the drill of {name} was interrupted; a move that was ordered goes on without it. failover status {name} "
+        f"shows where it runs; if that is not {home}: failover handover {name} --to {home}, once it is protected"
+    )
 
 
 def _plan(before: Mapping[str, Any]) -> str:
@@ -155,15 +167,18 @@ def _moved(agent: Control, name: str, source: str, target: str) -> Leg:
 
 
 def _until_protected(agent: Control, name: str, target: str, source: str) -> dict[str, Any]:
-    """Raises AgentRefusedError: it is not protected there by the robot that it came from."""
+    """Raises AgentRefusedError: it is not protected there by the robot that it came from, or has ended."""
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         seen = _seen(agent, name)
         if seen.get("primary") == target and seen.get("protection") == "protected" and seen.get("standby") == source:
             return seen
+        if seen.get("state") in OVER_STATES:
+            how = "has ended" if seen["state"] == "ended" else "was released"
+            raise AgentRefusedError(f"{name} {how} since it moved to {target}; nothing is left to move")
         if time.monotonic() > deadline_s:
             why = "; ".join(seen.get("notes") or ()) or f"{source} holds no checkpoint of it yet"
-            where = f"{name} runs at {seen.get('primary')}"
+            where = f"{name} runs at {seen.get('primary') or 'no robot that answers'}"
             raise AgentRefusedError(f"{where} and was not protected by {source} within {PATIENCE_S:.0f} s: {why}")
         time.sleep(POLL_S)
 
@@ -187,7 +202,8 @@ def _output(agent: Control, name: str) -> int:
 
 def _runs_at(agent: Control, name: str) -> str:
     try:
-        return str(_seen(agent, name).get("primary") or "")
+        seen = _seen(agent, name)
+        return "" if seen.get("state") in OVER_STATES else str(seen.get("primary") or "")
     except FailoverError:
         return ""
 

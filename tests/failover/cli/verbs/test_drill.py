@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
+import json
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
 
+from failover.cli.verbs import drill as module
 from failover.cli.verbs.drill import Leg, Report, _missed, _told
 
 LEG = Leg("robot1", "robot2", 5, 40.0, 0.5, 300.0, 900.0, 98.0, (100, 180))
@@ -42,3 +46,46 @@ def test_the_report_ends_with_where_the_component_is() -> None:
     assert well[-1] == "/lab/x is back at robot1: all was as promised"
     bad = _told(Report("/lab/x", "robot1", "robot2", "robot2", "", legs[:1], ("it did not move",)))
     assert bad[-2:] == ["MISSED: it did not move", "/lab/x runs at robot2"]
+
+
+class Agent:
+    """Of a robot whose component ends, or whose user gives up, once it has moved."""
+
+    def __init__(self, ending: str) -> None:
+        self.ending, self.moved = ending, False
+
+    def ask(self, verb: str, **wanted: Any) -> dict[str, Any]:
+        if verb == "handover":
+            self.moved = True
+            return {"to": wanted["to"], "epoch": 6, "took_ms": 300.0, "sentence": ""}
+        if verb == "logs":
+            return {"totals": [0, 0]}
+        if self.moved and self.ending == "interrupted":
+            raise KeyboardInterrupt
+        here, there = ("robot2", "robot1") if self.moved else ("robot1", "robot2")
+        component = {"name": "/lab/x", "role": "primary", "primary": here, "standby": there, "epoch": 5, "state": "running"}
+        component |= {"state": "ended", "standby": "", "protection": "none"} if self.moved else {"protection": "protected"}
+        return {"robot": "robot1", "peers": [], "components": [component]}
+
+
+def drilled(monkeypatch: pytest.MonkeyPatch, ending: str) -> int:
+    monkeypatch.setattr(module, "connect", lambda _: nullcontext(Agent(ending)))
+    return module.drill(argparse.Namespace(name="x", json=True, yes=True, at_most_ms=None))
+
+
+def test_a_component_that_ends_meanwhile_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "PATIENCE_S", 1.0)
+    assert drilled(monkeypatch, "ended") == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["runs_at"] == "" and "/lab/x has ended since it moved to robot2" in report["missed"][0]
+
+
+def test_whoever_gives_up_is_told_how_to_find_the_component_and_to_bring_it_back(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        drilled(monkeypatch, "interrupted")
+    said = capsys.readouterr().err
+    assert "failover status /lab/x shows where it runs" in said and "failover handover /lab/x --to robot1" in said
