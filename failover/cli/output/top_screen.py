@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Literal, Protocol
 
 from msgspec import Struct
 from rich.text import Text
@@ -58,8 +58,8 @@ class Story(ModalScreen[None]):
 
     def compose(self) -> ComposeResult:
         with VerticalScroll(id="story"):
-            yield Static(Text(self._title, style="bold"))
-            yield Static(Text(self._text), id="told")
+            yield Static(shown(self._title, "bold"))
+            yield Static(shown(self._text), id="told")
 
 
 class Question(ModalScreen[bool]):
@@ -72,7 +72,7 @@ class Question(ModalScreen[bool]):
         self._text = text
 
     def compose(self) -> ComposeResult:
-        yield Static(Text(f"{self._text}\n\ny: yes   n: no"), id="question")
+        yield Static(shown(f"{self._text}\n\ny: yes   n: no"), id="question")
 
 
 class Top(App[None]):
@@ -149,15 +149,15 @@ class Top(App[None]):
         if (picture := self._picture) is None:
             return
         status = picture.status
-        shown = f", sorted by {self._order}" + (f", only {self._wanted!r}" if self._wanted else "")
+        how = f", sorted by {self._order}" + (f", only {self._wanted!r}" if self._wanted else "")
         is_well = team_tree.is_healthy(status)
-        head = f"{'healthy' if is_well else 'DEGRADED'}: team {status['team']}, at {status['robot']}{shown}"
+        head = f"{'healthy' if is_well else 'DEGRADED'}: team {status['team']}, at {status['robot']}{how}"
         self._head(f"{head}. {status.get('promise') or ''}", "green" if is_well else "bold yellow")
-        self.query_one("#remarks", Static).update(Text("\n".join(team_tree.remarks(status)), style="yellow"))
+        self.query_one("#remarks", Static).update(shown("\n".join(team_tree.remarks(status)), "yellow"))
         self._fill(lines(picture.robots, status, self._order, self._wanted))
 
     def _head(self, text: str, style: str) -> None:
-        self.query_one("#head", Static).update(Text(text, style=style))
+        self.query_one("#head", Static).update(shown(text, style))
 
     def _fill(self, found: list[Line]) -> None:
         """Change what is another; the cursor stays where it was, also when lines come and go above it."""
@@ -236,7 +236,7 @@ class Top(App[None]):
 
         def answered(is_meant: bool | None) -> None:
             if is_meant:
-                self._ask(lambda: self._source.order(verb, name, epoch), self.notify)
+                self._ask(lambda: self._source.order(verb, name, epoch), self._say)
 
         self.push_screen(Question(consequence(verb, view)), answered)
 
@@ -246,9 +246,12 @@ class Top(App[None]):
         try:
             told = question()
         except FailoverError as error:
-            self.call_from_thread(self.notify, f"{error}", severity="error", timeout=10)
+            self.call_from_thread(self._say, f"{error}", "error")
         else:
             self.call_from_thread(answered, told)
+
+    def _say(self, text: str, severity: Literal["information", "error"] = "information") -> None:
+        self.notify(shown(text).plain, severity=severity, timeout=10, markup=False)
 
 
 def consequence(verb: str, view: Mapping[str, Any]) -> str:
@@ -265,7 +268,12 @@ def consequence(verb: str, view: Mapping[str, Any]) -> str:
 
 
 def _cell(text: str, line: Line) -> Text:
-    return Text(text, style=COLOURS[line.mood])
+    return shown(text, COLOURS[line.mood])
+
+
+def shown(text: str, style: str = "") -> Text:
+    """As it stands: names and what programs said are no markup, and give the terminal no orders."""
+    return Text("".join(one if one == "\n" or one.isprintable() else " " for one in text), style=style)
 
 
 def run(source: Source) -> None:
