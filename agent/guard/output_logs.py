@@ -97,7 +97,7 @@ class OutputLogs:
 
     def mark(self) -> None:
         """Bytes are about to be written: note when."""
-        self._times.mark(self.totals())
+        self._times.mark(self.totals)
 
     def descriptor(self, stream: int) -> int:
         """The log's file descriptor; it stays this object's."""

@@ -14,7 +14,7 @@ import contextlib
 import os
 import struct
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -38,14 +38,14 @@ class OutputTimes:
         self._path = directory / NAME
         self._marked_ns = 0
 
-    def mark(self, sizes: tuple[int, int]) -> None:
-        """The logs have these sizes, and grow now."""
+    def mark(self, sizes: Callable[[], tuple[int, int]]) -> None:
+        """The logs have these sizes, and grow now; they are asked for where that is to be noted."""
         now_ns = clock.wall_ns(clock.now_ns())
         if 0 <= now_ns - self._marked_ns < STEP_NS:
             return
         self._marked_ns = now_ns
         with contextlib.suppress(OSError):
-            if _appended(self._path, _MARK.pack(now_ns, *sizes)) > SIZE_MAX:
+            if _appended(self._path, _MARK.pack(now_ns, *sizes())) > SIZE_MAX:
                 self._thin()
 
     def _thin(self) -> None:
@@ -74,7 +74,9 @@ class Times:
         self._marks = _read(directory / NAME)
 
     def since(self, wall_ns: int) -> tuple[int, int] | None:
-        """Offsets from which on the streams were written at or after an instant; None: nothing was."""
+        """Offsets from which on the streams were written at or after an instant; None: nothing was. All where no mark tells."""
+        if not self._marks:
+            return 0, 0
         later = [mark for mark in self._marks if mark[0] + STEP_NS >= wall_ns]
         return (min(mark[1] for mark in later), min(mark[2] for mark in later)) if later else None
 

@@ -68,7 +68,7 @@ class Passage(Struct, frozen=True):
     Attributes:
         offsets: from which on; below zero from the end.
         committed: only what no takeover can take back; all of it once it has ended.
-        since_ms: not what is older; 0: of any age.
+        since_ms: not what is older, and nothing before the offsets; 0: of any age.
         times: with the instants at which it was written.
     """
 
@@ -164,7 +164,9 @@ class OutputRelay:
         try:
             if logs.owner is not None:
                 check_right(by, f"the output of {part.name} that is kept here", logs.owner)
-            offset = _since(directory, part, logs.bounds(part.stream).size) if part.since_ms else part.offset
+            size, offset = logs.bounds(part.stream).size, part.offset
+            if part.since_ms:
+                offset = max(_since(directory, part, size), min(offset, size))
             piece = logs.read(part.stream, offset, PIECE_SIZE, committed=part.committed)
         finally:
             logs.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from bisect import bisect_right
 from typing import Any, Final
 
@@ -60,7 +61,7 @@ def logs(arguments: argparse.Namespace) -> int:
     shown = Shown(arguments)
     agent = connect(arguments)
     try:
-        since_ms = arguments.since or 0
+        since_ms, began_s = arguments.since or 0, time.monotonic()
         if arguments.tail is not None:
             totals, since_ms = _show_tail(agent, shown), 0
         while arguments.follow or arguments.tail is None:
@@ -72,7 +73,8 @@ def logs(arguments: argparse.Namespace) -> int:
                     raise
                 agent.close()
                 agent = reconnect(arguments, arguments.name)
-                since_ms = 0 if any(shown.offsets) else since_ms
+                since_ms += int((time.monotonic() - began_s) * 1000) if since_ms else 0  # of a stream of which none was shown
+                began_s = time.monotonic()
     except KeyboardInterrupt:
         return 0
     finally:

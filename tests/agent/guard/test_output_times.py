@@ -74,7 +74,7 @@ def test_the_file_does_not_grow_for_ever_and_the_newest_times_stay_exact(tmp_pat
     times, sizes = OutputTimes(tmp_path), 0
     for number in range(3 * SIZE_MAX // 24):
         calendar[0] = (1_000 * S) + number * STEP_NS
-        times.mark((number, 0))
+        times.mark(lambda number=number: (number, 0))  # type: ignore[misc]
         sizes = max(sizes, (tmp_path / output_times.NAME).stat().st_size)
     assert sizes <= SIZE_MAX + 24
     found = Times(tmp_path)
@@ -109,3 +109,25 @@ def test_a_mark_that_a_power_cut_left_unfinished_is_not_read_and_spoils_none(tmp
         with (tmp_path / output_times.NAME).open("ab") as file:
             file.write(b"torn")
     assert Times(tmp_path).of(1, 0, 9) == [(0, 1_001 * S), (5, 1_002 * S)]
+
+
+def test_where_no_mark_tells_all_of_it_may_be_new(tmp_path: Path) -> None:
+    logs = OutputLogs(tmp_path)
+    logs.write(1, 0, b"of an agent that made no marks")
+    logs.close()
+    assert Times(tmp_path).since(1_000 * S) == (0, 0)
+
+
+def test_how_much_there_is_is_not_asked_for_at_each_write(tmp_path: Path, calendar: list[int]) -> None:
+    logs, asked = OutputLogs(tmp_path), 0
+
+    def totals() -> tuple[int, int]:
+        nonlocal asked
+        asked += 1
+        return 0, 0
+
+    logs.totals = totals  # type: ignore[method-assign]
+    for _ in range(10):
+        logs.mark()
+    logs.close()
+    assert asked == 1, "once within a tenth of a second"

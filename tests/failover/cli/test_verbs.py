@@ -375,6 +375,21 @@ def test_a_person_at_a_terminal_is_asked_before_a_promotion(agent: Start, said: 
     assert ran.returncode == returncode and "promote r2 all the same? [y/N]" in ran.stderr
 
 
+def test_followed_logs_show_nothing_older_after_the_agent_was_restarted(agent: Start) -> None:
+    seen: list[dict[str, Any]] = []
+
+    def answer(request: Request) -> Answer:
+        seen.append(request.arguments)
+        if len(seen) == 1:
+            return [Output(1, 900, b"new")]
+        return [Result({"name": "x", "totals": [903, 500], "exit_status": 0})]
+
+    assert failover("logs", "x", "--follow", "--since", "1min", socket=agent(answer).path).stdout == "new"
+    first, second = seen
+    assert first["since_ms"] == 60_000 and second["offsets"] == [903, 0]
+    assert 60_000 <= second["since_ms"] < 120_000, "of standard error, of which nothing was shown, nothing older either"
+
+
 def test_logs_can_show_one_stream_alone(agent: Start) -> None:
     stand_in = agent(
         lambda request: [Output(1, 0, b"a"), Output(2, 0, b"b"), Result({"name": "x", "totals": [1, 1], "exit_status": 0})]

@@ -90,3 +90,10 @@ def test_a_robot_shows_no_user_what_another_users_component_of_the_same_name_wro
     listener.caller = SimpleNamespace(uid=7002)
     asyncio.run(relay.pass_on(listener, NAME, Passage()))
     assert listener.heard == WRITTEN[:COMMITTED]
+
+
+def test_what_was_shown_before_is_not_shown_again_however_new_it_is(places: Places) -> None:
+    listener: Any = Listener()
+    relay = OutputRelay(Worker(places, State.FINISHED))
+    totals = asyncio.run(relay.pass_on(listener, NAME, Passage((COMMITTED, 0), since_ms=60_000)))
+    assert listener.heard == WRITTEN[COMMITTED:] and totals == (len(WRITTEN), 0)
