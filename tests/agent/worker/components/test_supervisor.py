@@ -237,7 +237,7 @@ def test_a_freeze_reaches_a_restored_program_while_its_snapshot_is_read_for_the_
         monkeypatch.setattr(Supervisor, "_resumed", resumed)
         monkeypatch.setattr(Supervisor, "_notice", lambda *_: None)
         monkeypatch.setattr(supervisor_module, "_resumed_from", read)
-        monkeypatch.setattr(supervisor_module.clock, "age_ns", lambda _: 0)
+        monkeypatch.setattr("agent.worker.components.supervisor.clock.age_ns", lambda _: 0)
         monkeypatch.setattr(supervisor_module, "close_all", lambda _: None)
         monkeypatch.setattr(type(supervisor._occasions), "before_resume", soon)
         with pytest.raises(OSError, match="not of interest"):

@@ -29,9 +29,10 @@ class Source:
     """An agent whose every word is hostile."""
 
     def pictures(self) -> Iterator[Picture]:
-        components = [{**one, "notes": [HOSTILE], "reasons": [HOSTILE]} for one in STATUS["components"]]
-        status: dict[str, Any] = {"team": HOSTILE, **STATUS, "components": components, "promise": HOSTILE}
-        status["peers"] = [{**peer, "lane": HOSTILE} for peer in STATUS["peers"]]
+        known: dict[str, Any] = dict(STATUS)
+        components = [{**one, "notes": [HOSTILE], "reasons": [HOSTILE]} for one in known["components"]]
+        status: dict[str, Any] = {"team": HOSTILE, **known, "components": components, "promise": HOSTILE}
+        status["peers"] = [{**peer, "lane": HOSTILE} for peer in known["peers"]]
         yield Picture(status, task_tree.robots("robot1", (), status, {}))
         time.sleep(1)
 
