@@ -485,6 +485,10 @@ def _check_alerts(path: Path, config: Config, members: Team) -> None:
             f'{where}: user is missing, and this agent runs as root: name whose rights the commands have, as user = "nobody"'
         )
     _check_user(where, alerts.user)
+    if os.geteuid() == 0 and alerts.user and _uid_of(alerts.user) == 0:
+        raise ConfigError(
+            f'{where}: user = {alerts.user!r} is root: commands have an ordinary user\'s rights, as user = "nobody"'
+        )
 
 
 def _check_user(where: str, user: str) -> None:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from agent.event_log import EventLogFile
 from agent.system import clock
 from agent.system.log_setup import DECISIONS
-from failover.core.event_log.decisions import Decision, Line
+from failover.core.event_log.decisions import Decision, Line, without_output
 
 WAITING_MAX: Final = 512
 """Lines that wait for the disk; beyond it they are given up, and counted."""
@@ -123,7 +123,7 @@ class EventLogWriter:
         for line in batch:
             decision = line.decision
             about = {"component": decision.component, "epoch": decision.facts.epoch}
-            log.info("%s: %s", decision.component or self._robot, decision.sentence, extra=about)
+            log.info("%s: %s", decision.component or self._robot, without_output(decision.sentence), extra=about)
         lost = self._given_up
         self.trouble = f"{lost} decisions are missing in the event log: the disk did not take them in time" if lost else ""
         return True

@@ -24,6 +24,7 @@ from checkpoint.errors import CheckpointError
 from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.inherited_limits import Inheritance
+from failover.core.event_log import decisions
 from failover.core.rights.rules import Subject, without_rules
 from failover.errors import RightsError
 
@@ -37,9 +38,6 @@ SCHED_DEADLINE: Final = 6
 ROOT: Final = 0
 NOBODY: Final = -1
 """For questions that a robot asks another one by itself: it may be told how things stand, and no more."""
-
-SAID: Final = "; it said: "
-"""Begins, at the end of a sentence of the status or the event log, the last line that a program wrote."""
 
 _CREDENTIALS: Final = struct.Struct("3i")
 
@@ -106,8 +104,7 @@ def refusal_without_rules(uid: int, right: str, path: str, owners: Mapping[str, 
 def without_output(told: Any) -> Any:
     """The same without the output of programs, in all of its sentences: for a user who may not read their output."""
     if isinstance(told, str):
-        sentence, said, _ = told.partition(SAID)
-        return f"{sentence}; only its owner and root may read what it said" if said else told
+        return decisions.without_output(told)
     if isinstance(told, Mapping):
         return {key: without_output(value) for key, value in told.items()}
     return [without_output(value) for value in told] if isinstance(told, list | tuple) else told

@@ -440,6 +440,9 @@ def test_an_agent_of_root_tells_an_operator_by_a_named_users_rights_alone(direct
     with pytest.raises(ConfigError, match=r"user is missing, and this agent runs as root.*nobody"):
         configuration.load(written(directory, "[alerts]", 'on_split = ["tell"]'))
     assert configuration.load(written(directory, "[alerts]", "limit_s = 5")).config.alerts.limit_s == 5, "nothing would be run"
+    for user in ("root", "0"):
+        with pytest.raises(ConfigError, match=r"is root: commands have an ordinary user's rights"):
+            configuration.load(written(directory, "[alerts]", f'user = "{user}"', 'on_split = ["tell"]'))
 
 
 def test_a_witness_has_nothing_to_tell_of(directory: Path) -> None:

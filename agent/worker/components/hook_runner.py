@@ -12,13 +12,13 @@ from msgspec.structs import replace
 from agent.errors import AgentError
 from agent.hook_kinds import Kind, signal_in
 from agent.system import clock
-from agent.system.permissions import SAID
 from agent.worker.components import hooks
 from agent.worker.components.context import Surroundings, program_of
 from agent.worker.components.hooks import Hook, Occasion
 from agent.worker.components.statistics import Figures
 from checkpoint.snapshot import format
 from failover.core import acts, events
+from failover.core.event_log.decisions import SAID
 from failover.core.types import ComponentSpec
 
 CAPTURE_PAUSE_S: Final = 10

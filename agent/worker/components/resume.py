@@ -12,7 +12,6 @@ from msgspec.structs import replace
 from agent.core_config import started_here, terms_here
 from agent.guard.messages import Task
 from agent.system.clock import Laps
-from agent.system.permissions import SAID
 from agent.worker.components import launch
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
@@ -22,6 +21,7 @@ from checkpoint.model import Snapshot
 from checkpoint.snapshot import format, required_files
 from checkpoint.store.content_store import DIGEST_SIZE, path_in
 from failover.core import acts
+from failover.core.event_log.decisions import SAID
 from failover.core.types import ComponentSpec, Resumption
 
 LINE_LIMIT: Final = 300

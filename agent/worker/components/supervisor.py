@@ -22,7 +22,6 @@ from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
 from agent.system import clock
 from agent.system.adopted_process import Guest
 from agent.system.crash import end_worker_on_mistake
-from agent.system.permissions import SAID
 from agent.worker.components import launch, resume, under_way
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
@@ -39,6 +38,7 @@ from checkpoint.model import Position
 from checkpoint.snapshot import format
 from failover.core import acts, events
 from failover.core.acts import Act
+from failover.core.event_log.decisions import SAID
 from failover.core.types import ComponentSpec, Resumption
 
 KILLED: Final = 9

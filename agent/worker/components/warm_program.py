@@ -12,11 +12,11 @@ from typing import Any, Final
 from agent.errors import TROUBLE, GuardError
 from agent.system import clock
 from agent.system.crash import end_worker_on_mistake
-from agent.system.permissions import SAID
 from agent.worker.components import launch
 from agent.worker.components.component import Component
 from agent.worker.components.launch import Program
 from agent.worker.components.paths import Places
+from failover.core.event_log.decisions import SAID
 
 READY_S: Final = 60.0
 """How long a program may take until it says that it keeps a state; it imports what it needs meanwhile."""

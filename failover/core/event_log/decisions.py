@@ -6,7 +6,12 @@ that had heard a heartbeat sent after this robot's decision decided later (`fail
 
 from __future__ import annotations
 
+from typing import Final
+
 from msgspec import Struct
+
+SAID: Final = "; it said: "
+"""Begins, at the end of a sentence of the status or the event log, the last line that a program wrote."""
 
 
 class Sighting(Struct, frozen=True):
@@ -86,3 +91,9 @@ class Line(Struct, frozen=True):
     wall_ns: int
     decision: Decision
     repeats: int = 0
+
+
+def without_output(sentence: str) -> str:
+    """The same without what a program wrote: for a reader who may not read its output."""
+    before, said, _ = sentence.partition(SAID)
+    return f"{before}; only its owner and root may read what it said" if said else sentence

@@ -15,7 +15,7 @@ from agent import event_log
 from agent.event_log import EventLogFile, packed, read, unpacked
 from agent.main_loop import event_log_writer
 from agent.main_loop.event_log_writer import REPEAT_NS, WAITING_MAX, EventLogWriter
-from failover.core.event_log.decisions import Decision, Facts, Line, Sighting
+from failover.core.event_log.decisions import SAID, Decision, Facts, Line, Sighting
 
 PATIENCE_S = 20.0
 POLL_S = 0.005
@@ -92,6 +92,16 @@ def test_what_a_writer_was_told_is_read_in_order_by_the_next_life(tmp_path: Path
     writer.close(PATIENCE_S)
     assert sentences(tmp_path) == [f"number {number}" for number in range(40)]
     assert {(one.robot, one.life) for one in read(tmp_path).lines} == {("robot1", 7)}
+
+
+def test_the_agents_log_has_no_output_of_a_program(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Others than its owner read the journal; the event log is for root, and `failover why` withholds it from others."""
+    with caplog.at_level("INFO"):
+        writer = EventLogWriter(tmp_path, "robot1", 7)
+        writer.note([Decision(1, "/lab/x", f"it ended{SAID}the password is 1234")])
+        writer.close(PATIENCE_S)
+    assert sentences(tmp_path) == [f"it ended{SAID}the password is 1234"]
+    assert "it ended; only its owner and root may read what it said" in caplog.text and "1234" not in caplog.text
 
 
 def test_a_disk_that_hangs_delays_nobody_and_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
