@@ -13,7 +13,7 @@ from tests.simulation.chaos import TEAMS, life
 from tests.simulation.invariants import Broken
 from tests.simulation.mutants import AS_THE_SEED_SAYS, CAUGHT_BY, ELECTIVE_MUTANTS, MUTANTS, Mutant, mistaken
 
-SEEDS = int(os.environ.get("FAILOVER_SEEDS", "400"))
+SEEDS = int(os.environ.get("FAILOVER_SEEDS", "300"))
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 

@@ -1,6 +1,6 @@
 """A keeper that is killed at any instant leaves the program unharmed, and an unfinished restore leaves nothing.
 
-``FAILOVER_KILLS`` says how often each is tried (20 unless set; 200 for a long look).
+``FAILOVER_KILLS`` says how often each is tried (10 unless set; 200 for a long look).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ Wanted = TypeVar("Wanted")
 LATE_S = 0.05
 """By so much a keeper is late on purpose, where a program that runs waits for less."""
 
-KILLS = int(os.environ.get("FAILOVER_KILLS", "20"))
+KILLS = int(os.environ.get("FAILOVER_KILLS", "10"))
 
 WORKER = """
 import hashlib, sys, time
