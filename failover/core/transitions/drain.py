@@ -13,12 +13,14 @@ from failover.core.types import MS, State
 
 
 def review(component: Component, turn: Turn) -> None:
-    """Ask the standby whether it could run the component, once it has a checkpoint; `failback.inquired` hands it over then."""
+    """Ask the standby whether it could run the component, once it has a checkpoint; `failback.inquired` hands it over then.
+
+    Also while a snapshot is under way: the handover waits for it. Where each takes longer than the period, one always is.
+    """
     if turn.now_ns < component.drain_ns or hindrance(component, turn):
         return
-    if component.flight is None:
-        component.drain_ns = turn.now_ns + PAUSE * turn.config.retry_ms * MS
-        turn.order(acts.Inquire(component.name, component.epoch, component.standby))
+    component.drain_ns = turn.now_ns + PAUSE * turn.config.retry_ms * MS
+    turn.order(acts.Inquire(component.name, component.epoch, component.standby))
 
 
 def hindrance(component: Component, turn: Turn) -> str:

@@ -21,11 +21,11 @@ UNFIT_PAUSE: Final = 30
 
 
 def review(component: Component, turn: Turn) -> None:
-    """Ask the preferred robot, once it keeps up and some time has passed."""
+    """Ask the preferred robot, once it keeps up and some time has passed; the handover waits for a snapshot under way."""
     prefer = component.rules.prefer
     if prefer in ("", turn.me) or prefer != component.standby or turn.now_ns < component.return_ns or turn.is_drained(prefer):
         return
-    if component.acked is not None and component.flight is None and turn.alive(prefer):
+    if component.acked is not None and turn.alive(prefer):
         component.return_ns = turn.now_ns + PAUSE * turn.config.retry_ms * MS
         turn.order(acts.Inquire(component.name, component.epoch, prefer))
 
