@@ -295,8 +295,16 @@ def test_a_claim_without_consent_gives_no_right_to_act_alone_after_a_restart() -
 
 def test_of_robots_with_the_same_checkpoint_the_preferred_one_then_the_least_loaded_then_the_lesser_name() -> None:
     component = Component(NAME, spec=ComponentSpec(NAME, rules=Rules(prefer="robot9")))
-    loads = {"robot10": 0, "robot2": 0, "robot1": 3, "robot9": 7}
-    assert sorted(loads, key=lambda robot: placing(component, robot, loads[robot])) == ["robot9", "robot2", "robot10", "robot1"]
+    node = Node(Config("robot1", ("robot2", "robot9", "robot10")), 1, VoteRecord(), 0)
+    turn = node._turn(0)
+    turn.load, turn.team.peers["robot9"].load = 3, 7
+
+    def order() -> list[str]:
+        return sorted(("robot1", *turn.team.peers), key=lambda robot: placing(component, turn, robot))
+
+    assert order() == ["robot9", "robot2", "robot10", "robot1"]
+    turn.team.peers["robot9"].drained = True
+    assert order() == ["robot2", "robot10", "robot1", "robot9"], "a drained one is the last"
 
 
 @pytest.mark.parametrize(
