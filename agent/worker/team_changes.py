@@ -49,6 +49,8 @@ UNHEARD_NS: Final = 10_000_000_000
 """A member that was not heard since this agent's start counts as one that lives for so long: it may be starting, too."""
 
 ALIVE: Final = ("alive", "suspect")
+RESTARTING: Final = "restarting"
+"""Its agent is away, as it announced, and what it runs acts on."""
 
 TEAM_IS: Final = "team_is"
 """The question which team a robot has: any member may ask it, and a former one as well."""
@@ -422,7 +424,7 @@ def refuse(objection: str) -> None:
 
 
 def _may_live(peer: PeerView) -> bool:
-    return peer.state in ALIVE or (peer.state == "unheard" and peer.silent_ns < UNHEARD_NS)
+    return peer.state in (*ALIVE, RESTARTING) or (peer.state == "unheard" and peer.silent_ns < UNHEARD_NS)
 
 
 def _note_refusal(work: asyncio.Task[dict[str, Any]]) -> None:

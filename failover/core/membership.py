@@ -177,15 +177,15 @@ class Membership:
         self._configure(config)
         self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
         self._stranger_ns = 0
-        self._former_until_ns: dict[str, int] = {}
+        self._former: dict[str, Peer] = {}
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
         for peer in self.peers.values():
             self._count_loyalty(peer)
         self._awaits = False
         for one in awaited:
-            if one.robot in self.peers:
-                self._await(self.peers[one.robot], one.ms, now_ns)
-                self.peers[one.robot].awaited = (one.boot, 0)
+            peer = self.peers.get(one.robot) or self._former.setdefault(one.robot, Peer(one.robot, now_ns))
+            self._await(peer, one.ms, now_ns)
+            peer.awaited = (one.boot, 0)
 
     def _configure(self, config: Config) -> None:
         self._config = config
@@ -196,19 +196,24 @@ class Membership:
     def change(self, config: Config, now_ns: int) -> None:
         """Go on with these peers. A new one is dead until it is heard; a former one is dead once its last lease is over.
 
-        A new member cannot act on anything that this robot told it, so no grace is due to it, and no takeover waits for it.
+        A new member cannot act on anything that this robot told it, so no grace is due to it, and no takeover waits for it. One
+        that belonged to the team until just now can: what it was told and promised then holds to its end.
         """
         self._configure(config)
-        before_ns = now_ns - self._grace_ns
-        left = {
-            robot: max(peer.loyal_until_ns, peer.awaited_until_ns)
-            for robot, peer in self.peers.items()
-            if robot not in config.peers
+        known = self._former | self.peers
+        self.peers = {robot: self.peers.get(robot) or self._newcomer(robot, now_ns) for robot in config.peers}
+        self._former = {
+            robot: peer for robot, peer in known.items() if robot not in config.peers and _bound_until_ns(peer) > now_ns
         }
-        self._former_until_ns = {robot: at for robot, at in (self._former_until_ns | left).items() if at > now_ns}
-        self.peers = {robot: self.peers.get(robot) or Peer(robot, before_ns) for robot in config.peers}
         for peer in self.peers.values():
             self._count_loyalty(peer)
+
+    def _newcomer(self, robot: str, now_ns: int) -> Peer:
+        peer = Peer(robot, now_ns - self._grace_ns)
+        if (former := self._former.get(robot)) is not None:
+            peer.awaited_until_ns, peer.awaited_ms = _bound_until_ns(former), former.awaited_ms
+            peer.awaited = (former.awaited[0], 0)
+        return peer
 
     def hear(self, beat: Beat, link: str, now_ns: int) -> tuple[Entry, ...]:
         """Take in a beat; returns its entries that are news. A stranger's beat is none."""
@@ -262,7 +267,8 @@ class Membership:
         """The promises that are not over, for the vote record."""
         if not self._awaits:
             return ()
-        running = (peer for peer in self.peers.values() if now_ns < peer.awaited_until_ns)
+        promised = (peer for peer in (*self.peers.values(), *self._former.values()) if peer.awaited_ms)
+        running = (peer for peer in promised if now_ns < peer.awaited_until_ns)
         kept = tuple([Awaited(peer.robot, peer.awaited[0], peer.awaited_ms) for peer in running])
         self._awaits = bool(kept)
         return kept
@@ -303,10 +309,12 @@ class Membership:
             peer.unread_ns = min(peer.unread_ns + late_ns, now_ns) if peer.unread_ns else 0
             self._count_loyalty(peer)
             if now_ns - late_ns < peer.awaited_until_ns:
-                longest_ns = now_ns + self._config.awaited_ns(peer.awaited_ms)
+                longest_ns = now_ns + max(self._config.awaited_ns(peer.awaited_ms), self._config.loyalty_ns_max)
                 peer.awaited_until_ns = min(peer.awaited_until_ns + late_ns, max(longest_ns, peer.awaited_until_ns))
         self._stranger_ns = min(self._stranger_ns + late_ns, now_ns) if self._stranger_ns else 0
-        self._former_until_ns = {robot: at_ns + late_ns for robot, at_ns in self._former_until_ns.items()}
+        for peer in self._former.values():
+            peer.loyal_until_ns += late_ns
+            peer.awaited_until_ns += late_ns if now_ns - late_ns < peer.awaited_until_ns else 0
         self._born_ns += late_ns
 
     def loyal_until_ns(self, robot: str) -> int:
@@ -345,7 +353,7 @@ class Membership:
     def dead(self, robot: str, now_ns: int) -> bool:
         """Silent for longer than any lease that it may still act on. A robot that is no peer at all is dead to us."""
         if robot not in self.peers:
-            return now_ns >= self._former_until_ns.get(robot, 0)
+            return robot not in self._former or now_ns >= _bound_until_ns(self._former[robot])
         peer = self.peers[robot]
         return now_ns >= peer.loyal_until_ns and now_ns >= peer.awaited_until_ns
 
@@ -494,6 +502,11 @@ class Membership:
             awaited_ns=self.awaited_ns(peer.robot, now_ns),
             drained=peer.drained,
         )
+
+
+def _bound_until_ns(former: Peer) -> int:
+    """Until when a former member must not be replaced: it may act until then on what it was told, or promised."""
+    return max(former.loyal_until_ns, former.awaited_until_ns)
 
 
 def _state_name(number: int) -> str:

@@ -440,3 +440,8 @@ def test_a_robot_that_was_not_heard_since_the_start_may_be_starting_too(tmp_path
     silent_ns = team_changes.UNHEARD_NS
     asyncio.run(town["a"].change("remove", "b"))
     assert town["a"].on_disk == ["a"]
+
+
+def test_a_robot_whose_agent_restarts_lives() -> None:
+    assert team_changes._may_live(PeerView("r2", "restarting", 1, 3_000_000_000, False, 0, awaited_ns=10_000_000_000))
+    assert not team_changes._may_live(PeerView("r2", "dead", 1, 3_000_000_000, False, 0))

@@ -236,3 +236,27 @@ def test_a_stall_of_our_own_is_not_counted_as_silence_of_a_robot_that_is_waited_
     team.forgive(WAIT_MS * MS, (10 + WAIT_MS) * MS)
     assert not team.dead("robot2", (9 + 2 * WAIT_MS) * MS)
     assert team.dead("robot2", (10 + 2 * WAIT_MS) * MS)
+
+
+def test_a_promise_outlives_that_its_robot_leaves_the_team_and_our_restart_and_that_it_joins_again() -> None:
+    team, alone, kept = Membership(PATIENT, 1, 0), replace(PATIENT, peers=()), (Awaited("robot2", 1, 20_000),)
+    team.hear(asks(1), "eth0", 10 * MS)
+    team.change(alone, 20 * MS)
+    assert team.awaited(21 * MS) == kept, "the record would forget it"
+    team.change(PATIENT, 30 * MS)
+    over_ns = (10 + WAIT_MS) * MS
+    assert team.awaited(31 * MS) == kept and team.promises(kept) == ()
+    assert not team.dead("robot2", over_ns - 1) and team.dead("robot2", over_ns)
+    assert team.awaited(over_ns) == ()
+    later = Membership(alone, 2, 0, kept)
+    assert later.awaited(MS) == kept and not later.dead("robot2", WAIT_MS * MS - 1)
+    assert later.dead("robot2", WAIT_MS * MS) and later.awaited(WAIT_MS * MS) == ()
+
+
+def test_a_member_that_joins_again_at_once_is_not_replaced_while_it_may_act_on_what_it_heard_before() -> None:
+    team = Membership(PAIR, 1, 0)
+    team.hear(beat(1), "eth0", 10 * MS)
+    team.change(replace(PAIR, peers=()), 20 * MS)
+    team.change(PAIR, 30 * MS)
+    assert team.awaited(31 * MS) == (), "it was promised nothing"
+    assert not team.dead("robot2", (9 + LOYALTY_MS) * MS) and team.dead("robot2", (10 + LOYALTY_MS) * MS)
