@@ -418,7 +418,8 @@ class Membership:
     def keeps_waiting(self, robot: str, now_ns: int) -> bool:
         """Whether a peer would count as dead, but for packets from it that cannot be authenticated."""
         peer = self.peers[robot]
-        return not peer.boot and peer.heard_ns + self._grace_ns <= now_ns < peer.loyal_until_ns
+        is_silent = now_ns >= max(peer.heard_ns + self._grace_ns, peer.awaited_until_ns)
+        return not peer.boot and is_silent and now_ns < peer.loyal_until_ns
 
     def strangers_until_ns(self) -> int:
         """For how long a robot that the team file does not know has proved to live: one that belonged to the team, perhaps."""

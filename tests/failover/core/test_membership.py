@@ -260,3 +260,10 @@ def test_a_member_that_joins_again_at_once_is_not_replaced_while_it_may_act_on_w
     team.change(PAIR, 30 * MS)
     assert team.awaited(31 * MS) == (), "it was promised nothing"
     assert not team.dead("robot2", (9 + LOYALTY_MS) * MS) and team.dead("robot2", (10 + LOYALTY_MS) * MS)
+
+
+def test_an_operators_order_does_not_pass_over_one_that_is_waited_for_because_it_cannot_be_authenticated() -> None:
+    team = Membership(replace(PATIENT, grace_ms=100), 2, 0, (Awaited("robot2", 1, 20_000),))
+    at_ns = (WAIT_MS - 1) * MS
+    team.unreadable("robot2", "a wrong key", at_ns)
+    assert not team.keeps_waiting("robot2", at_ns) and team.keeps_waiting("robot2", WAIT_MS * MS)
