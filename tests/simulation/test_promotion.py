@@ -7,6 +7,7 @@ import pytest
 from failover.core.events import Promote
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rules, State, WhenAlone
 from tests.simulation.invariants import seen_at, state_at
+from tests.simulation.planned import with_grace
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
@@ -163,3 +164,16 @@ def test_who_waits_for_a_checkpoint_is_told_when_its_keeper_is_lost() -> None:
     later(world)
     assert "server1 is not heard any more; try again" in world.log[-1]
     assert "holds a checkpoint of it" in told(world, last)
+
+
+def test_an_operator_is_told_whose_restart_a_promotion_waits_for() -> None:
+    specs = (ComponentSpec(PART, launch=Launch(("part",))),)
+    world = World(1, with_grace(pair(specs, ("robot1", "robot2", "robot3")), 9_000))
+    for name in world.robots:
+        world.power_on(name)
+    assert later(world, 2_000) == ["robot1"]
+    world.restart("robot3", 8_000 * MS)
+    later(world, 300)
+    world.power_off("robot1")
+    later(world)
+    assert "the agent of robot3 restarts, and robot2 has promised to wait for it: ask again in" in told(world, "robot2")

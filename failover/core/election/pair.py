@@ -101,7 +101,7 @@ def waits_after_boot_ns(component: Component, turn: Turn) -> int:
 
 
 def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> bool:
-    """No living member holds it or knows its end, and each member is heard or dead.
+    """No living member holds it or knows its end, and each member is heard or dead (or its agent restarts: `_is_passed_over`).
 
     A server or a witness repeats an end that it has heard of: its word, or its silence, counts until a majority knows of none.
 
@@ -115,12 +115,26 @@ def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> boo
         if turn.gone(robot) or (is_ordered and turn.team.keeps_waiting(robot, turn.now_ns)):
             continue
         if not turn.alive(robot):
+            if _is_passed_over(component, turn, peer):
+                continue
             return False
         if not _is_free_of(component, robot, peer):
             if turn.config.runs(robot):
                 return False
             is_doubtful = True
     return not is_doubtful or _is_not_ended(component, turn)
+
+
+def _is_passed_over(component: Component, turn: Turn, peer: Peer) -> bool:
+    """Whether votes decide without a robot whose agent restarts: its last word is that it has nothing to do with the component.
+
+    Were it the primary all the same, the majority that elected it would be bound to it. Only a majority can do without it so:
+    under pair each robot is waited for. So is one that may hold the newest checkpoint, until it is dead.
+    """
+    robot = peer.robot
+    if not turn.config.by_majority or robot in (component.primary, *component.entrusted):
+        return False
+    return turn.team.awaited_ns(robot, turn.now_ns) > 0 and _is_free_of(component, robot, peer)
 
 
 def _is_free_of(component: Component, robot: str, peer: Peer) -> bool:
