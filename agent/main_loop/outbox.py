@@ -84,11 +84,17 @@ class Outbox(Struct):
         return Due(beats=self._beats((beat,), now_ns), acts=self._free_acts())
 
     def _queue(self, act: Act) -> None:
-        """Put an act last. Of the leases of one component only the newest waits: a disk may be full for a night."""
+        """Put an act last. Of the leases of one component only the newest waits: a disk may be full for a night.
+
+        The core still waits for the word that one of an earlier lease of the same epoch asked for.
+        """
         if self.waiting and isinstance(act, SetLease):
             for one in list(self._acts):
-                if isinstance(one[1], SetLease) and one[1].component == act.component:
+                earlier = one[1]
+                if isinstance(earlier, SetLease) and earlier.component == act.component:
                     self._acts.remove(one)
+                    if earlier.is_asked and earlier.epoch == act.epoch:
+                        act = msgspec.structs.replace(act, is_asked=True)
         self._acts.append((self._ordered, act))
 
     def _beats(self, beats: tuple[Beat, ...], now_ns: int) -> tuple[Beat, ...]:

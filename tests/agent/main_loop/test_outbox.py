@@ -69,6 +69,21 @@ def test_leases_do_not_pile_up_behind_a_disk_that_is_full() -> None:
     assert box.kept(1, NEW, 1000).acts == (act(1), SetLease("/a", 4, 999), SetLease("/b", 1, 999))
 
 
+def test_a_newer_lease_asks_for_the_word_that_the_one_it_replaces_asked_for() -> None:
+    box = outbox()
+    box.take(Ready(NEW), 1)
+    box.take(Ready(act=(SetLease("/a", 4, 20, is_asked=True), SetLease("/b", 1, 20))), 2)
+    box.take(Ready(act=(SetLease("/a", 4, 30), SetLease("/b", 1, 30))), 3)
+    assert box.kept(1, NEW, 4).acts == (SetLease("/a", 4, 30, is_asked=True), SetLease("/b", 1, 30))
+
+
+def test_a_later_epochs_lease_answers_for_no_earlier_one() -> None:
+    box = outbox()
+    box.take(Ready(NEW), 1)
+    box.take(Ready(act=(SetLease("/a", 4, 20, is_asked=True), SetLease("/a", 5, 30))), 2)
+    assert box.kept(1, NEW, 3).acts == (SetLease("/a", 5, 30),)
+
+
 def test_a_later_vote_record_covers_the_earlier_ones() -> None:
     box = outbox()
     box.take(Ready(NEW, act=(act(1),)), 1)
