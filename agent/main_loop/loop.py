@@ -77,8 +77,11 @@ PERSIST_PATIENCE_S: Final = 2.0
 ASK_NS: Final = 3 * NANOSECONDS_A_SECOND
 """How long an end waits for the worker to find out whether it is a restart."""
 
+DISK_NS: Final = 2 * NANOSECONDS_A_SECOND
+"""How long a restart waits for this robot's own disk, once all that it waits for from its peers is there, or is not to come."""
+
 LEAVE_NS: Final = 5 * NANOSECONDS_A_SECOND
-"""How long a restart waits, beyond the grace, for what the core still waits for, and for this robot's own disk."""
+"""How long a restart waits, beyond the grace, for what the core still waits for."""
 
 COMES_BACK: Final = signal.SIGUSR1
 """Told by this, the agent announces that another one starts at once, as it does when systemd restarts it; then it ends."""
@@ -168,7 +171,7 @@ class MainLoop:
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
         self._ending = self._rests = self._leaves = False
-        self._ends_ns = 0
+        self._ends_ns = self._disk_ns = 0
         self._listens = True
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
@@ -265,12 +268,16 @@ class MainLoop:
             return False
         now_ns = clock.now_ns()
         is_over = now_ns >= self._ends_ns
-        if self._leaves and (is_over or (self._node.may_go(now_ns) and not self._outbox.waiting)):
-            exposed = self._node.exposed(now_ns)
-            if exposed:
-                log.warning(NOT_AWAITED, ", ".join(exposed))
-            return True
-        return is_over
+        if not self._leaves:
+            return is_over
+        waits_for_disk = self._node.may_go(now_ns) and self._outbox.waiting
+        self._disk_ns = (self._disk_ns or now_ns + DISK_NS) if waits_for_disk else 0
+        if not is_over and (now_ns < self._disk_ns or not self._node.may_go(now_ns)):
+            return False
+        exposed = dict.fromkeys((*self._node.exposed(now_ns), *self._outbox.unleased))
+        if exposed:
+            log.warning(NOT_AWAITED, ", ".join(exposed))
+        return True
 
     def _open_board(self) -> None:
         """Map the board that the worker has made; a robot without its board still protects its programs."""

@@ -61,6 +61,11 @@ class Outbox(Struct):
         """Whether a vote record is on its way to the disk."""
         return self._kept < self._ordered
 
+    @property
+    def unleased(self) -> tuple[str, ...]:
+        """The components whose guards wait for a lease that waits for the disk."""
+        return tuple(act.component for _, act in self._acts if isinstance(act, SetLease) and act.until_ns)
+
     def take(self, ready: Ready, now_ns: int) -> Due:
         """Take in new obligations; return those that may leave now: `NOTHING` if there are none."""
         if ready.persist is None and not ready.send and not ready.act and not self._acts and self._kept >= self._ordered:

@@ -84,6 +84,16 @@ def test_a_later_epochs_lease_answers_for_no_earlier_one() -> None:
     assert box.kept(1, NEW, 3).acts == (SetLease("/a", 5, 30),)
 
 
+def test_it_names_the_components_whose_newest_lease_waits_for_the_disk() -> None:
+    box = outbox()
+    assert box.unleased == ()
+    box.take(Ready(NEW, act=(act(1),)), 1)
+    box.take(Ready(act=(SetLease("/a", 4, 20), SetLease("/b", 1, 20))), 2)
+    assert box.unleased == ("/a", "/b")
+    box.kept(1, NEW, 3)
+    assert box.unleased == ()
+
+
 def test_a_later_vote_record_covers_the_earlier_ones() -> None:
     box = outbox()
     box.take(Ready(NEW, act=(act(1),)), 1)
