@@ -393,6 +393,8 @@ class MainLoop:
             ready = self._node.step(event, now_ns)
             due = self._outbox.take(ready, now_ns)
             if due is not NOTHING:
+                if self._leaves and due.beats and self._outbox.waiting:
+                    self._node.left_without_promises(due.beats[-1].counter)
                 self._obey(due)
             if ready.told:
                 self._event_log.note(ready.told)

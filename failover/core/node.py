@@ -197,6 +197,10 @@ class Node:
         )
         return self._leaving_ns > 0 and (now_ns >= self._leaving_ns or (told and not self.exposed(now_ns)))
 
+    def left_without_promises(self, counter: int) -> None:
+        """That beat of ours left while this robot's disk was slow: its promises come with a later one, and so `may_go` waits."""
+        self._dependents = {robot: max(at, counter + 1) for robot, at in self._dependents.items()}
+
     def exposed(self, now_ns: int) -> tuple[str, ...]:
         """The components here that stand still soon after this agent ends, and are taken over, unless it is back at once."""
         turn = self._turn(now_ns)

@@ -10,7 +10,7 @@ from failover.core import acts
 from failover.core.component import Component
 from failover.core.election.consent import STATES
 from failover.core.election.pair import placing
-from failover.core.events import Captured, Handover, Received, Run, Started, Stored, Tick
+from failover.core.events import Captured, Handover, Leave, Received, Run, Started, Stored, Tick
 from failover.core.node import Node
 from failover.core.types import MS, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, VoteRecord, WhenAlone
 from failover.core.wire.messages import FREE, SAFE, Beat, Echo, Entry
@@ -337,3 +337,20 @@ def test_a_voters_standby_shows_output_only_as_far_as_its_primary_says_that_it_i
 def shown(ready: acts.Ready) -> list[Position]:
     """How far readers may see from now on."""
     return [act.position for act in ready.act if isinstance(act, acts.Show)]
+
+
+def test_an_agent_goes_only_after_its_peer_has_heard_a_beat_that_left_with_the_promise() -> None:
+    talk = Talk(replace(WITNESS, restart_grace_ms=1_000))
+    talk.tick(400)
+    for _ in range(3):
+        talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST))
+        talk.tick(20)
+    talk.readies.append(talk.node.step(Leave(), talk.now_ns))
+    (first,) = talk.readies[-1].send
+    assert [promise.robot for promise in first.promises] == ["robot1"]
+    talk.node.left_without_promises(first.counter)
+    talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST))
+    assert not talk.node.may_go(talk.now_ns), "the disk was slow, and that beat has not said it"
+    talk.tick(40)
+    talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST))
+    assert talk.node.may_go(talk.now_ns)
