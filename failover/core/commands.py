@@ -95,7 +95,8 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
         return f"cannot {verb} {name}: {how}; failover stop or release it first, or choose another name"
     if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):
         again_s = left_ns // (1_000 * MS) + 1
-        return f"cannot {verb} {name}: {component.primary} has it, and its agent restarts; ask again in {again_s} s"
+        how = "its agent restarts" if turn.team.peers[component.primary].is_asked else "it is not heard"
+        return f"cannot {verb} {name}: {component.primary} has it, and {how}; ask again in {again_s} s"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
         if entry is not None and not vacant(component, turn) and component.state not in ENDED:

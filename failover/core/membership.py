@@ -76,7 +76,8 @@ class Peer(Struct):
         loyal_until_ns: `Membership.loyal_until_ns`, counted when something of it changes: it is asked for several times a step.
         awaited_until_ns: until when we have promised not to replace it, because its agent restarts; ``awaited_ms``: what we
             granted, without the margin; ``awaited``: (boot, counter) of its newest beat that asked, (boot, 0) if an earlier life
-            of ours heard that. promised_ns: until when it has promised not to replace us.
+            of ours heard that; ``is_asked``: else our agent restarts, and it acts on our word. promised_ns: until when
+            it has promised not to replace us.
     """
 
     robot: str
@@ -101,6 +102,7 @@ class Peer(Struct):
     awaited_until_ns: int = 0
     awaited_ms: int = 0
     awaited: tuple[int, int] = (0, 0)
+    is_asked: bool = False
     promised_ns: int = 0
     links: dict[str, int] = field(default_factory=dict)
     entries: dict[str, _Known] = field(default_factory=dict)
@@ -185,7 +187,7 @@ class Membership:
         for one in awaited:
             peer = self.peers.get(one.robot) or self._former.setdefault(one.robot, Peer(one.robot, now_ns))
             self._await(peer, one.ms, now_ns)
-            peer.awaited = (one.boot, 0)
+            peer.awaited, peer.is_asked = (one.boot, 0), one.is_asked
 
     def _configure(self, config: Config) -> None:
         self._config = config
@@ -212,7 +214,7 @@ class Membership:
         peer = Peer(robot, now_ns - self._grace_ns)
         if (former := self._former.get(robot)) is not None:
             peer.awaited_until_ns, peer.awaited_ms = _bound_until_ns(former), former.awaited_ms
-            peer.awaited = (former.awaited[0], 0)
+            peer.awaited, peer.is_asked = (former.awaited[0], 0), former.is_asked
         return peer
 
     def hear(self, beat: Beat, link: str, now_ns: int) -> tuple[Entry, ...]:
@@ -240,7 +242,7 @@ class Membership:
         grace_ms = min(beat.grace_ms, self._config.restart_grace_ms)
         if grace_ms > 0:
             self._await(peer, grace_ms, now_ns)
-            peer.awaited = (beat.boot, beat.counter)
+            peer.awaited, peer.is_asked = (beat.boot, beat.counter), True
 
     def _await(self, peer: Peer, grace_ms: int, now_ns: int) -> None:
         """Promise it; one that was longer stays."""
@@ -253,6 +255,7 @@ class Membership:
     def promise_unasked(self, robot: str, now_ns: int) -> None:
         """This agent is about to restart, and a peer acts on its word: that one may go on until the next is there."""
         peer = self.peers[robot]
+        peer.is_asked = peer.is_asked and now_ns < peer.awaited_until_ns
         self._await(peer, self._config.restart_grace_ms, now_ns)
         peer.awaited = (peer.boot, peer.counter)
 
@@ -269,7 +272,7 @@ class Membership:
             return ()
         promised = (peer for peer in (*self.peers.values(), *self._former.values()) if peer.awaited_ms)
         running = (peer for peer in promised if now_ns < peer.awaited_until_ns)
-        kept = tuple([Awaited(peer.robot, peer.awaited[0], peer.awaited_ms) for peer in running])
+        kept = tuple([Awaited(peer.robot, peer.awaited[0], peer.awaited_ms, peer.is_asked) for peer in running])
         self._awaits = bool(kept)
         return kept
 
@@ -456,6 +459,11 @@ class Membership:
             return 0
         return max(peer.asked_ns + self._config.lease_ns if peer.asked_ns else 0, peer.promised_ns)
 
+    def hears_us(self, robot: str, now_ns: int) -> bool:
+        """Whether a peer has echoed a beat of ours that left within a lease; a promise to wait for us is no echo."""
+        asked_ns = self.peers[robot].asked_ns
+        return asked_ns > 0 and asked_ns + self._config.lease_ns > now_ns
+
     def views(self, now_ns: int) -> tuple[PeerView, ...]:
         """For the status."""
         return tuple(self._view(peer, now_ns) for peer in self.peers.values())
@@ -475,7 +483,7 @@ class Membership:
             now_ns - peer.heard_ns,
             self.loyal_until_ns(peer.robot) - peer.heard_ns,
             tuple((link, now_ns - at) for link, at in sorted(peer.links.items())),
-            self.lease_ns(peer.robot) > now_ns,
+            self.hears_us(peer.robot, now_ns),
             says,
         )
 
@@ -490,7 +498,7 @@ class Membership:
         silent_ns = now_ns - peer.heard_ns
         state = self._state(peer, now_ns)
         heard = tuple(link for link, at in sorted(peer.links.items()) if now_ns - at < self._loyalty_ns)
-        hears_us = self.lease_ns(peer.robot) > now_ns
+        hears_us = self.hears_us(peer.robot, now_ns)
         return PeerView(
             peer.robot,
             state,
@@ -502,6 +510,7 @@ class Membership:
             self.unread(peer.robot, now_ns),
             awaited_ns=self.awaited_ns(peer.robot, now_ns),
             drained=peer.drained,
+            is_asked=peer.is_asked,
         )
 
 

@@ -463,11 +463,13 @@ class Awaited(Struct, frozen=True):
     Attributes:
         boot: life of its agent that was promised it.
         ms: for so long, and its margin: since its newest beat that asked, and again since a start of ours.
+        is_asked: it has asked for that; else our agent restarts, or did, and that robot acts on our word.
     """
 
     robot: str
     boot: int
     ms: int
+    is_asked: bool = True
 
 
 class VoteRecord(Struct, frozen=True):
@@ -513,6 +515,7 @@ class PeerView(Struct, frozen=True):
     ``unread``: why what comes from it cannot be authenticated, if something of that kind came lately. ``refused``: what it said
     beyond what it may say, a sentence for each reason; ``doubted``: some of it lately. ``awaited_ns``: for how long it is not
     replaced, because its agent announced that it comes back; 0: it did not, or that is over. ``drained``: it is to run nothing.
+    ``is_asked``: it has asked to be waited for; else our own agent has restarted, and promised it.
     """
 
     robot: str
@@ -527,6 +530,7 @@ class PeerView(Struct, frozen=True):
     doubted: bool = False
     awaited_ns: int = 0
     drained: bool = False
+    is_asked: bool = True
 
 
 class ComponentView(Struct, frozen=True):

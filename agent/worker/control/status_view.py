@@ -49,6 +49,9 @@ PRIMARY_STATES: Final = frozenset(
     {State.CLAIMING, State.STARTING, State.PRIMARY, State.FROZEN, State.HANDING_OVER, State.RECOVERING, State.TAKING_OVER}
 )
 AWAITED: Final = "its agent restarts, as it announced; {} replaces it in {:.0f} s, if it is not back by then"
+PROMISED: Final = (
+    "{0} has promised to wait for it, as {0} itself restarted; {0} replaces it in {1:.0f} s, if it is not back by then"
+)
 
 PEER_STATES: Final = {"alive": "live", "unheard": "unknown"}
 
@@ -160,7 +163,8 @@ def _slots(view: SlotsView) -> dict[str, Any]:
 
 def _peer(peer: PeerView, link: PeerConnection | None, told: Told, settings: Settings) -> dict[str, Any]:
     awaited_s = peer.awaited_ns / NANOSECONDS_A_MILLISECOND / 1_000
-    awaited = AWAITED.format(settings.config.robot, awaited_s) if peer.awaited_ns else ""
+    why = AWAITED if peer.is_asked else PROMISED
+    awaited = why.format(settings.config.robot, awaited_s) if peer.awaited_ns else ""
     reason = list(dict.fromkeys(filter(None, (awaited, link.reason if link is not None else "", peer.unread, *peer.refused))))
     return {
         "name": peer.robot,

@@ -411,7 +411,7 @@ def _outlast(component: Component, turn: Turn, sender: str, entry: Entry, theirs
     """Go on above the other's epoch, so that the least work is lost; where that robot does not hear us, give up to it as ever."""
     if entry.epoch < component.epoch:
         return  # it will hear of ours
-    if turn.team.lease_ns(sender) > turn.now_ns:
+    if turn.team.hears_us(sender, turn.now_ns):
         component.rival_ns = 0
         ours = "was promoted by an operator" if component.ordered else "never stopped acting"
         turn.say(component, f"{turn.me} keeps its copy, which {ours}; the one of {sender} began in epoch {entry.born}")
@@ -520,7 +520,7 @@ def _acted_all_along(component: Component, turn: Turn) -> bool:
 
 def _go_on_above_the_end(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     """As soon as the other robot hears us: until then it would not follow."""
-    if turn.team.lease_ns(sender) > turn.now_ns:
+    if turn.team.hears_us(sender, turn.now_ns):
         turn.say(
             component, f"{turn.me} keeps its copy, which never stopped acting; {sender} tells of an end in epoch {entry.epoch}"
         )

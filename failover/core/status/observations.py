@@ -56,14 +56,16 @@ class Watch(Struct):
 
     def _follow_restart(self, turn: Turn, peer: Peer) -> None:
         robot, left_ns = peer.robot, peer.awaited_until_ns - turn.now_ns
-        if left_ns > 0 and robot not in self._awaited:
+        if left_ns > 0 and peer.awaited_ms and robot not in self._awaited:
             self._awaited.add(robot)
-            turn.say_of_robot(
-                f"the agent of {robot} is to restart: {turn.me} promises to wait {left_ns / (1_000 * MS):.1f} s for it"
+            why = (
+                f"the agent of {robot} is to restart" if peer.is_asked else f"what runs at {robot} acts on the word of {turn.me}"
             )
+            left_s = left_ns / (1_000 * MS)
+            turn.say_of_robot(f"{why}: {turn.me} promises to wait {left_s:.1f} s for {'it' if peer.is_asked else robot}")
         elif left_ns <= 0 and robot in self._awaited:
             self._awaited.discard(robot)
-            if turn.alive(robot):
+            if turn.alive(robot) and peer.is_asked:
                 turn.say_of_robot(f"the agent of {robot} is back: {turn.me} waits for it no longer than ever")
 
     def _greet(self, turn: Turn, event: Received) -> None:

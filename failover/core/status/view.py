@@ -193,9 +193,13 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         and component.state is State.STANDBY
         and (left_ns := turn.team.awaited_ns(component.primary, turn.now_ns))
     ):
-        notes.append(
-            f"the agent of {component.primary} restarts, as it announced: {left_ns / NS_PER_S:.0f} s more it is waited for"
+        is_asked = turn.team.peers[component.primary].is_asked
+        why = (
+            "restarts, as it announced"
+            if is_asked
+            else f"is not heard, and {turn.me} has promised to wait when it restarted itself"
         )
+        notes.append(f"the agent of {component.primary} {why}: {left_ns / NS_PER_S:.0f} s more it is waited for")
     if component.unprotected:
         notes.append(
             "not protected any more: on_unsupported = stop_protecting; to protect it again: failover release, then protect"

@@ -96,12 +96,16 @@ def _why_not_vacant(component: Component, turn: Turn) -> str:
         return f"{component.primary} lives and has it; ask there"
     if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):
         promised = f"{turn.me} has promised to wait for it, and its program may act until then"
-        return f"the agent of {component.primary} restarts; {promised}: ask again in {_seconds(left_ns)}"
+        return f"{_away(turn, component.primary)}; {promised}: ask again in {_seconds(left_ns)}"
     awaited = {robot: left_ns for robot in turn.team.peers if (left_ns := turn.team.awaited_ns(robot, turn.now_ns))}
     if awaited:
         robot, left_ns = max(awaited.items(), key=lambda one: one[1])
-        return f"the agent of {robot} restarts, and {turn.me} has promised to wait for it: ask again in {_seconds(left_ns)}"
+        return f"{_away(turn, robot)}, and {turn.me} has promised to wait for it: ask again in {_seconds(left_ns)}"
     return f"some robots are neither heard nor silent for {_loyalty(turn)} ms yet"
+
+
+def _away(turn: Turn, robot: str) -> str:
+    return f"the agent of {robot} restarts" if turn.team.peers[robot].is_asked else f"{robot} is not heard"
 
 
 def _seconds(left_ns: int) -> str:

@@ -267,3 +267,18 @@ def test_an_operators_order_does_not_pass_over_one_that_is_waited_for_because_it
     at_ns = (WAIT_MS - 1) * MS
     team.unreadable("robot2", "a wrong key", at_ns)
     assert not team.keeps_waiting("robot2", at_ns) and team.keeps_waiting("robot2", WAIT_MS * MS)
+
+
+def test_a_promise_that_no_one_asked_for_says_so_until_it_is_asked_for_and_a_promise_is_no_echo() -> None:
+    team = Membership(PATIENT, 1, 0)
+    team.asked(7, MS)
+    team.hear(Beat("robot2", 1, 1, promises=(Promise("robot1", 1, 7, 20_000),)), "eth0", 10 * MS)
+    assert team.lease_ns("robot2") > 10 * MS and not team.views(10 * MS)[0].hears_us
+    team.promise_unasked("robot2", 10 * MS)
+    kept = team.awaited(11 * MS)
+    assert kept == (Awaited("robot2", 1, 20_000, is_asked=False),) and not team.views(11 * MS)[0].is_asked
+    assert not Membership(PATIENT, 2, 0, kept).views(MS)[0].is_asked
+    team.hear(asks(2), "eth0", 20 * MS)
+    assert team.awaited(21 * MS) == (Awaited("robot2", 1, 20_000),)
+    team.promise_unasked("robot2", 30 * MS)
+    assert team.views(31 * MS)[0].is_asked, "it asked for what still runs"

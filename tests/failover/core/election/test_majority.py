@@ -354,3 +354,5 @@ def test_an_agent_goes_only_after_its_peer_has_heard_a_beat_that_left_with_the_p
     talk.tick(40)
     talk.hear("robot1", entry(State.PRIMARY, 1, "robot1", NEWEST))
     assert talk.node.may_go(talk.now_ns)
+    told = [one.sentence for ready in talk.readies for one in ready.told]
+    assert "what runs at robot1 acts on the word of witness1: witness1 promises to wait 1.1 s for robot1" in told
