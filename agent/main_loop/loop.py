@@ -89,6 +89,9 @@ COMES_BACK: Final = signal.SIGUSR1
 STOP_S: Final = 15
 """How long systemd waits for the next word of an agent that waits for its peers before it restarts."""
 
+NEEDS_SHARE: Final = 5
+"""It says so this often in that time, also where no watchdog is on."""
+
 SIGNALS_MAX: Final = 64
 """Read at once; more of them say nothing new."""
 
@@ -170,8 +173,8 @@ class MainLoop:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = self._rests = self._leaves = False
-        self._ends_ns = self._disk_ns = 0
+        self._ending = self._rests = self._leaves = self._is_announced = False
+        self._ends_ns = self._disk_ns = self._needs_ns = 0
         self._listens = True
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
@@ -212,9 +215,10 @@ class MainLoop:
             now_ns = clock.now_ns()
             if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
                 self._notifier.alive()
-                if self._leaves:
-                    self._notifier.needs(STOP_S)
                 fed_ns = now_ns
+            if self._leaves and now_ns >= self._needs_ns:
+                self._notifier.needs(STOP_S)
+                self._needs_ns = now_ns + STOP_S * NANOSECONDS_A_SECOND // NEEDS_SHARE
         if not self._remembered:
             self._notifier.stopping()
         self._end()
@@ -246,15 +250,22 @@ class MainLoop:
         del self._inputs[descriptor]
 
     def _heed_signals(self) -> None:
-        """End; where another agent starts at once, after the peers have promised to wait. A second signal ends it as it is."""
+        """End; where another agent starts at once, after the peers have promised to wait. A second signal ends it as it is.
+
+        The one by which systemd carries out a restart that was announced before is no second one.
+        """
         numbers = self._wake.recv(SIGNALS_MAX)
-        if self._ends_ns or self._node is None or signal.SIGINT in numbers:
+        if self._node is None or signal.SIGINT in numbers:
             self._ending = True
-        elif signal.SIGTERM in numbers:
+        elif self._ends_ns:
+            self._ending = self._ending or not self._is_announced or COMES_BACK in numbers
+            self._is_announced = False
+        elif COMES_BACK in numbers:
+            self._is_announced = signal.SIGTERM not in numbers
+            self._leave()
+        else:
             self._ends_ns = clock.now_ns() + ASK_NS
             self._worker.send(IsRestart())
-        else:
-            self._leave()
 
     def _leave(self) -> None:
         """Announce the restart, until `_may_end`."""

@@ -26,8 +26,11 @@ STARTED: Final = "SYSTEMD_EXEC_PID"
 STOP_S: Final = 5
 """How long a shutdown waits for a component to obey SIGTERM; one that is frozen never does, and the default is 90 s."""
 
-ASK_S: Final = 1.5
-"""How long systemd may take to answer a question; it has more to do just then."""
+ASK_S: Final = 2.5
+"""How long systemd may take to answer a question; it has more to do just then. Without an answer a restart counts as a stop.
+
+Less than the main loop waits for that answer (``ASK_NS``).
+"""
 
 Kind = Literal["guard", "keeper", "hook", "directory"]
 

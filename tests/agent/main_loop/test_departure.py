@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 from types import SimpleNamespace
 from typing import Any
 
@@ -53,3 +54,35 @@ def test_a_disk_that_answers_in_time_and_is_busy_again_later_is_waited_for_anew(
 
 def test_one_whose_promises_are_there_ends_at_once_and_says_nothing(at: list[int], caplog: pytest.LogCaptureFixture) -> None:
     assert MainLoop._may_end(leaving(waiting=False, may_go=True)) and not caplog.messages
+
+
+def signalled(*numbers: int, ends_ns: int = 0, is_announced: bool = False) -> Any:
+    """A loop to which these signals came at once; ``said``: what it did about them."""
+    said: list[str] = []
+    one = SimpleNamespace(
+        _wake=SimpleNamespace(recv=lambda _: bytes(numbers)),
+        _node=object(),
+        _worker=SimpleNamespace(send=lambda _: said.append("asks")),
+        _leave=lambda: said.append("leaves"),
+        _ends_ns=ends_ns,
+        _is_announced=is_announced,
+        _ending=False,
+        said=said,
+    )
+    MainLoop._heed_signals(one)
+    return one
+
+
+def test_a_restart_that_was_announced_before_systemd_ends_the_agent_waits_for_the_promises_all_the_same() -> None:
+    assert signalled(signal.SIGUSR1).said == ["leaves"]
+    assert signalled(signal.SIGUSR1, signal.SIGTERM).said == ["leaves"]
+    announced = signalled(signal.SIGTERM, ends_ns=1, is_announced=True)
+    assert not announced._ending and announced.said == [] and not announced._is_announced
+    assert signalled(signal.SIGTERM, ends_ns=1)._ending, "the next one ends it as it is"
+
+
+def test_an_end_asks_whether_it_is_a_restart_and_an_interrupt_waits_for_nothing() -> None:
+    asked = signalled(signal.SIGTERM)
+    assert asked.said == ["asks"] and asked._ends_ns and not asked._ending
+    assert signalled(signal.SIGINT)._ending and signalled(signal.SIGINT, ends_ns=1, is_announced=True)._ending
+    assert signalled(signal.SIGUSR1, ends_ns=1)._ending
