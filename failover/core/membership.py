@@ -364,6 +364,14 @@ class Membership:
         """Heard in this life of ours, and not silent for too long. One that is waited for is neither alive nor dead."""
         return robot in self.peers and self.peers[robot].boot > 0 and now_ns < self.peers[robot].loyal_until_ns
 
+    def is_owed(self, robot: str, now_ns: int) -> bool:
+        """Whether a later life of a robot is heard than the one that we promised to wait for, and it has not given that back.
+
+        Then a guard of that robot may still act on the promise, although its agent knows nothing of it.
+        """
+        peer = self.peers[robot]
+        return now_ns < peer.awaited_until_ns and peer.boot > peer.awaited[0]
+
     def awaited_ns(self, robot: str, now_ns: int) -> int:
         """For how long a silent peer is waited for still, because its agent restarts as it announced; 0: it is heard, or dead."""
         peer = self.peers.get(robot)

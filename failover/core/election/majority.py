@@ -47,6 +47,8 @@ def is_free(component: Component, turn: Turn) -> bool:
         return turn.dead(primary) and turn.team.rested(turn.now_ns)
     if turn.gone(primary):
         return True
+    if turn.team.is_owed(primary, turn.now_ns):
+        return False
     entry = peer.entry(component.name)
     if entry is not None:
         return turn.alive(primary) and state_of(entry) not in _BOUND

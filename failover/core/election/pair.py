@@ -118,6 +118,8 @@ def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> boo
             if _is_passed_over(component, turn, peer):
                 continue
             return False
+        if robot == component.primary and turn.team.is_owed(robot, turn.now_ns):
+            return False
         if not _is_free_of(component, robot, peer):
             if turn.config.runs(robot):
                 return False

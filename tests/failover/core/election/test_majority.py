@@ -9,11 +9,11 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.component import Component
 from failover.core.election.consent import STATES
-from failover.core.election.pair import placing
+from failover.core.election.pair import placing, vacant
 from failover.core.events import Captured, Handover, Leave, Received, Run, Started, Stored, Tick
 from failover.core.node import Node
 from failover.core.types import MS, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, VoteRecord, WhenAlone
-from failover.core.wire.messages import FREE, SAFE, Beat, Echo, Entry
+from failover.core.wire.messages import FREE, RETURNED, SAFE, Beat, Echo, Entry
 from failover.errors import RulesError
 
 NAME = "/lab/x"
@@ -356,3 +356,29 @@ def test_an_agent_goes_only_after_its_peer_has_heard_a_beat_that_left_with_the_p
     assert talk.node.may_go(talk.now_ns)
     told = [one.sentence for ready in talk.readies for one in ready.told]
     assert "what runs at robot1 acts on the word of witness1: witness1 promises to wait 1.1 s for robot1" in told
+
+
+@pytest.mark.parametrize(("grace_ms", "free"), [(0, False), (RETURNED, True)])
+def test_a_new_life_that_says_it_runs_nothing_frees_no_voter_before_it_gives_the_promise_back(grace_ms: int, free: bool) -> None:
+    config = replace(ROBOT, restart_grace_ms=9_000)
+    talk = Talk(config)
+    talk.tick(400)
+    primary = entry(State.PRIMARY, 1, "robot2", NEWEST)
+    for counter in range(1, 4):
+        beat = Beat("robot2", 1, counter, counter, 0, 1, (), (primary,), grace_ms=9_000 if counter == 3 else 0)
+        talk.node.step(Received(beat, "wire"), talk.now_ns)
+        talk.tick(20)
+    for counter in range(1, 10):
+        idle = entry(State.STANDBY, 1, "robot2", NEWEST)
+        beat = Beat("robot2", 2, counter, counter, 0, 1, (), (idle,), grace_ms=grace_ms)
+        talk.readies.append(talk.node.step(Received(beat, "wire"), talk.now_ns))
+        talk.hear("witness1", idle)
+        talk.tick(20)
+    component, turn = talk.node._components[NAME], talk.node._turn(talk.now_ns)
+    assert (component.free, vacant(component, turn)) == (free, free)
+    for _ in range(600):
+        talk.hear("witness1")
+        talk.node.step(Received(replace(beat, counter=(counter := counter + 1), grace_ms=0), "wire"), talk.now_ns)
+        talk.tick(20)
+    component, turn = talk.node._components[NAME], talk.node._turn(talk.now_ns)
+    assert component.free and vacant(component, turn), "to its end, and no longer"
