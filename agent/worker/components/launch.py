@@ -403,14 +403,17 @@ async def reconnect(socket_path: Path, places: Places) -> Component:
     """Find a component again after the agent was restarted.
 
     Raises:
-        GuardLostError: no guard listens there any more; the left-over socket has been removed.
+        GuardLostError: no guard listens there any more, and the left-over socket has been removed; or it cannot be asked now, and
+            the socket stays for the next agent.
     """
     try:
         guard = connect(socket_path)
-    except OSError as error:
+    except (ConnectionRefusedError, FileNotFoundError) as error:
         with contextlib.suppress(FileNotFoundError):
             socket_path.unlink()
         raise GuardLostError(f"the guard of {socket_path.name} has gone: {error.strerror}") from error
+    except OSError as error:
+        raise GuardLostError(f"cannot reach the guard of {socket_path.name}: {error.strerror}; its socket stays") from error
     early: list[Any] = []  # events behind the answer, which come before the component is there to hear them
 
     def keep(message: Any) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import fcntl
 import os
 import signal
@@ -524,3 +525,19 @@ def test_logs_that_were_closed_write_into_no_other_file(tmp_path: Path) -> None:
     logs.close()
     with pytest.raises(OSError, match="Bad file descriptor"):
         logs.commit((1, 1))
+
+
+@pytest.mark.parametrize(("error", "stays"), [(errno.ECONNREFUSED, False), (errno.EAGAIN, True), (errno.EMFILE, True)])
+def test_only_a_socket_at_which_no_guard_listens_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, stays: bool
+) -> None:
+    def refuse(_path: Path) -> None:
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(launch, "connect", refuse)
+    path = tmp_path / "guard"
+    path.touch()
+    nowhere: Any = None
+    with pytest.raises(GuardLostError, match=os.strerror(error)):
+        asyncio.run(launch.reconnect(path, nowhere))
+    assert path.exists() is stays
