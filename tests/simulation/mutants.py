@@ -577,6 +577,11 @@ def drained_all_the_same() -> Any:
     return patch.object(drain, "review", lambda *_: None)
 
 
+def waits_for_every_restart() -> Any:
+    """No component is taken over while the agent of any member restarts."""
+    return patch.object(pair, "_is_passed_over", lambda *_: False)
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
@@ -630,6 +635,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (leaves_without_a_word, "the_peer_of_a_program_that_chose_safety_restarts"),
     (freezes_what_ran_on, "an_agent_restarts_as_announced_and_nothing_moves"),
     (waits_though_it_is_back, "a_robot_that_is_lost_soon_after_its_restart_is_replaced_at_once"),
+    (waits_for_every_restart, "an_agent_that_restarts_and_runs_nothing_delays_no_takeover"),
     (back_too_soon, "an_agent_that_is_back_and_not_heard_by_all_is_waited_for"),
 )
 """Mistakes that a pair survives, or that cost no promise but the peace: each spoils a scenario."""
