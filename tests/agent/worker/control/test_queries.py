@@ -8,8 +8,8 @@ from typing import Any, Final, cast
 
 import pytest
 
-from agent.system.permissions import SAID
 from agent.worker.control.queries import Lines, Questions
+from failover.core.event_log.decisions import SAID
 
 OWNER: Final = 7001
 WORDS: Final = "password: swordfish"

@@ -13,11 +13,11 @@ from typing import Any, cast
 import pytest
 
 from agent.errors import RefusedError
-from agent.system.permissions import SAID
 from agent.worker.control.queries import Lines, Questions
 from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.verbs import Verbs
 from failover.config.rights import RIGHTS_FILE
+from failover.core.event_log.decisions import SAID
 from failover.core.types import State
 
 NOBODY = 65_534
