@@ -60,11 +60,13 @@ def test_agents_restart_as_planned_in_peace_unnoticed_and_beside_all_other_fault
             raise Broken(f"seed {seed}: {story}") from None
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
 def test_a_mistake_in_the_rules_of_a_pair_is_caught_by_some_seed(mutant: Mutant) -> None:
     _catch(mutant, (PAIR,))
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("mutant", ELECTIVE_MUTANTS, ids=lambda mutant: mutant.__name__)
 def test_a_mistake_in_the_rules_of_voters_is_caught_by_some_seed(mutant: Mutant) -> None:
     _catch(mutant, VOTERS)
