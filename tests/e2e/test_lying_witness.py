@@ -33,8 +33,8 @@ CHANGES = {
 }
 
 
-def beat(self, entries, echoes):
-    said = honest(self, entries, echoes)
+def beat(self, *said_of, **more):
+    said = honest(self, *said_of, **more)
     try:
         with open(os.environ["FAILOVER_TEST_LIE"]) as file:
             change = CHANGES[file.read()]
