@@ -74,6 +74,7 @@ def test_no_team_changes_while_a_member_is_away_and_one_that_is_lost_is_taken_ou
     with machines(tmp_path, 4) as stage:
         stage.create("robot1")
         stage.brought("robot1", "robot2")
+        together(stage, "robot1", "robot2")
         stage.brought("robot1", "robot3")
         together(stage, "robot1", "robot2", "robot3")
         stage.machine("robot3").cut_power()
