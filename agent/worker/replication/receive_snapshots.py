@@ -50,7 +50,7 @@ class Shown(Struct, frozen=True):
         ends: of each stream that the position's snapshot tells of.
     """
 
-    generation: int
+    position: Position
     is_held: bool
     owner: int
     ends: dict[int, int]
@@ -59,11 +59,14 @@ class Shown(Struct, frozen=True):
     def by(cls, one: Unshown) -> Shown:
         """As they are when the output of this snapshot is in them."""
         ends = {piece.stream: piece.offset + len(piece.content) for piece in one.output}
-        return cls(one.position.generation, one.is_held, one.owner, ends)
+        return cls(one.position, one.is_held, one.owner, ends)
 
     def is_continued_by_nothing(self, one: Unshown) -> bool:
         """Whether nothing was written up to this snapshot."""
-        return not any(piece.content for piece in one.output) and Shown.by(one) == self
+        if any(piece.content for piece in one.output) or one.position.generation != self.position.generation:
+            return False
+        after = Shown.by(one)
+        return (after.is_held, after.owner, after.ends) == (self.is_held, self.owner, self.ends)
 
 
 class Deposit:
@@ -96,8 +99,6 @@ class Deposit:
         self._turns: dict[str, asyncio.Lock] = {}
         self._stored: dict[tuple[str, Position], tuple[Offer, Snapshot]] = {}
         self._unshown: dict[str, deque[Unshown]] = {}
-        self._brought: dict[str, Position] = {}
-        """Up to where the logs were brought last."""
         self._shown: dict[str, Shown] = {}
 
     def admit(self, act: Admit) -> None:
@@ -171,9 +172,7 @@ class Deposit:
             return
         unshown = self._unshown.setdefault(act.component, deque(maxlen=UNSHOWN_MAX))
         unshown.append(Unshown(snapshot.position, snapshot.output, offer.spec.launch.output == COMMITTED, offer.spec.owner))
-        if self._brought.get(act.component) == snapshot.position:  # of another component, which had this name
-            del self._brought[act.component]
-        if snapshot.is_base:  # likewise
+        if snapshot.is_base:  # perhaps of another component, which has this name now
             self._shown.pop(act.component, None)
         self._kept(offer, snapshot)
 
@@ -213,7 +212,7 @@ class Deposit:
         if shown is None or not due or due[-1].position != position or not all(map(shown.is_continued_by_nothing, due)):
             return False
         self._forget_shown(component, position)
-        self._brought[component] = position
+        self._shown[component] = Shown.by(due[-1])
         return True
 
     def _show(self, component: str, position: Position, *, is_elsewhere: bool = True) -> None:
@@ -222,13 +221,9 @@ class Deposit:
         Args:
             is_elsewhere: another robot is known to hold it, also where this one took it in.
         """
-        if self._brought.get(component) == position and not is_elsewhere:
+        shown = self._shown.pop(component, None)
+        if shown is not None and shown.position == position and not is_elsewhere:
             return  # a takeover need not read the whole chain again
-        self._shown.pop(component, None)
-        self._bring_logs(component, position, is_elsewhere=is_elsewhere)
-        self._brought[component] = position
-
-    def _bring_logs(self, component: str, position: Position, *, is_elsewhere: bool) -> None:
         directory, due = log_directory(component, self._places), self._due(component, position)
         if not due or due[-1].position != position:
             self._complete(component, directory, position, is_safe=is_elsewhere)
@@ -267,7 +262,6 @@ class Deposit:
             if position is not None:
                 await asyncio.to_thread(self._show, component, position, is_elsewhere=False)
             self._shown.pop(component, None)
-            self._brought.pop(component, None)
 
     def mend_logs(self, running: Collection[str]) -> None:
         """Bring each stream as far as the newest checkpoint says: an earlier life, or a power cut, may have come in between.
