@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from failover.core.component import Component
 from failover.core.election.consent import STATES
 from failover.core.frames.frame import beat_size_max
@@ -111,14 +113,12 @@ class Speaker:
             self._boot,
             self.counter,
             self._settled,
-            0,
-            len(entries),
-            echoes,
-            (),
-            self._rule,
-            grace_ms,
-            promises,
-            drained,
+            total=len(entries),
+            echoes=echoes,
+            rule=self._rule,
+            grace_ms=grace_ms,
+            promises=promises,
+            drained=drained,
         )
         if not entries:
             self._said.clear()
@@ -130,20 +130,8 @@ class Speaker:
             self._said[name] = (entries[name], 0)
         for entry in chosen:
             self._said[entry.name] = (entry, self.counter)
-        return Beat(
-            self._me,
-            self._boot,
-            self.counter,
-            self._settled,
-            min(sum(STATES[entry.state] in HOLDING for entry in entries.values()), LOAD_MAX),
-            len(entries),
-            echoes,
-            chosen,
-            self._rule,
-            grace_ms,
-            promises,
-            drained,
-        )
+        load = min(sum(STATES[entry.state] in HOLDING for entry in entries.values()), LOAD_MAX)
+        return replace(empty, load=load, entries=chosen)
 
     def unsaid(self, beat: Beat) -> None:
         """That beat leaves over no link: what no later one has said is said first in the next one."""
