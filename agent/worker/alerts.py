@@ -188,7 +188,8 @@ class Alerts:
                 asked.add(one["standby"])
             elif one["state"] not in OVER_STATES and (one["name"] in self._watch.troubles or one["primary"] not in living):
                 asked |= peers
-        view = await self._questions.joined(asked & peers)
+        asked &= peers
+        view = await self._questions.joined(asked) if asked else ours
         told = {one["name"]: _sight_of(one) for one in view["components"] if self._tells_of(one, living)}
         if clock.now_ns() - self._began_ns < SETTLED_NS:
             return told

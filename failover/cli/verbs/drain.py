@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 from failover.cli.connection import connect
 from failover.cli.output import render
@@ -23,12 +23,13 @@ def drain(arguments: argparse.Namespace) -> int:
     deadline = time.monotonic() + arguments.timeout
     with connect(arguments) as agent:
         answer = agent.ask("drain", robot=arguments.robot)
-        before, left = set[str](), _left(agent, arguments.robot, set())
+        before, left = set[str](), _left(_seen(agent), arguments.robot, set())
         while left and time.monotonic() < deadline:
             before |= set(left)
             time.sleep(POLL_S)
-            left = _left(agent, arguments.robot, before)
-            _tell(arguments, moved, _gone(agent, before - set(left) - set(moved)))
+            seen = _seen(agent)
+            left = _left(seen, arguments.robot, before)
+            _tell(arguments, moved, _gone(seen, before - set(left) - set(moved)))
     if arguments.json:
         render.as_json({**answer, "moved": moved, "left": left})
         return 1 if left and arguments.timeout else 0
@@ -57,18 +58,21 @@ def _tell(arguments: argparse.Namespace, moved: dict[str, str], gone: Mapping[st
             print(f"{name} runs at {robot}" if robot else f"{name} has ended", flush=True)
 
 
-def _left(agent: Control, robot: str, before: set[str]) -> dict[str, str]:
+def _seen(agent: Control) -> dict[str, Mapping[str, Any]]:
+    """The components by their names, each as the robot sees it that runs it."""
+    return {one["name"]: sight(one) for one in agent.ask("status", team=True)["components"]}
+
+
+def _left(seen: Mapping[str, Mapping[str, Any]], robot: str, before: set[str]) -> dict[str, str]:
     """The components that a robot runs still, or that do not run elsewhere yet, each with what it says about that."""
-    seen = [sight(one) for one in agent.ask("status", team=True)["components"]]
-    here = [one for one in seen if one.get("primary") == robot and one.get("state") not in OVER_STATES]
-    here += [one for one in seen if one["name"] in before and one not in here and one.get("state") in UNDER_WAY]
-    return {one["name"]: "; ".join(note for note in one["notes"] if "is drained" in note) or str(one["state"]) for one in here}
+    here = {name: one for name, one in seen.items() if one.get("primary") == robot and one.get("state") not in OVER_STATES}
+    here |= {name: one for name, one in seen.items() if name in before and one.get("state") in UNDER_WAY}
+    return {
+        name: "; ".join(note for note in one["notes"] if "is drained" in note) or str(one["state"]) for name, one in here.items()
+    }
 
 
-def _gone(agent: Control, names: set[str]) -> dict[str, str]:
+def _gone(seen: Mapping[str, Mapping[str, Any]], names: set[str]) -> dict[str, str]:
     """Where the components run that have left; "" for one that has ended."""
-    if not names:
-        return {}
-    seen = {one["name"]: sight(one) for one in agent.ask("status", team=True)["components"]}
     found = {name: seen.get(name, {}) for name in names}
     return {name: "" if one.get("state") in OVER_STATES else str(one.get("primary") or "") for name, one in found.items()}
