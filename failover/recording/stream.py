@@ -141,9 +141,13 @@ class Counts(Struct):
 
 
 class Endable:
-    """An act that takes its time. ``is_ended``: set it, also in a signal's function, to end it."""
+    """An act that takes its time, and is over soon after it ``is_ended``."""
 
     is_ended = False
+
+    def end(self) -> None:
+        """Also in a signal's function."""
+        self.is_ended = True
 
     def sleep_until(self, instant_s: float) -> None:
         """Until an instant of `time.monotonic`, or the end."""

@@ -6,11 +6,10 @@ import contextlib
 import os
 import resource
 import selectors
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import msgspec
@@ -223,14 +222,3 @@ class Simulation:
             memory_mb=round(memory / 1e6, 1),
             digest=xxhash.xxh3_64_hexdigest(msgspec.json.encode(digests)),
         )
-
-
-@contextlib.contextmanager
-def ended_by_signals(simulation: Simulation) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the simulation, and its figures are told."""
-    before = {one: signal.signal(one, lambda *_: simulation.stop()) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for one, function in before.items():
-            signal.signal(one, function)

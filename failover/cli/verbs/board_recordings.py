@@ -3,41 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 from failover import __version__
 from failover.boards import directory
 from failover.cli.connection import connect
+from failover.cli.ending import ended_by_signals
 from failover.cli.output import render
 from failover.cli.output.team_tree import size
 from failover.cli.verbs.board import board_there
 from failover.core.board import layout
 from failover.recording.follower import Choice, Follower
-from failover.recording.stream import Decisions, Endable, Stream
+from failover.recording.stream import Decisions, Stream
 
 LIBRARY: Final = f"failover {__version__}"
-
-
-@contextlib.contextmanager
-def ended_by_signals(act: Endable) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end an act in order, instead of the process at once."""
-
-    def end(_number: int, _frame: FrameType | None) -> None:
-        act.is_ended = True
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def chosen(arguments: argparse.Namespace) -> Choice:
@@ -67,7 +50,7 @@ def record(arguments: argparse.Namespace) -> int:
         recorder = Recorder(board, Follower(board, chosen(arguments), note), plan, decisions)
         if not arguments.json:
             print(f"recording the board of {board.robot} to {plan.path}; Ctrl-C ends it", flush=True)
-        with ended_by_signals(recorder.stream):
+        with ended_by_signals(recorder.stream.end):
             recorder.run()
     told, files = recorder.stream.counts, recorder.files
     if decisions is not None and decisions.complaint and (is_agents or told.decisions):
@@ -154,7 +137,7 @@ def replay(arguments: argparse.Namespace) -> int:
             note(said)
         least_s = TURN_S if arguments.loop else 0.0
         player = Player(source, contents, stage, arguments.pace)
-        with ended_by_signals(player):
+        with ended_by_signals(player.end):
             player.run(least_s)
             while arguments.loop and not player.is_ended:
                 player.run(least_s)
@@ -184,6 +167,6 @@ def serve(arguments: argparse.Namespace) -> int:
                 place = f"[{arguments.listen}]" if ":" in arguments.listen else arguments.listen
                 print(f"the board of {board.robot} is live at ws://{place}:{server.port}, until Ctrl-C", flush=True)
             stream = Stream(board, follower, server, _decisions(arguments))
-            with ended_by_signals(stream):
+            with ended_by_signals(stream.end):
                 stream.run(arguments.rate, None, each_look=server.fulfil)
     return 0

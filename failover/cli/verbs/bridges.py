@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 from failover.cli.arguments.bridges import USUAL
 from failover.cli.connection import connect
+from failover.cli.ending import ended_by_signals
 from failover.cli.output import render
 from failover.cli.verbs.board import board_there
-from failover.cli.verbs.board_recordings import chosen, ended_by_signals, note
+from failover.cli.verbs.board_recordings import chosen, note
 from failover.errors import BridgeError, LostAgentError, NoAgentError
 from failover.recording.follower import Follower
 from failover.recording.foxglove_server import check_address
@@ -48,7 +49,7 @@ def zenoh(arguments: argparse.Namespace) -> int:
             else:
                 print(f"the board of {board.robot} is at {prefix}/ROBOT/ITEM, {', '.join(places)}, until Ctrl-C", flush=True)
             stream = Stream(board, follower, bridge)
-            with ended_by_signals(stream):
+            with ended_by_signals(stream.end):
                 stream.run(arguments.rate, None, each_look=bridge.fulfil)
     return 0
 

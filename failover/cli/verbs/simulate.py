@@ -8,10 +8,11 @@ from typing import Final
 
 import msgspec
 
+from failover.cli.ending import ended_by_signals
 from failover.cli.output import render
 from failover.errors import SimulationError
 from failover.simulators.files import read
-from failover.simulators.run import Simulation, Summary, ended_by_signals
+from failover.simulators.run import Simulation, Summary
 from failover.simulators.world import parts
 from failover.simulators.world.parts import GUESTS_MAX, LABS_MAX, World
 
@@ -29,7 +30,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     if not arguments.pace and not arguments.span_s:
         raise SimulationError(PACE_MAX_NEEDS)
     with Simulation(world, arguments.pace, arguments.span_s or 0, arguments.board or "") as simulation:
-        with ended_by_signals(simulation):
+        with ended_by_signals(simulation.stop):
             if not arguments.json:
                 print(_begun(world, arguments), file=sys.stderr, flush=True)
             summary = simulation.run()
