@@ -396,25 +396,25 @@ class Supervisor:
             component, age_ns = await self._resumed(act, descriptors, outage_ns, laps)
             self.component = component  # before anything is waited for: leases and freezes reach it
             acts_ns = component.let_go_ns or clock.now_ns()
+            self.figures.restores += 1
+            self.figures.commits = Commits()  # of another process: its numbers begin anew
+            self.figures.reasons = ()
+            self.figures.notes = tuple(note for note in component.notes if note.startswith(LASTING_NOTES))
+            self.figures.outage_ms = (silent_ns + acts_ns - began_ns) / 1e6
+            since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
+            protecting = f"; protecting it again {(clock.now_ns() - acts_ns) / 1e6:.1f} ms" if component.let_go_ns else ""
+            sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}{protecting}"
+            log.info("%s: %s", self.name, sentence, extra={"epoch": act.epoch})
+            self.started.set()
+            lost_ns = 0 if act.why is Resumption.HANDED_OVER else max(0, age_ns - idle_ns)
+            self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns, lost_ns))
+            self._notice(sentence)
+            self._watch_the_end()
+            if occasion is not None:
+                self._task(self._occasions.after_resume(act.spec, occasion, component.pid))
             self.figures.resumed = await asyncio.to_thread(_resumed_from, descriptors[-1], act.position, acts_ns)
         finally:
             close_all(tuple(descriptors))
-        self.figures.restores += 1
-        self.figures.commits = Commits()  # of another process: its numbers begin anew
-        self.figures.reasons = ()
-        self.figures.notes = tuple(note for note in component.notes if note.startswith(LASTING_NOTES))
-        self.figures.outage_ms = (silent_ns + acts_ns - began_ns) / 1e6
-        since = f"the last word of the robot that ran it: silence {silent_ns / 1e6:.1f} ms, " if silent_ns else "the order: "
-        protecting = f"; protecting it again {(clock.now_ns() - acts_ns) / 1e6:.1f} ms" if component.let_go_ns else ""
-        sentence = f"it acts again {self.figures.outage_ms:.1f} ms after {since}{laps}{protecting}"
-        log.info("%s: %s", self.name, sentence, extra={"epoch": act.epoch})
-        self.started.set()
-        lost_ns = 0 if act.why is Resumption.HANDED_OVER else max(0, age_ns - idle_ns)
-        self.around.tell(events.Restored(self.name, act.epoch, act.position, age_ns + clock.now_ns() - read_ns, lost_ns))
-        self._notice(sentence)
-        self._watch_the_end()
-        if occasion is not None:
-            self._task(self._occasions.after_resume(act.spec, occasion, component.pid))
 
     def _off_ns(self, age_ns: int) -> int:
         """For how long nothing ran here since a checkpoint that is so old, because this robot was off."""

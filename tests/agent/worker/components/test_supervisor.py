@@ -223,7 +223,7 @@ def test_a_freeze_reaches_a_restored_program_while_its_snapshot_is_read_for_the_
             pass
 
         async def resumed(*_: object) -> tuple[Component, int]:
-            return cast(Component, SimpleNamespace(let_go_ns=1, freeze=guard.freeze, pid=1)), 0
+            return cast(Component, SimpleNamespace(let_go_ns=1, freeze=guard.freeze, pid=1, notes=())), 0
 
         around = Surroundings(nothing, store, Records(tmp_path), lambda _: None, nothing, soon, nothing)
         supervisor = Supervisor(NAME, around, epoch=3)
@@ -236,6 +236,7 @@ def test_a_freeze_reaches_a_restored_program_while_its_snapshot_is_read_for_the_
         monkeypatch.setattr(Supervisor, "_stop", soon)
         monkeypatch.setattr(Supervisor, "_resumed", resumed)
         monkeypatch.setattr(Supervisor, "_notice", lambda *_: None)
+        monkeypatch.setattr(Supervisor, "_watch_the_end", lambda _: None)
         monkeypatch.setattr(supervisor_module, "_resumed_from", read)
         monkeypatch.setattr("agent.worker.components.supervisor.clock.age_ns", lambda _: 0)
         monkeypatch.setattr(supervisor_module, "close_all", lambda _: None)
