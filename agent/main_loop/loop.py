@@ -24,6 +24,7 @@ from agent.core_config import node_config, team_config
 from agent.errors import AgentError
 from agent.main_loop import messages, starvation, vote_record
 from agent.main_loop.beat_sockets import NOT_CAST, TURN_LIMIT, BeatLane
+from agent.main_loop.departure import COMES_BACK, Departure, Next
 from agent.main_loop.duplicate_beats import Copies
 from agent.main_loop.event_log_writer import EventLogWriter
 from agent.main_loop.media import Link, Media
@@ -73,24 +74,6 @@ SLEEP_LIMIT_S: Final = 0.5
 
 PERSIST_PATIENCE_S: Final = 2.0
 """How long an orderly end waits for the disk."""
-
-ASK_NS: Final = 3 * NANOSECONDS_A_SECOND
-"""How long an end waits for the worker to find out whether it is a restart."""
-
-DISK_NS: Final = 2 * NANOSECONDS_A_SECOND
-"""How long a restart waits for this robot's own disk, once all that it waits for from its peers is there, or is not to come."""
-
-LEAVE_NS: Final = 5 * NANOSECONDS_A_SECOND
-"""How long a restart waits, beyond the grace, for what the core still waits for."""
-
-COMES_BACK: Final = signal.SIGUSR1
-"""Told by this, the agent announces that another one starts at once, as it does when systemd restarts it; then it ends."""
-
-STOP_S: Final = 15
-"""How long systemd waits for the next word of an agent that waits for its peers before it restarts."""
-
-NEEDS_SHARE: Final = 5
-"""It says so this often in that time, also where no watchdog is on."""
 
 SIGNALS_MAX: Final = 64
 """Read at once; more of them say nothing new."""
@@ -173,8 +156,8 @@ class MainLoop:
         self._wake, self._signalled = socket.socketpair(
             socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
         )
-        self._ending = self._rests = self._leaves = self._is_announced = False
-        self._ends_ns = self._disk_ns = self._needs_ns = 0
+        self._ending = self._rests = False
+        self._departure = Departure(settings.config.restart_grace_s * NANOSECONDS_A_SECOND)
         self._listens = True
         self._deaf_until_ns = 0
         self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
@@ -216,9 +199,8 @@ class MainLoop:
             if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
                 self._notifier.alive()
                 fed_ns = now_ns
-            if self._leaves and now_ns >= self._needs_ns:
-                self._notifier.needs(STOP_S)
-                self._needs_ns = now_ns + STOP_S * NANOSECONDS_A_SECOND // NEEDS_SHARE
+            if needs_s := self._departure.needs_s(now_ns):
+                self._notifier.needs(needs_s)
         if not self._remembered:
             self._notifier.stopping()
         self._end()
@@ -250,42 +232,24 @@ class MainLoop:
         del self._inputs[descriptor]
 
     def _heed_signals(self) -> None:
-        """End; where another agent starts at once, after the peers have promised to wait. A second signal ends it as it is.
-
-        The one by which systemd carries out a restart that was announced before is no second one.
-        """
         numbers = self._wake.recv(SIGNALS_MAX)
-        if self._node is None or signal.SIGINT in numbers:
-            self._ending = True
-        elif self._ends_ns:
-            self._ending = self._ending or not self._is_announced or COMES_BACK in numbers
-            self._is_announced = False
-        elif COMES_BACK in numbers:
-            self._is_announced = signal.SIGTERM not in numbers
-            self._leave()
-        else:
-            self._ends_ns = clock.now_ns() + ASK_NS
-            self._worker.send(IsRestart())
+        self._depart(Next.END if self._node is None else self._departure.signalled(numbers, clock.now_ns()))
 
-    def _leave(self) -> None:
-        """Announce the restart, until `_may_end`."""
-        grace_ns = self._settings.config.restart_grace_s * NANOSECONDS_A_SECOND
-        self._leaves, self._ends_ns = True, clock.now_ns() + grace_ns + LEAVE_NS
-        self._step(Leave())
+    def _depart(self, step: Next) -> None:
+        match step:
+            case Next.ASK:
+                self._worker.send(IsRestart())
+            case Next.ANNOUNCE:
+                self._step(Leave())
+            case Next.END:
+                self._ending = True
 
-    def _may_end(self) -> bool:
-        """Whether an end that was asked for need not wait any more."""
-        if not self._ends_ns or self._node is None:
+    def _may_end(self, node: Node) -> bool:
+        """Whether an end that was asked for need not wait any more; what stands still then is named."""
+        now_ns, is_restart = clock.now_ns(), self._departure.is_restart
+        if not self._departure.may_end(is_restart and node.may_go(now_ns), self._outbox.waiting, now_ns):
             return False
-        now_ns = clock.now_ns()
-        is_over = now_ns >= self._ends_ns
-        if not self._leaves:
-            return is_over
-        waits_for_disk = self._node.may_go(now_ns) and self._outbox.waiting
-        self._disk_ns = (self._disk_ns or now_ns + DISK_NS) if waits_for_disk else 0
-        if not is_over and (now_ns < self._disk_ns or not self._node.may_go(now_ns)):
-            return False
-        exposed = dict.fromkeys((*self._node.exposed(now_ns), *self._outbox.unleased))
+        exposed = dict.fromkeys((*node.exposed(now_ns), *self._outbox.unleased)) if is_restart else {}
         if exposed:
             log.warning(NOT_AWAITED, ", ".join(exposed))
         return True
@@ -344,8 +308,8 @@ class MainLoop:
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
                 self._step(Tick())
-        if self._ends_ns:
-            self._ending = self._ending or self._may_end()
+        if self._departure.is_begun and self._node is not None:
+            self._ending = self._ending or self._may_end(self._node)
 
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
@@ -404,7 +368,7 @@ class MainLoop:
             ready = self._node.step(event, now_ns)
             due = self._outbox.take(ready, now_ns)
             if due is not NOTHING:
-                if self._leaves and due.beats and self._outbox.waiting:
+                if self._departure.is_restart and due.beats and self._outbox.waiting:
                     self._node.left_without_promises(due.beats[-1].counter)
                 self._obey(due)
             if ready.told:
@@ -531,9 +495,7 @@ class MainLoop:
             case TeamIs(robots):
                 self._take_team(robots)
             case Ends(is_restart):
-                if is_restart and not self._leaves:
-                    self._leave()
-                self._ending = self._ending or not self._leaves
+                self._depart(self._departure.answered(is_restart, clock.now_ns()))
             case Alive():
                 pass
             case _:
@@ -720,7 +682,7 @@ class MainLoop:
         self._alarm.close()
         self._poll.close()
         signal.set_wakeup_fd(-1)
-        log.info("robot %s %s; its components live on", self._me, "restarts" if self._leaves else "ends")
+        log.info("robot %s %s; its components live on", self._me, "restarts" if self._departure.is_restart else "ends")
 
 
 def beat(settings: Settings, notifier: Notifier) -> None:

@@ -29,7 +29,7 @@ STOP_S: Final = 5
 ASK_S: Final = 2.5
 """How long systemd may take to answer a question; it has more to do just then. Without an answer a restart counts as a stop.
 
-Less than the main loop waits for that answer (``ASK_NS``).
+Less than the main loop waits for that answer (`agent.main_loop.departure.ASK_NS`).
 """
 
 Kind = Literal["guard", "keeper", "hook", "directory"]
