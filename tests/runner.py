@@ -40,7 +40,7 @@ SEGMENTS: Final = ("tests/checkpoint/engines/ptrace/restore/test_memory_kinds.py
 LIMITS: Final = 2
 """Limits of a test after which its worker ends."""
 AGAIN_S: Final = 0.5
-"""How soon the limit is looked at again that was over between two phases."""
+"""How soon the handler looks again at a limit that was over between two phases; and what the next phase has at least."""
 CRASHED: Final = 70
 """Exit status of a worker with an internal error."""
 
@@ -106,7 +106,10 @@ _in_phase = False
 
 @contextlib.contextmanager
 def _phase() -> Iterator[None]:
+    """A phase has at least `AGAIN_S`: an alarm at its very beginning would skip a teardown, and break the next test."""
     global _in_phase
+    if 0 < signal.getitimer(signal.ITIMER_REAL)[0] < AGAIN_S:
+        signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
     _in_phase = True
     try:
         yield
