@@ -472,6 +472,10 @@ class Membership:
         asked_ns = self.peers[robot].asked_ns
         return asked_ns > 0 and asked_ns + self._config.lease_ns > now_ns
 
+    def patience_ns(self, robot: str) -> int:
+        """For how long a living peer may not hear us: until it has our key, where its present life has never heard us."""
+        return self._loyalty_ns if self.peers[robot].heard_us else self._grace_ns
+
     def views(self, now_ns: int) -> tuple[PeerView, ...]:
         """For the status."""
         return tuple(self._view(peer, now_ns) for peer in self.peers.values())

@@ -157,6 +157,11 @@ def rewinds_at_reunion() -> Any:
     return patch.object(pair, "_never_stopped", lambda *_: False)
 
 
+def impatient_at_reunion() -> Any:
+    """The copy that never stopped gives up to a robot that has just started, and has no key of it yet."""
+    return patch.object(Membership, "patience_ns", lambda team, _robot: team._loyalty_ns)
+
+
 def never_stopped_though_it_stood() -> Any:
     """A copy that stood still meanwhile claims that it never stopped."""
     return patch.object(lease, "_all_agree", lambda *_: True)
@@ -594,6 +599,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (minority_rules, "without_a_majority_nothing_acts"),
     (rewinds_at_reunion, "after_a_total_cut_the_copy_that_never_stopped_stays"),
     (rewinds_at_reunion, "a_claim_in_the_dark_gives_up_to_the_copy_that_never_stopped"),
+    (impatient_at_reunion, "the_copy_that_never_stopped_waits_until_the_other_robot_has_its_key"),
     (never_stopped_though_it_stood, "a_primary_that_stood_still_gives_up_to_the_copy_that_acted"),
     (claims_at_boot, "a_standby_that_boots_before_its_network_rewinds_nothing"),
     (claims_at_boot, "a_robot_that_was_taken_out_of_the_team_is_replaced_after_the_patience"),

@@ -418,9 +418,11 @@ def _outlast(component: Component, turn: Turn, sender: str, entry: Entry, theirs
         ours = "was promoted by an operator" if component.ordered else "never stopped acting"
         turn.say(component, f"{turn.me} keeps its copy, which {ours}; the one of {sender} began in epoch {entry.born}")
         renew(component, turn, entry.epoch)
-    elif turn.now_ns >= component.rival_ns + 2 * turn.config.loyalty_ns:
+        return
+    patience_ns = turn.team.patience_ns(sender)
+    if turn.now_ns >= component.rival_ns + 2 * patience_ns:
         component.rival_ns = turn.now_ns
-    elif turn.now_ns >= component.rival_ns + turn.config.loyalty_ns and stronger(component, turn, sender, entry, theirs):
+    elif turn.now_ns >= component.rival_ns + patience_ns and stronger(component, turn, sender, entry, theirs):
         lose(component, turn, sender, entry)
 
 
