@@ -13,7 +13,18 @@ from failover.config import strict_toml
 from failover.core.naming import names, worlds
 from failover.core.wire.names import ROBOT_SIZE_MAX, check_robot, text_size
 from failover.errors import FileMistakeError, NameFormatError
-from failover.simulators.world.parts import ENGINES_MAX, GUESTS_MAX, LABS_MAX, US_MAX, Controller, Kind, Lab, Robot, World
+from failover.simulators.world.parts import (
+    ENGINES_MAX,
+    GUESTS_MAX,
+    LABS_MAX,
+    RADIUS_M,
+    US_MAX,
+    Controller,
+    Kind,
+    Lab,
+    Robot,
+    World,
+)
 
 SHIPPED: Final = Path(__file__).parent / "worlds"
 SIZE_MAX_M: Final = 1_000.0
@@ -66,7 +77,7 @@ class RobotConfig:
     us: int = 8
     battery: float | bool = 1.0
     camera: bool = True
-    radius: float = 0.225
+    radius: float = RADIUS_M
     controller: Controller = "wander"
     names: dict[str, str] = field(default_factory=dict)
     aliases: dict[str, str] = field(default_factory=dict)

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -22,6 +21,7 @@ from failover.drivers.proxy import Proxy
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
 from tests.e2e.test_board import board_of, two_with_boards
+from tests.failover.simulators.test_simulation import simulated
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = ROOT / "examples" / "cruise.py"
@@ -41,19 +41,6 @@ at = [1, 1]
 """The second one has the name of a member of the team."""
 
 
-@contextmanager
-def simulated(environment: dict[str, str], world: Path) -> Iterator[subprocess.Popen[str]]:
-    words = [sys.executable, "-m", "failover", "simulate", "--world", str(world)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
-        try:
-            assert process.stderr is not None
-            said = process.stderr.readline()
-            assert "Ctrl-C ends" in said, said + process.stderr.read()
-            yield process
-        finally:
-            process.kill()
-
-
 @pytest.fixture
 def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[RobotMachine, RobotMachine]]:
     with two_with_boards(tmp_path, monkeypatch) as both:
@@ -71,7 +58,7 @@ def test_a_protected_program_drives_a_simulated_robot_on_after_its_own_robot_is_
     there = {**os.environ, **usual, "FAILOVER_SOCKET": str(second.socket)}
     there.pop(worlds.VARIABLE, None)
     peers = second.status()["peers"]
-    with simulated(there, place / "world.toml") as process:
+    with simulated("--world", str(place / "world.toml"), environment=there) as process:
         with Board(board_of(second), "test") as board:
             assert list(board.robots()) == ["robot2", "robot1"]
             assert list(board.guests()) == ["Simulated.Robotino", "Simulated.robot2"]

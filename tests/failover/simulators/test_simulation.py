@@ -69,9 +69,10 @@ def until(condition: Callable[[], T], what: str) -> T:
 
 
 @contextlib.contextmanager
-def simulated(*words: str) -> Iterator[subprocess.Popen[str]]:
+def simulated(*words: str, environment: dict[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
     """A simulation whose robots have begun."""
-    with subprocess.Popen(command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command(*words), **pipes, text=True, env=environment) as process:
         try:
             assert process.stderr is not None
             said = process.stderr.readline()
