@@ -162,7 +162,7 @@ def _prefer(component: Component, turn: Turn, command: Prefer) -> None:
 
 
 def _fail_back(component: Component, turn: Turn, command: Failback) -> None:
-    home = component.rules.prefer or (component.spec.home if component.spec else "")
+    home = component.home
     if home and command.to not in ("", home):
         refusal = f"{component.name} would move to {home} now, and not to {command.to}; look at it, and give the order again"
         turn.order(acts.Answer(command.request, False, f"{refusal}; nothing was done"))

@@ -280,6 +280,11 @@ class Component(Struct):
         return self.spec.rules if self.spec else Rules()
 
     @property
+    def home(self) -> str:
+        """Where it would move back to: the robot that its operator prefers, else where it was started; "" where unknown."""
+        return self.rules.prefer or (self.spec.home if self.spec else "")
+
+    @property
     def freezes(self) -> bool:
         """Whether safety was chosen: no primary acts alone."""
         return self.rules.when_alone is WhenAlone.FREEZE

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from failover.core.events import Handover, Prefer
 from failover.core.types import MS, ComponentSpec, Launch, Rules
 from tests.simulation.deeds import LACK
@@ -10,7 +12,7 @@ from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
 PART = "/team/part"
-LONG_MS = 40_000
+LONG_MS = 15_000
 
 
 def at_robot1(lacks: tuple[str, ...]) -> World:
@@ -66,31 +68,50 @@ def test_what_one_robot_lacked_is_not_said_of_the_one_that_is_preferred_then() -
     assert "waits" not in notes(world), "it is asked anew"
 
 
-def test_the_robot_where_it_was_started_stands_by_after_a_handover_so_that_it_can_go_back() -> None:
-    world = World(1, elective(3, (ComponentSpec(PART, home="robot3", launch=Launch(("part",))),)))
+def brought(home: str, rules: Rules, to: str) -> World:
+    """Three robots that vote; a program of that home runs where it was sent. Until then that robot is its standby."""
+    world = World(1, elective(3, (ComponentSpec(PART, home=home, launch=Launch(("part",)), rules=rules),)))
     for name in world.robots:
         world.power_on(name)
     world.run(2_000 * MS)
     (first,) = world.acting(PART)
-    if first != "robot3":
-        assert seen_at(world, first, PART).standby == "robot3"
-        world.command(first, Handover(world.request(), PART, "robot3"))
-        assert later(world, 1_000) == ["robot3"]
+    if first != to:
+        assert seen_at(world, first, PART).standby == to
+        world.command(first, Handover(world.request(), PART, to))
+    assert later(world, 2_000) == [to]
+    return world
+
+
+def test_the_robot_where_it_was_started_stands_by_after_a_handover_so_that_it_can_go_back() -> None:
+    world = brought("robot3", Rules(), to="robot3")
     world.command("robot3", Handover(world.request(), PART, seen_at(world, "robot3", PART).standby))
-    (away,) = later(world, 1_000)
+    (away,) = later(world, LONG_MS)
     assert away != "robot3"
     assert seen_at(world, away, PART).standby == "robot3", "though another robot's name is less"
 
 
 def test_where_it_runs_on_the_robot_that_its_operator_chose_as_standby_another_one_stands_by() -> None:
-    rules = Rules(standby="robot2")
-    world = World(1, elective(3, (ComponentSpec(PART, home="robot1", launch=Launch(("part",)), rules=rules),)))
+    world = brought("robot1", Rules(standby="robot2"), to="robot2")
+    assert seen_at(world, "robot2", PART).standby == "robot1"
+
+
+@pytest.mark.parametrize("rule", ["pair", "majority"])
+@pytest.mark.parametrize("prefer", ["robot1", ""])
+def test_of_three_robots_the_lost_one_stands_by_once_it_is_back_and_is_returned_to_where_it_is_preferred(
+    rule: str, prefer: str
+) -> None:
+    specs = (ComponentSpec(PART, home="robot1", launch=Launch(("part",)), rules=Rules(prefer=prefer)),)
+    world = World(1, elective(3, specs) if rule == "majority" else pair(specs, ("robot1", "robot2", "robot3")))
+    world.robots["robot1"].lacks = LACK
     for name in world.robots:
         world.power_on(name)
-    world.run(2_000 * MS)
-    (first,) = world.acting(PART)
-    if first != "robot2":
-        assert seen_at(world, first, PART).standby == "robot2"
-        world.command(first, Handover(world.request(), PART, "robot2"))
-    assert later(world, 2_000) == ["robot2"]
-    assert seen_at(world, "robot2", PART).standby == "robot1"
+    assert later(world, 2_000) == ["robot1"]
+    world.power_off("robot1")
+    assert later(world, 3_000) == ["robot2"] and seen_at(world, "robot2", PART).standby == "robot3"
+    world.power_on("robot1")
+    assert later(world, LONG_MS) == ["robot2"]
+    assert seen_at(world, "robot2", PART).standby == "robot3", "it could not resume it, so the protection stays as it is"
+    world.robots["robot1"].lacks = ()
+    (at,) = later(world, 2 * LONG_MS)
+    assert at == (prefer or "robot2")
+    assert prefer or seen_at(world, "robot2", PART).standby == "robot1"

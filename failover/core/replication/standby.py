@@ -55,10 +55,9 @@ def choose_standby(component: Component, turn: Turn) -> None:
         if grants(component, peer, turn.me) and turn.config.keeps(peer.robot) and (not wanted or peer.robot == wanted)
     ]
     if able:
-        home = component.rules.prefer or (component.spec.home if component.spec else "")
 
         def placing(peer: Peer) -> tuple[bool, bool, bool, int, Weight]:
-            return not turn.config.runs(peer.robot), peer.drained, peer.robot != home, peer.load, weight(peer.robot)
+            return not turn.config.runs(peer.robot), peer.drained, peer.robot != component.home, peer.load, weight(peer.robot)
 
         chosen = min(able, key=placing).robot
         if chosen == component.standby:
@@ -66,6 +65,27 @@ def choose_standby(component: Component, turn: Turn) -> None:
         component.standby = chosen
         component.due_ns = turn.now_ns
         turn.say(component, f"{component.standby} is its standby")
+
+
+def may_replace(component: Component, turn: Turn, robot: str) -> bool:
+    """Whether this living robot may stand by instead of the present one, which is alive, too.
+
+    Not against the operator's choice, and not under ``freeze`` of a pair, where the standby stays.
+    """
+    if component.rules.standby not in ("", turn.me, robot) or (component.freezes and not turn.config.by_majority):
+        return False
+    return turn.config.runs(robot) and grants(component, turn.team.peers[robot], turn.me)
+
+
+def replace(component: Component, turn: Turn, robot: str) -> None:
+    """From now on this robot stands by. The snapshot that is on its way to the other one is called off: the next is a base."""
+    flight = component.flight
+    if flight is not None and flight.position is not None:
+        turn.order(acts.CancelShip(component.name, component.epoch, flight.position, flight.to))
+        component.flight = None
+    component.standby = robot
+    component.due_ns = turn.now_ns
+    turn.say(component, f"{robot} is its standby, where it would move back to")
 
 
 def _stays(component: Component, turn: Turn) -> bool:

@@ -180,7 +180,7 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"it resumed at {turn.me} from its last checkpoint and lost {lost_s:.1f} s of its work")
     if moving := drain.note(component, turn):
         notes.append(moving)
-    if staying := failback.note(component):
+    if staying := failback.note(component, turn):
         notes.append(staying)
     if component.unstored and component.state is State.STANDBY:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
