@@ -65,6 +65,7 @@ class Process:
             [sys.executable, "-P", "-m", "failover.simulators"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            bufsize=0,  # a signal's function may close it amid a write, which a buffer forbids
             env=environment,
             start_new_session=True,  # Ctrl-C is for the process that begins them
         )
@@ -75,9 +76,10 @@ class Process:
 
     def _write(self, content: bytes) -> None:
         assert self.child.stdin is not None
-        with contextlib.suppress(BrokenPipeError, ValueError):  # it has ended, or a signal has had `end` called
-            self.child.stdin.write(content)
-            self.child.stdin.flush()
+        rest = memoryview(content)
+        with contextlib.suppress(OSError, ValueError):  # it has ended, or a signal has had `end` called
+            while rest:
+                rest = rest[self.child.stdin.write(rest) :]
 
     def begin(self) -> None:
         """All are ready."""
