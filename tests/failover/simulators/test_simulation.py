@@ -71,8 +71,7 @@ def until(condition: Callable[[], T], what: str) -> T:
 @contextlib.contextmanager
 def simulated(*words: str, environment: dict[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
     """A simulation whose robots have begun."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command(*words), **pipes, text=True, env=environment) as process:
+    with subprocess.Popen(command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
         try:
             assert process.stderr is not None
             said = process.stderr.readline()
