@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from failover.errors import AgentRefusedError
-from tests.e2e import robots
+from tests.e2e import robots, teams
 from tests.e2e.robots import RobotMachine
 
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.01)\n"
@@ -89,6 +89,26 @@ def test_failback_brings_a_component_home(pair: Pair) -> None:
     order(second, "failback", name="count")
     robots.until(lambda: runs_at(pair, first), "it to be back home")
     expect_more(first)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_of_three_robots_the_preferred_one_is_lost_is_back_and_runs_it_again(tmp_path: Path) -> None:
+    with teams.acting(tmp_path, {"robot1": "robot", "robot2": "robot", "robot3": "robot"}) as stage:
+        first = stage.members["robot1"]
+        robots.run(first, "count", *COUNTING)
+        order(first, "prefer", name="count", robot="robot1")
+        robots.until_protected(first)
+        stage.cut_power("robot1")
+        left = [stage.members[name] for name in ("robot2", "robot3")]
+        heir = robots.until(
+            lambda: next((one for one in left if robots.component(one, "count").get("restores")), None), "an heir"
+        )
+        robots.until_protected(heir)
+        assert robots.component(heir, "count")["standby"] in ("robot2", "robot3")
+        first = stage.switch_on("robot1")
+        robots.until_taken_over(first)
+        expect_more(first)
 
 
 def test_orders_may_be_given_at_either_robot(pair: Pair) -> None:
