@@ -99,9 +99,10 @@ def _fit(agent: Control, wanted: str) -> dict[str, Any]:
     """The component, as the robot sees it that runs it.
 
     Raises:
-        AgentRefusedError: there is none of this name, or it could not be moved safely.
+        AgentRefusedError: there is none of this name, or it could not be moved safely, or another robot would stand by then.
     """
-    component = named(_status(agent), wanted)
+    status = _status(agent)
+    component = named(status, wanted)
     seen = sight(component)
     if seen.get("role") != "primary" or seen.get("state") not in ("running", "degraded"):
         raise AgentRefusedError(f"no drill of {seen['name']}: it is {seen.get('state')}, not running; see failover status")
@@ -109,6 +110,13 @@ def _fit(agent: Control, wanted: str) -> dict[str, Any]:
         notes = [note for one in (seen, component) for note in (*(one.get("lacks") or ()), *(one.get("notes") or ()))]
         why = "; ".join(dict.fromkeys(notes)) or seen.get("promise") or "no other robot holds its checkpoints"
         raise AgentRefusedError(f"no drill of {seen['name']}: it is NOT PROTECTED: {why}", "NotProtected")
+    belongs = seen.get("prefer") or seen.get("home")
+    robots = sum(peer["role"] == "robot" for peer in status["peers"]) + 1
+    if robots > 2 and belongs not in ("", None, seen["primary"]):
+        raise AgentRefusedError(
+            f"no drill of {seen['name']}: it runs at {seen['primary']} and belongs at {belongs}, which would stand by for it "
+            f"after the first move; failover failback {wanted} first"
+        )
     return dict(seen)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from failover.cli.verbs import drill as module
 from failover.cli.verbs.drill import Leg, Report, _missed, _told
+from failover.errors import AgentRefusedError
 
 LEG = Leg("robot1", "robot2", 5, 40.0, 0.5, 300.0, 900.0, 98.0, (100, 180))
 
@@ -65,7 +66,8 @@ class Agent:
         here, there = ("robot2", "robot1") if self.moved else ("robot1", "robot2")
         component = {"name": "/lab/x", "role": "primary", "primary": here, "standby": there, "epoch": 5, "state": "running"}
         component |= {"state": "ended", "standby": "", "protection": "none"} if self.moved else {"protection": "protected"}
-        return {"robot": "robot1", "peers": [], "components": [component]}
+        peers = [{"role": "robot"}] * 2 if self.ending == "away" else []
+        return {"robot": "robot1", "peers": peers, "components": [component | {"home": "robot3"}]}
 
 
 def drilled(monkeypatch: pytest.MonkeyPatch, ending: str) -> int:
@@ -80,6 +82,13 @@ def test_a_component_that_ends_meanwhile_is_not_waited_for(
     assert drilled(monkeypatch, "ended") == 1
     report = json.loads(capsys.readouterr().out)
     assert report["runs_at"] == "" and "/lab/x has ended since it moved to robot2" in report["missed"][0]
+
+
+def test_of_three_robots_a_component_that_is_away_is_not_moved_for_it_would_not_come_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(AgentRefusedError, match=r"it runs at robot1 and belongs at robot3.*; failover failback x first"):
+        drilled(monkeypatch, "away")
 
 
 def test_whoever_gives_up_is_told_how_to_find_the_component_and_to_bring_it_back(
