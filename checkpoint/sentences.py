@@ -8,6 +8,15 @@ from typing import Final
 AS_SOON_AS: Final = "failover captures it as soon as"
 """Begins the cure of a refusal for a moment only: that moment's end follows."""
 
+_KEPT: Final = frozenset("\n\t\N{NO-BREAK SPACE}")
+
+
+def visible(text: str) -> str:
+    """The text, with what cannot be seen written out (``\\x1b``): what a program said gives a terminal no orders."""
+    if text.isprintable():
+        return text
+    return "".join(one if one.isprintable() or one in _KEPT else ascii(one)[1:-1] for one in text)
+
 
 def in_words(error: BaseException) -> str:
     """An error as people read it: what the kernel says without its number, and a file's name as text, also where it was bytes."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from checkpoint.errors import CheckpointError
 from checkpoint.runtime import early_interrupt
-from checkpoint.sentences import in_words
+from checkpoint.sentences import in_words, visible
 from failover.cli import keeper_prestart
 from failover.errors import AgentRefusedError, FailoverError, NoAgentError
 
@@ -80,10 +80,10 @@ def tell(error: Exception, arguments: argparse.Namespace, status: int) -> int:
         sentence = in_words(error)
         if len(reasons) > 1:  # they follow, one a line
             sentence = sentence.removesuffix("; ".join(reasons)).rstrip(": ")
-        print(f"failover: {sentence}", file=sys.stderr)
+        print(visible(f"failover: {sentence}"), file=sys.stderr)
         listed = [reason for reason in reasons if reason not in sentence]
         for reason in listed[:REASONS_SHOWN]:
-            print(f"  - {reason}", file=sys.stderr)
+            print(visible(f"  - {reason}"), file=sys.stderr)
         if len(listed) > REASONS_SHOWN:
             print(f"  - and {len(listed) - REASONS_SHOWN} more; --json has them all", file=sys.stderr)
     return status

@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from checkpoint.sentences import visible
 from failover.cli.output import team_tree
 
 if TYPE_CHECKING:
@@ -40,7 +41,8 @@ ASCII: Final = str.maketrans({"└": "`", "├": "|", "─": "-", "–": "-", "�
 
 
 def spoken(text: str) -> str:
-    """The text in characters that standard output has."""
+    """The text in characters that standard output has, and without orders to a terminal."""
+    text = visible(text)
     encoding = codecs.lookup(getattr(sys.stdout, "encoding", None) or "ascii").name
     return text if encoding.startswith("utf") else text.translate(ASCII).encode(encoding, "replace").decode(encoding)
 
@@ -88,6 +90,7 @@ def _padded(text: str, width: int) -> str:
 
 def table(columns: Sequence[str], lines: Sequence[Sequence[str]], title: str = "") -> None:
     """Print a table: framed on a terminal, aligned elsewhere."""
+    lines = [tuple(map(spoken, line)) for line in lines]
     if is_terminal():
         console = _console()
         console.print(_drawn(console.width, columns, [(line, "") for line in lines], title))

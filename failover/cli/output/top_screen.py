@@ -17,6 +17,7 @@ from textual.screen import ModalScreen
 from textual.widgets import DataTable, Footer, Input, Static
 from textual.worker import get_current_worker
 
+from checkpoint.sentences import visible
 from failover.cli.output import team_tree
 from failover.cli.output.task_tree import Robot
 from failover.cli.output.top_table import COLUMNS, ORDERS, Line, lines
@@ -273,7 +274,7 @@ def _cell(text: str, line: Line) -> Text:
 
 def shown(text: str, style: str = "") -> Text:
     """As it stands: names and what programs said are no markup, and give the terminal no orders."""
-    return Text("".join(one if one == "\n" or one.isprintable() else " " for one in text), style=style)
+    return Text(visible(text), style=style)
 
 
 def run(source: Source) -> None:

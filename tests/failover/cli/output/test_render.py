@@ -57,6 +57,20 @@ def test_a_status_loses_no_word_on_any_terminal(
     assert all("".join(row.cells[0].translate(FRAME).split()) in whole for row in team_tree.rows(status))
 
 
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_what_a_program_said_gives_the_terminal_no_orders(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = "it ended: \x1b]0;mine\x07 \x9b2J \N{RIGHT-TO-LEFT OVERRIDE}"
+    status = STATUS | {"components": [COMPONENT | {"notes": [said]}], "peers": []}
+    monkeypatch.setattr(render, "is_terminal", lambda: is_terminal)
+    monkeypatch.setenv("COLUMNS", "200")
+    render.tree(status)
+    shown = ESCAPE.sub("", capsys.readouterr().out)
+    assert all(one in shown for one in ("it ended: ", r"\x1b]0;mine\x07", r"\x9b2J", r"\u202e"))
+    assert not set(shown) & set("\x1b\x07\x9b\N{RIGHT-TO-LEFT OVERRIDE}")
+
+
 @pytest.mark.parametrize("width", [60, 80, 100, 200])
 def test_a_key_is_shown_whole_on_any_terminal(
     width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -20,7 +20,7 @@ from failover.errors import AgentRefusedError
 from tests.failover.cli.output.test_task_tree import STATUS
 
 HOSTILE = "[/red] \x1b]0;mine\x07 \x9b2J [@click=quit]"
-HARMLESS = "[/red]  ]0;mine   2J [@click=quit]"
+HARMLESS = r"[/red] \x1b]0;mine\x07 \x9b2J [@click=quit]"
 WAITS = 300
 """Looks at the screen, a tenth of a second apart."""
 
