@@ -20,7 +20,6 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,11 +38,12 @@ from failover.drivers.keeping import Keeping
 from failover.drivers.server import Hand, Near
 from failover.errors import FailoverError, ProgramError
 from failover.fencing.epoch import epoch
-from failover.kept_state.api import RESTARTED, SWITCHED, Resumed
+from failover.kept_state.api import SWITCHED, Resumed
 from failover.programs.carried import Carried
 from failover.programs.channel import Hello
 from failover.programs.running import Answered, Running, Source
 from failover.programs.sources import Place, before, source_of_directory, source_of_store, version_of
+from failover.programs.starting import Revival, Starter, again
 from failover.programs.store import Kept
 
 ROLLBACK_S: Final = 300
@@ -108,25 +108,16 @@ class HostActor(Actor):
         self._old_until_ns = 0
         self._trial: Trial | None = None
         self._number = kept.number if kept is not None else 0
-        self._coming: Running | None = None
-        self._is_coming = False
         self._said = ""
         self._last = first.source
         self._why_lost = ""
         self._owed: tuple[Command, ...] = ()
         """What the version that is started anew must carry out before anything else."""
-        self._is_starting_anew = False
-        """Until `_revived` has taken what came of it."""
-        self._started: tuple[Running | None] | None = None
-        """What came of it, from the thread."""
         self._restart_ns = 0
         self._gap_ms = 0.0
         self._state = first.state
         self._is_changed = True
-        self._starter = ThreadPoolExecutor(1, "starts versions")
-        self._reviver = ThreadPoolExecutor(1, "starts versions anew")
-        self._loading: set[Running] = set()
-        self._is_closing = False
+        self._starter = Starter(place, self._resumed, self._say, lambda: self.wake())
         self.wake: Callable[[], None] = lambda: None
         self.renew: Callable[[Declaration], None] = lambda _: None
         self._switched: Kept | None = None
@@ -184,14 +175,14 @@ class HostActor(Actor):
         waits = [one for one in (super().wait_ns(now_ns),) if one is not None]
         if self.fence(0):
             return min(*waits, LOOK_NS) if waits else LOOK_NS
-        if self._coming is not None or self._started is not None or self._may_keep:
+        if self._starter.has_news or self._may_keep:
             waits.append(0)
         if self._trial is not None:
             due = self._trial.wait_ns(now_ns)
             waits.append(LOOK_NS if due is None else due)
         if self._old is not None and self._trial is None:
             waits.append(max(self._old_until_ns - now_ns, 0))
-        if self._running is None and not self._is_starting_anew:
+        if self._running is None and not self._starter.is_reviving:
             waits.append(max(self._restart_ns - now_ns, 0))
         return min(waits, default=None)
 
@@ -318,13 +309,13 @@ class HostActor(Actor):
         now_ns = clock()
         if self._running is not None and not self._running.lives:
             self._ended()
-        if self._started is not None:
-            (anew,), self._started = self._started, None
-            self._revived(anew)
-        if self._running is None and self._coming is None and not self._is_starting_anew and now_ns >= self._restart_ns:
-            self._restart(now_ns)
-        if self._coming is not None:
-            coming, self._coming = self._coming, None
+        if (revival := self._starter.revived()) is not None:
+            self._revived(revival)
+        coming = self._starter.warmed()
+        if self._running is None and coming is None and not self._starter.is_reviving and now_ns >= self._restart_ns:
+            self._restart_ns = now_ns + RESTART_NS
+            self._starter.revive(self._last, self._state, self._owed)
+        if coming is not None:
             self._switch_to(coming, clock)
         if self._trial is not None:
             self._judge(now_ns)
@@ -441,7 +432,7 @@ class HostActor(Actor):
         self._state = self._state_at_switch
         for count, command in enumerate(commands):
             try:
-                self._running.state = self._state = _again(self._running, command)
+                self._running.state = self._state = again(self._running, command)
             except FailoverError as error:
                 self._lost(f"at {command.verb}, which is left out: {error}")
                 self._owed = tuple(commands[count + 1 :])
@@ -451,7 +442,7 @@ class HostActor(Actor):
     def _let_go(self) -> None:
         old, self._old = self._old, None
         if old is not None:
-            self._starter.submit(old.end)  # it may take its time, and no version waits for it
+            self._starter.aside(old.end)  # it may take its time, and no version waits for it
 
     # --- An end that no person ordered ------------------------------------------------------------------------------------
 
@@ -470,66 +461,11 @@ class HostActor(Actor):
             self._last = lost.source
             self._say(f"{lost.source.manifest.version}: {why}; it is started anew")
 
-    def _restart(self, now_ns: int) -> None:
-        """Start the last version anew, in a thread: it may import for a minute, and the host answers meanwhile."""
-        self._restart_ns = now_ns + RESTART_NS
-        self._is_starting_anew = True
-        self._reviver.submit(self._start_anew, self._last, self._state, self._owed)
-
-    def _start_anew(self, source: Source, state: Any, owed: Sequence[Command]) -> None:
-        """In the thread."""
-        running: Running | None = None
-        try:
-            if source.digest:  # a key or a right may have gone since it was started
-                self._place.store.admitted(source.digest, self._place.team)
-            running = self._begun(source, state)
-            for command in owed:
-                try:
-                    running.state = _again(running, command)
-                except FailoverError as error:
-                    self._note(f"{command.verb} is left out: {error}")
-                    left, running = running, None
-                    left.end()
-                    running = self._begun(source, left.state)
-        except FailoverError as error:
-            self._why_lost = str(error)
-            self._say(f"it cannot be started anew: {error}")
-        except Exception as error:  # the sentence must not be lost in a thread
-            log.exception("a version could not be started anew")
-            self._say(f"it cannot be started anew: {type(error).__name__}: {error}")
-        finally:
-            self._started = (running,)
-            self.wake()
-
-    def _begun(self, source: Source, state: Any) -> Running:
-        """A new process of a version, with this state.
-
-        Raises:
-            ProgramError: it cannot be loaded, or cannot read the state.
-        """
-        running = self._loaded(source)
-        try:
-            running.begin(state, self._resumed(RESTARTED))
-        except FailoverError:
-            running.end()
-            raise
-        return running
-
-    def _loaded(self, source: Source) -> Running:
-        """A new process of a version, warm; `close` ends it before that."""
-        running = Running(source, lambda: self.wake())
-        self._loading.add(running)
-        try:
-            if self._is_closing:
-                running.end()
-            return running.load()
-        finally:
-            self._loading.discard(running)
-
-    def _revived(self, anew: Running | None) -> None:
+    def _revived(self, revival: Revival) -> None:
         """The version that was started anew takes messages, unless it could not, or another one does by now."""
-        self._is_starting_anew = False
+        anew = revival.running
         if anew is None:
+            self._why_lost = revival.why or self._why_lost
             return
         if self._running is not None:
             anew.end()
@@ -554,7 +490,7 @@ class HostActor(Actor):
             active=self.version,
             pid=running.pid if running is not None else 0,
             on_trial=self._trial is not None,
-            is_coming=self._is_coming,
+            is_coming=self._starter.is_warming,
             said=self._said,
             gap_ms=round(self._gap_ms, 3),
             enforced=running.hello.enforced if running is not None else (),
@@ -567,7 +503,7 @@ class HostActor(Actor):
     def _switch(self, body: Mapping[str, Any]) -> Any:
         """Begin to start a version; what comes of it, ``_versions`` tells."""
         version, directory = body.get("version"), body.get("directory")
-        if self._is_coming or self._trial is not None:
+        if self._starter.is_warming or self._trial is not None:
             raise ProgramError(f"{self._place.name} is in the middle of a switch; wait until its trial is over, or roll it back")
         if self._owed:
             version, count = self._last.manifest.version, len(self._owed)
@@ -580,7 +516,7 @@ class HostActor(Actor):
                 raise ProgramError(
                     f"{directory} is {source.manifest.name} for {source.manifest.path}, and not {self._place.name}"
                 )
-            self._start(lambda: source)
+            self._warm(lambda: source)
             return {"version": source.manifest.version}
         if not isinstance(version, str) or self._place.directory is not None:
             raise ProgramError(
@@ -593,25 +529,12 @@ class HostActor(Actor):
             raise ProgramError(
                 f"{version} is older than {self.version}, which runs: failover program rollback {self._place.name} goes back"
             )
-        self._start(lambda: source_of_store(self._place, one.version))
+        self._warm(lambda: source_of_store(self._place, one.version))
         return {"version": one.version}
 
-    def _start(self, source: Callable[[], Source]) -> None:
-        self._is_coming, self._said = True, ""
-
-        def started() -> None:
-            try:
-                self._coming = self._loaded(source())
-            except FailoverError as error:
-                self._say(f"it stays as it was: {error}")
-            except Exception as error:  # the sentence must not be lost in a thread
-                log.exception("a version could not be started")
-                self._say(f"it stays as it was: {type(error).__name__}: {error}")
-            finally:
-                self._is_coming = False
-                self.wake()
-
-        self._starter.submit(started)
+    def _warm(self, source: Callable[[], Source]) -> None:
+        self._said = ""
+        self._starter.warm(source)
 
     def _rollback(self, body: Mapping[str, Any]) -> Any:
         """Back to the version before, whose process still waits."""
@@ -685,7 +608,7 @@ class HostActor(Actor):
     def _settle(self) -> None:
         """Have the disk keep the shelf, without a wait: not between two messages, nor before an answer."""
         self._is_unsettled = False
-        self._starter.submit(self._place.store.settle, self._place.name)
+        self._starter.aside(lambda: self._place.store.settle(self._place.name))
 
     def _record_anyway(self, change: Callable[[Shelf], Shelf]) -> None:
         """The same where what was done is done; a disk that is full is told."""
@@ -704,9 +627,7 @@ class HostActor(Actor):
 
     def close(self) -> None:
         """End all processes; the state stays."""
-        self._is_closing = True
-        for loading in tuple(self._loading):
-            loading.end()
+        self._starter.end_soon()
         if self._running is not None and self._running.lives:
             try:
                 self._running.pause()
@@ -718,10 +639,7 @@ class HostActor(Actor):
                 self._write(is_lasting=True)
         except ProgramError as error:
             log.warning("%s", error)
-        for thread in (self._starter, self._reviver):
-            thread.shutdown(wait=True)  # not before: a version dies with the thread that started it
-        anew = self._started[0] if self._started is not None else None
-        for one in (self._running, self._old, self._coming, anew):
+        for one in (*self._starter.close(), self._running, self._old):
             if one is not None:
                 one.end()
 
@@ -743,15 +661,6 @@ def _checked(message: Envelope, found: Answered) -> Answered:
     else:
         anew = refusal(message, said.error.kind if said.error.kind in FAULTS else "failed", said.error.sentence)
     return msgspec.structs.replace(found, answer=anew)
-
-
-def _again(running: Running, command: Command) -> Any:
-    """The state after a command that is carried out once more.
-
-    Raises:
-        ProgramError: its process ended, hangs, or said what is no answer.
-    """
-    return running.call(Envelope(verb=command.verb, body=command.body)).state
 
 
 def _cut(one: Stream) -> Stream:

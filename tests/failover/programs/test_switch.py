@@ -32,6 +32,7 @@ from failover.programs.channel import State as KeptState
 from failover.programs.hosting import Hosting
 from failover.programs.running import Running
 from failover.programs.sources import Place
+from failover.programs.starting import Revival
 from failover.programs.store import Kept, Store
 from tests.failover.drivers.serving import taking_messages
 from tests.failover.drivers.serving import until as wait_for
@@ -500,10 +501,10 @@ def test_a_host_that_is_fenced_starts_and_switches_nothing_until_it_acts_again(l
         for count in range(1, 4):
             host.wake()
             wait_for(lambda count=count: len(turns) >= count)  # type: ignore[misc]
-        assert actor._running is lost and not actor._is_starting_anew
-        actor._started = (None,)
+        assert actor._running is lost and not actor._starter.is_reviving
+        actor._starter._revival = Revival(None)
         assert actor.wait_ns(host.now_ns()), "nor does it spin over what it does not do"
-        actor._started, actor.fence = None, acts
+        actor._starter._revival, actor.fence = None, acts
         host.wake()
         assert proxy.call("read", timeout=60) == [1] and actor._running is not lost
 
