@@ -23,6 +23,8 @@ pytestmark = pytest.mark.root
 
 RESTARTS = int(os.environ.get("FAILOVER_RESTARTS", "2"))
 SEED = os.environ.get("FAILOVER_SEED", "")
+SHOWN = 2
+"""Of many restarts, ``failover why`` tells the latest."""
 SPREAD_S = 0.3
 """Instants of restarts lie in here: a capture begins every 0.1 s."""
 
@@ -94,7 +96,8 @@ def test_restarts_of_an_agent_move_nothing_and_leave_no_gap(pair: Pair) -> None:
     assert "freezes it" not in story(first) and "stands still" not in story(first)
 
     # the promise was given back: a loss soon after a restart is met as ever
-    robots.until(lambda: story(second).count("robot2 waits for it no longer than ever") == RESTARTS, "the promise to be void")
+    told = min(RESTARTS, SHOWN)
+    robots.until(lambda: story(second).count("robot2 waits for it no longer than ever") >= told, "the promise to be void")
     robots.counts_on_elsewhere(first, second, more=20)
 
 
