@@ -1,9 +1,10 @@
-"""Entry point of the command ``failover``, see `failover.cli.main`."""
+"""Entry points of the commands ``failover`` (see `failover.cli.main`) and ``failover-agent`` (see `agent.__main__`)."""
 
 from __future__ import annotations
 
 import gc
 import sys
+from importlib import import_module
 
 from checkpoint.runtime import early_interrupt
 
@@ -21,6 +22,11 @@ def main() -> int:
     from failover.cli.main import main as run
 
     return early_interrupt.left(run())
+
+
+def agent() -> int:
+    """Load and run the daemon's command line: a wheel has it elsewhere than a checkout, and both have this module."""
+    return int(import_module("agent.__main__").main())
 
 
 if __name__ == "__main__":

@@ -361,7 +361,7 @@ class Guard:
 def main(arguments: list[str]) -> int:
     """Become a guard; returns its exit status."""
     if len(arguments) != 1:
-        print("usage: python -m agent.guard.server SOCKET_PATH   (started by failover-agent, not by hand)", file=sys.stderr)
+        print(f"usage: python -m {__package__}.server SOCKET_PATH   (started by failover-agent, not by hand)", file=sys.stderr)
         return 2
     path = arguments[0]
     try:

@@ -62,7 +62,7 @@ from checkpoint.store.xor_cache import Sender
 if TYPE_CHECKING:
     from checkpoint.engines.cooperative.engine import GuardedTask
 
-USAGE: Final = "usage: python -m checkpoint keeper FD|PATH [MODULE]\n"
+USAGE: Final = f"usage: python -m {checkpoint.__name__} keeper FD|PATH [MODULE]\n"
 CALL_S: Final = 30.0
 """How long one that listens waits for its peer."""
 
@@ -451,7 +451,7 @@ def _become(owner: Owner) -> None:
     All of us is loaded before: that user may have no right to read where we are installed.
     """
     slim_imports.load_seldom_used()
-    for module in pkgutil.walk_packages(checkpoint.__path__, "checkpoint."):
+    for module in pkgutil.walk_packages(checkpoint.__path__, f"{checkpoint.__name__}."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     try:

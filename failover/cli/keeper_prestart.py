@@ -12,6 +12,8 @@ import signal
 import sys
 from typing import IO, TYPE_CHECKING, Final, NamedTuple, Protocol
 
+import checkpoint
+
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
@@ -86,7 +88,7 @@ def _spawned(theirs: socket.socket, complaints: IO[bytes]) -> Child:
     import subprocess
 
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "checkpoint", "keeper", str(theirs.fileno())],
+        [sys.executable, "-P", "-m", checkpoint.__name__, "keeper", str(theirs.fileno())],
         pass_fds=(theirs.fileno(),),
         stdin=subprocess.DEVNULL,
         stderr=complaints,

@@ -22,6 +22,7 @@ from typing import Final
 
 from msgspec import Struct
 
+import checkpoint
 from agent.errors import GuardError, GuardLostError, KeeperLostError
 from agent.guard import messages
 from agent.system.systemd_units import Kind, in_a_unit
@@ -40,6 +41,9 @@ SPARES_MAX: Final = 8
 
 REFILL_S: Final = 1.0
 """How long after one was used its successor is started: a takeover has the processor for itself."""
+
+KEEPER: Final = (checkpoint.__name__, "keeper")
+"""Its module and verb."""
 
 GATES: Final = "agent.slack_gate"
 """The module by which a keeper captures a program between two activations of its tasks."""
@@ -204,7 +208,7 @@ class ProcessPool:
         """One that systemd started: it listens as a guard does."""
         name = _new_name()
         path = self._sockets / f"{name}.keeper"
-        child = self._spawn("keeper", name, ["checkpoint", "keeper", str(path), GATES])
+        child = self._spawn("keeper", name, [*KEEPER, str(path), GATES])
         end = await self._connected(path, child, "a keeper")
         return end, _peer_of(end)
 
@@ -212,7 +216,7 @@ class ProcessPool:
         ours, theirs = keeper_messages.pair()
         with theirs:
             try:
-                child = self._spawn("keeper", "", ["checkpoint", "keeper", str(theirs.fileno()), GATES], (theirs.fileno(),))
+                child = self._spawn("keeper", "", [*KEEPER, str(theirs.fileno()), GATES], (theirs.fileno(),))
             except GuardError:
                 ours.close()
                 raise

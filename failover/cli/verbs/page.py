@@ -1,4 +1,4 @@
-"""page: checks what is asked for, and becomes the process of the operators' page (``python -m page``)."""
+"""page: checks what is asked for, and becomes the process of the operators' page (`page.__main__`)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _serve(arguments: argparse.Namespace) -> NoReturn:
     options = [("--config", arguments.config), ("--listen", arguments.listen), ("--socket", arguments.socket)]
     words = [word for name, value in options if value for word in (name, value)]
     sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-P", "-m", "page", *words, *(["--json"] if arguments.json else [])])
+    os.execv(sys.executable, [sys.executable, "-P", "-m", "page.__main__", *words, *(["--json"] if arguments.json else [])])
 
 
 def _password() -> int:
