@@ -88,6 +88,20 @@ def test_in_any_order_of_arrival_the_first_that_may_act_stays_and_the_late_comer
     assert standby in {*order} - {first}
 
 
+@pytest.mark.parametrize("names", [("robot1",), ("robot1", "robot2")], ids="-".join)
+def test_what_no_robot_ever_ran_begins_at_once_where_every_robot_is_heard(names: tuple[str, ...]) -> None:
+    assert started(1, pair((SPEC,), names, 60_000)).acting(SPEC.name) == ["robot1"]
+
+
+def test_what_no_robot_is_known_to_have_run_waits_for_a_robot_that_was_not_heard_since_the_boot() -> None:
+    world = World(1, pair((SPEC,), boot_patience_ms=6_000), (Invariants(safe={SPEC.name}),))
+    world.power_on("robot1")
+    world.run(5_500 * MS)
+    assert world.acting(SPEC.name) == []
+    world.run(7_000 * MS)
+    assert world.acting(SPEC.name) == ["robot1"]
+
+
 def test_a_robot_with_a_new_disk_begins_nothing_afresh_of_which_another_member_knows_checkpoints() -> None:
     world = World(1, elective(2, (SPEC,), witnesses=1), (Invariants(safe={SPEC.name}, votes=True),))
     for name in ("robot1", "robot2", "witness1"):

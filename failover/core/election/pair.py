@@ -60,22 +60,19 @@ def consider(component: Component, turn: Turn) -> None:
 def unheard(component: Component, turn: Turn) -> tuple[str, ...]:
     """Under pair: the robots that ran it last, or may have taken it over since, of which there was no word in this life of ours.
 
-    They may be well: the network of a robot that boots often comes later than its agent.
+    They may be well: the network of a robot that boots often comes later than its agent. If no robot is known to have run it,
+    any robot may.
     """
     if turn.config.by_majority:
         return ()
-    theirs = dict.fromkeys((component.primary, *component.entrusted))
+    last = (component.primary,) if component.primary else turn.team.peers
+    theirs = dict.fromkeys((*last, *component.entrusted))
     return tuple(robot for robot in theirs if robot != turn.me and turn.team.unheard(robot))
 
 
 def _begins_in_the_dark(component: Component, turn: Turn) -> bool:
-    """Whether we claim it although a robot that may run it has said nothing in this life of ours. If no robot is known to have
-    run it, that is any robot, except where an operator starts it.
-    """
-    if turn.config.by_majority:
-        return False
-    is_unknown = not component.primary and not component.request
-    return bool(unheard(component, turn)) or (is_unknown and any(map(turn.team.unheard, turn.team.peers)))
+    """Whether no robot is known to have run it, or one that may run it has said nothing in this life of ours."""
+    return not turn.config.by_majority and (not component.primary or bool(unheard(component, turn)))
 
 
 def exhaustion(component: Component, me: str) -> str:
@@ -95,7 +92,8 @@ def waits_after_boot_ns(component: Component, turn: Turn) -> int:
     if not absent:
         return 0
     left_ns = turn.config.boot_patience_ms * MS - turn.team.lived_ns(turn.now_ns)
-    if any(robot not in turn.team.peers for robot in absent):  # a robot that knocks may be that one: our team file may be old
+    if not component.primary or any(robot not in turn.team.peers for robot in absent):
+        # A robot that knocks may be that one: our team file may be old.
         left_ns = max(left_ns, turn.team.strangers_until_ns() - turn.now_ns)
     return max(left_ns, 0)
 
