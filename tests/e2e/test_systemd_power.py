@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.e2e import machines, robots
-from tests.e2e.machines import Machine
+from tests.e2e.machines import CHECKOUT, Machine
 from tests.e2e.service import COUNT, POLITE, SERVICE, component, counted, install, started, two_robots
 
 pytestmark = [
@@ -96,3 +98,33 @@ def test_a_restart_of_the_service_moves_nothing_and_a_stop_is_a_loss(pair: tuple
     expect_nothing_to_move(first, second, "stays", "systemctl", "restart", SERVICE)
     first.run("systemctl", "stop", SERVICE)
     expect_it_to_go_on_at(second, "stays")
+
+
+UNIT = "[Service]\nExecStart=/opt/controller/controller\nUser=nobody\nRestart=on-failure\n[Install]\nWantedBy=multi-user.target\n"
+
+
+def typed(recipe: str) -> str:
+    """What a recipe has a person type."""
+    section = (CHECKOUT / "docs" / "recipes.md").read_text().split(f"## {recipe}\n")[1]
+    return section.split("```\n")[1].replace("/lab/r1/", "/lab/robot1/").replace('"robot"', f'"{USER}"')
+
+
+@pytest.mark.compiler
+def test_a_cpp_program_whose_unit_gives_way_to_the_agent_outlives_its_machine(
+    pair: tuple[Machine, Machine], tmp_path: Path
+) -> None:
+    built, source = tmp_path / "controller", CHECKOUT / "tests" / "recipes" / "controller.cpp"
+    if subprocess.run(["c++", "-O2", "-pthread", "-o", built, source], capture_output=True, check=False).returncode:
+        pytest.skip("needs a C++ compiler: apt-get install g++")
+    first, second = pair
+    for machine in pair:
+        place = machine.root / "opt/controller"
+        place.mkdir(parents=True)
+        shutil.copy(built, place)
+    (first.root / "etc/systemd/system/controller.service").write_text(UNIT)
+    first.run("systemctl", "enable", "--now", "controller")
+    first.run("sh", "-ec", typed("A C++ program under systemd"))
+    robots.until(lambda: component(first, "controller").get("protection") == "protected", "its protection")
+    assert first.property("controller", "ActiveState") == "inactive"
+    first.end()
+    expect_it_to_go_on_at(second, "controller")
