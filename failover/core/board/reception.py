@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import repeat
-from operator import add, gt, setitem
+from itertools import compress, repeat
+from operator import add, gt, le, setitem
 from typing import Any, Final, Protocol
 
 from msgspec import Struct
 from msgspec.structs import astuple
 
 from failover.core.board.ages import AGE_MAX_US, NO_ERROR_BOUND, NS_PER_US
-from failover.core.board.banks import EPOCH_SHIFT, Fence, Place, bank_words, first_of_epoch, put_carefully
+from failover.core.board.banks import EPOCH_SHIFT, LOW_HALF, Fence, Place, bank_words, first_of_epoch, put_carefully
 from failover.core.board.layout import FRAMES_FIELD, LOST_FIELD, REFUSED_FIELD, SUM_WORD, TRANSIT_FIELD
 
 TOGETHER_MIN: Final = 3
@@ -78,7 +78,7 @@ class Slot:
         error_us = error_us if age_us < AGE_MAX_US else NO_ERROR_BOUND
         self.count += 1
         words[record + FRAMES_FIELD // 8] = self.count
-        words[record + TRANSIT_FIELD // 8] = _transit(round_, error_us)
+        words[record + TRANSIT_FIELD // 8] = (round_ & LOW_HALF) << 32 | error_us
         if missing and 0 <= self.last_round < round_ - self.period:
             words[record + LOST_FIELD // 8] += min((round_ - self.last_round) // self.period - 1, missing)
         self.last_round = round_
@@ -96,14 +96,20 @@ class Slot:
         if self.fence is not None:
             put_carefully(place, following, item.value, stamp_ns, error_us, self.fence)
             return True
-        head, stamped, sized, begin = self.heads[following % len(self.heads)]
+        self.store(following, item.value, stamp_ns, error_us)
+        return True
+
+    def store(self, number: int, value: bytes, stamp_ns: int, error_us: int) -> None:
+        """Put a value that fits, in the order of `failover.core.board.banks`, where none needs fences."""
+        place, size = self.place, len(value)
+        words = place.words
+        head, stamped, sized, begin = self.heads[number % len(self.heads)]
         words[head] = 0
         words[stamped] = stamp_ns
         words[sized] = error_us << 32 | size
-        place.area[begin : begin + size] = item.value
-        words[head] = following
-        words[place.newest] = following
-        return True
+        place.area[begin : begin + size] = value
+        words[head] = number
+        words[place.newest] = number
 
 
 class _Shape(Struct, frozen=True):
@@ -130,8 +136,11 @@ class _Plan:
     def __init__(self, slots: Sequence[Slot], memory: _Memory) -> None:
         self.slots, self._memory = slots, memory
         self.newest = tuple([slot.place.newest for slot in slots])
+        self._least = tuple([slot.place.least for slot in slots])
+        self._limits = tuple([slot.place.limit for slot in slots])
+        self._fitting: tuple[int, ...] = ()
         self.cycle = math.lcm(*[len(slot.heads) for slot in slots])
-        self._known: dict[tuple[int, ...], dict[tuple[int, tuple[int, ...]], _Shape | None]] = {}
+        self._known: dict[tuple[int, ...], dict[tuple[int, tuple[int, ...]], _Shape]] = {}
 
     def enter(self, now_ns: int) -> None:
         """Take the state of the slots."""
@@ -139,9 +148,8 @@ class _Plan:
         self.following = tuple([slot.following for slot in self.slots])
         self.last_numbers = tuple([slot.last_number for slot in self.slots])
         self.after = min([slot.after for slot in self.slots])
-        banks = tuple([slot.following % len(slot.heads) for slot in self.slots])
-        self._shapes = self._known.setdefault(banks, {})
-        self.step = 0
+        self._shapes: dict[tuple[int, tuple[int, ...]], _Shape] | None = None
+        self._step = 0
 
     def leave(self) -> None:
         """Give it back, and count the frames in the records."""
@@ -154,17 +162,47 @@ class _Plan:
             slot.place.words[slot.record + TRANSIT_FIELD // 8] = self.transit
         self.frames = 0
 
-    def shape(self, sizes: tuple[int, ...]) -> _Shape | None:
-        """For values of these sizes; None where one does not fit."""
-        key = (self.step, sizes)
+    def fit(self, sizes: tuple[int, ...]) -> bool:
+        """Whether values of these sizes do."""
+        if sizes != self._fitting:
+            if not (all(map(le, self._least, sizes)) and all(map(le, sizes, self._limits))):
+                return False
+            self._fitting = sizes
+        return True
+
+    def put(self, values: Sequence[bytes], sizes: tuple[int, ...], stamps_ns: Sequence[int], error_us: int) -> None:
+        """Put all values, each step for all of them before the next."""
+        shape, place, following = self._shape(sizes), self.slots[0].place, self.following
+        words = place.words
+        _store(words, shape.heads, repeat(0))
+        _store(words, shape.stamped, stamps_ns)
+        _store(words, shape.sized, map(add, sizes, repeat(error_us << 32)))
+        _store(place.area, shape.values, values)
+        _store(words, shape.heads, following)
+        _store(words, self.newest, following)
+        self.following = tuple(map(add, following, repeat(1)))
+        self._step = (self._step + 1) % self.cycle
+
+    def put_some(self, which: Sequence[bool], values: Sequence[bytes], stamps_ns: Sequence[int], error_us: int) -> None:
+        """Put some of the values; the items' banks are other ones then than a step further."""
+        slots, following = self.slots, self.following
+        for index in compress(range(len(which)), which):
+            slots[index].store(following[index], values[index], stamps_ns[index], error_us)
+        self.following = tuple(map(add, following, which))
+        self._shapes = None
+
+    def _shape(self, sizes: tuple[int, ...]) -> _Shape:
+        """Where all values go, of these sizes."""
+        if self._shapes is None:
+            banks = tuple([number % len(slot.heads) for slot, number in zip(self.slots, self.following, strict=True)])
+            self._shapes, self._step = self._known.setdefault(banks, {}), 0
+        key = (self._step, sizes)
         if key not in self._shapes:
             self._memory.places += len(sizes)
             self._shapes[key] = self._made(sizes)
         return self._shapes[key]
 
-    def _made(self, sizes: tuple[int, ...]) -> _Shape | None:
-        if not all(slot.place.least <= size <= slot.place.limit for slot, size in zip(self.slots, sizes, strict=True)):
-            return None
+    def _made(self, sizes: tuple[int, ...]) -> _Shape:
         banks = [slot.heads[number % len(slot.heads)] for slot, number in zip(self.slots, self.following, strict=True)]
         heads, stamped, sized, begins = zip(*banks, strict=True)
         values = tuple([slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=True)])
@@ -211,9 +249,12 @@ class Reception:
         Returns:
             How many were put, how many are not known here, and how many have another size than declared.
         """
-        if len(items) >= TOGETHER_MIN and not missing and self._take_together(items, came_ns, error_us, round_):
-            return len(items), 0, 0
-        self.settle()
+        if len(items) >= TOGETHER_MIN and not missing:
+            together = self._take_together(items, came_ns, error_us, round_)
+            if together is not None:
+                return together, 0, 0
+        if self._plan is not None:
+            self.settle()
         known = self._slots.get
         puts = unknown = misfits = 0
         for item in items:
@@ -228,8 +269,8 @@ class Reception:
                 misfits += 1
         return puts, unknown, misfits
 
-    def _take_together(self, items: Sequence[Brought], came_ns: int, error_us: int, round_: int) -> bool:
-        """Put all values if each is a newer one that fits; False: nothing was done."""
+    def _take_together(self, items: Sequence[Brought], came_ns: int, error_us: int, round_: int) -> int | None:
+        """Put those values that are newer, if all fit: how many; None: nothing was done."""
         numbers, ages_us, puts, values, *_ = zip(*map(_fields, items), strict=True)
         if self._memory.places > PLACES_MAX:
             self._forget()
@@ -238,25 +279,21 @@ class Reception:
             self.settle()
             plan = self._plan = self._planned(numbers)
             if plan is None:
-                return False
+                return None
             plan.enter(came_ns)
-        shape = plan.shape(tuple(map(len, values)))
-        oldest_us, newest = max(ages_us), max(puts)
-        is_usual = oldest_us < AGE_MAX_US and oldest_us * NS_PER_US < came_ns and newest < plan.after
-        if shape is None or not is_usual or not all(map(gt, puts, plan.last_numbers)):
-            return False
-        place = plan.slots[0].place
-        words, following = place.words, plan.following
-        _store(words, shape.heads, repeat(0))
-        _store(words, shape.stamped, [came_ns - age_us * NS_PER_US for age_us in ages_us])
-        _store(words, shape.sized, map(add, map(len, values), repeat(error_us << 32)))
-        _store(place.area, shape.values, values)
-        _store(words, shape.heads, following)
-        _store(words, plan.newest, following)
-        plan.following, plan.last_numbers = tuple(map(add, following, repeat(1))), puts
-        plan.step = (plan.step + 1) % plan.cycle
-        plan.frames, plan.round, plan.transit = plan.frames + 1, round_, _transit(round_, error_us)
-        return True
+        oldest_us, sizes = max(ages_us), tuple(map(len, values))
+        if not (oldest_us < AGE_MAX_US and oldest_us * NS_PER_US < came_ns and max(puts) < plan.after and plan.fit(sizes)):
+            return None
+        stamps_ns = [came_ns - age_us * NS_PER_US for age_us in ages_us]
+        newer = tuple(map(gt, puts, plan.last_numbers))
+        if all(newer):
+            plan.put(values, sizes, stamps_ns, error_us)
+            plan.last_numbers = puts
+        elif any(newer):
+            plan.put_some(newer, values, stamps_ns, error_us)
+            plan.last_numbers = tuple(map(max, puts, plan.last_numbers))
+        plan.frames, plan.round, plan.transit = plan.frames + 1, round_, (round_ & LOW_HALF) << 32 | error_us
+        return sum(newer)
 
     def _planned(self, numbers: tuple[int, ...]) -> _Plan | None:
         """How frames with these items are taken; None: one by one."""
@@ -277,10 +314,6 @@ _fields: Final[Callable[[Any], tuple[Any, ...]]] = astuple
 def _store(target: Any, places: Iterable[Any], values: Iterable[Any]) -> None:
     """One store into each of the places, in their order: a loop that is not of Python's lines."""
     any(map(setitem, repeat(target), places, values))
-
-
-def _transit(round_: int, error_us: int) -> int:
-    return (round_ & 0xFFFF_FFFF) << 32 | error_us
 
 
 def _end_of_epoch(number: int) -> int:
