@@ -18,7 +18,7 @@ import errno
 import select
 import socket
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from agent.errors import LaneError
@@ -101,7 +101,7 @@ class BeatLane:
         self._waiting = select.epoll()
         for fileno in self._sockets:
             self._waiting.register(fileno, select.EPOLLIN)
-        self._only = [(fileno, select.EPOLLIN) for fileno in self._sockets] if len(self._sockets) == 1 else []
+        self._likely = min(self._sockets)
         self._names: dict[int, str] = {}
         self._told: dict[bytes, str] = {}
         self.know(peers)
@@ -122,23 +122,15 @@ class BeatLane:
         """Readable while datagrams wait."""
         return self._waiting.fileno()
 
-    def send(self, peer: str, frame: bytes) -> None:
-        """One datagram to the peer over every link."""
-        for _, link, address, _ in self._ways.get(peer, ()):
-            self._leave(link, frame, address)
-
     def unicast(self, peer: str, place: int, datagrams: Sequence[bytes]) -> None:
         """Datagrams to the peer over one link."""
         for at, link, address, _ in self._ways.get(peer, ()):
             if at == place:
                 for datagram in datagrams:
-                    self._leave(link, datagram, address)
-
-    def _leave(self, link: socket.socket, datagram: bytes, address: tuple[str, int]) -> None:
-        try:
-            link.sendto(datagram, address)
-        except OSError:
-            self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
+                    try:
+                        link.sendto(datagram, address)
+                    except OSError:
+                        self.unsent += 1  # no route, no buffer, link down: the peer's silence is the message
 
     def ways(self, peer: str) -> tuple[tuple[int, int], ...]:
         """(our link, its link) of each way to the peer."""
@@ -216,7 +208,6 @@ class BeatLane:
         if cast is Cast.BROADCAST:
             self._uncounted.add(collecting.fileno())  # each of our own broadcasts comes back, and is dropped
         self._waiting.register(collecting.fileno(), select.EPOLLIN)
-        self._only = []
 
     def cast(self, place: int, cast: Cast, datagrams: Sequence[bytes]) -> str:
         """Datagrams to all over one link; "", or why this kind may not leave by it."""
@@ -238,16 +229,24 @@ class BeatLane:
         Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another. The
         instant is by this machine's calendar, in nanoseconds since 1970; 0: not told.
         """
-        taken = 0
-        ready = self._only or self._waiting.poll(0)  # this is asked where one waits: of one socket it is clear where
+        taken, told = 0, self._told
+        ready = [(self._likely, select.EPOLLIN)]  # this is asked where one waits, and one knows nearly always where
         while ready and taken < TURN_LIMIT:
-            for fileno, _ in ready:
+            for fileno, _ in ready[: TURN_LIMIT - taken]:
                 taken += 1
                 try:
                     frame, ancillary, _, sender = self._sockets[fileno].recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
                 except OSError:
                     continue  # none, or an ICMP error of an earlier datagram; the next call has the next datagram
-                link, wall_ns = self._circumstances(ancillary)
+                self._likely = fileno
+                link, wall_ns = "", 0
+                for one in ancillary:
+                    level, kind, content = one
+                    if kind == SO_TIMESTAMPNS and level == socket.SOL_SOCKET:
+                        seconds, ns = _ARRIVAL.unpack_from(content)
+                        wall_ns = seconds * 1_000_000_000 + ns
+                    else:
+                        link = told[content] if content in told else self._interface(one)
                 place = self._casts.get(link, NOT_CAST) if fileno in self._collects else NOT_CAST
                 yield frame, link, wall_ns, sender, place
             ready = self._waiting.poll(0)  # to be told that none waits is cheaper than a call that fails
@@ -255,20 +254,6 @@ class BeatLane:
     def dropped(self) -> int:
         """Datagrams that the kernel dropped since these sockets were bound: no beats, or beats without room; broadcasts apart."""
         return sum(_drops(link) for fileno, link in self._sockets.items() if fileno not in self._uncounted)
-
-    def _circumstances(self, ancillary: Iterable[tuple[int, int, bytes]]) -> tuple[str, int]:
-        """The interface, and the instant by the calendar."""
-        link, wall_ns = "", 0
-        for one in ancillary:
-            level, kind, content = one
-            if kind == SO_TIMESTAMPNS and level == socket.SOL_SOCKET:
-                seconds, ns = _ARRIVAL.unpack_from(content)
-                wall_ns = seconds * 1_000_000_000 + ns
-            elif content in self._told:
-                link = self._told[content]
-            else:
-                link = self._interface(one)
-        return link, wall_ns
 
     def _interface(self, told: tuple[int, int, bytes]) -> str:
         """The name of the interface that the kernel tells; remembered by what it says, and by the interface's number."""

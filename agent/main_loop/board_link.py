@@ -144,22 +144,31 @@ class BoardLink:
 
     def urgent(self, now_ns: int, medium: int = 0) -> list[Portion]:
         """Urgent items that were put since they last went over this medium, as often as `Bucket` allows it there."""
-        urgent = self._own.urgent
+        own, gone, may = self._own, self._gone, []
         if medium == 0:
             self._urgent_ns = now_ns
         try:
-            numbers = self._own.numbers(urgent)
+            numbers = own.numbers(own.urgent)
         except OSError:
             self.dropped[UNREADABLE] += 1
             return []
         if medium == 0:
             self._looked = numbers
-        put = [(one, numbers[one.id]) for one in urgent if numbers[one.id] > self._gone.get((medium, one.id), 0)]
-        may = [one for one in put if self._buckets.setdefault((medium, one[0].id), Bucket()).take(now_ns)]
+        for record in own.urgent:
+            lane, number = (medium, record.id), numbers[record.id]
+            if number > gone.get(lane, 0) and self._bucket(lane).take(now_ns):
+                may.append((record, number))
         return self._portions(may, now_ns)
+
+    def _bucket(self, lane: tuple[int, int]) -> Bucket:
+        bucket = self._buckets.get(lane)
+        if bucket is None:
+            bucket = self._buckets[lane] = Bucket()
+        return bucket
 
     def seen_to(self) -> bool:
         """What `urgent` gave is on its way: programs are to tell of their next put. Whether there was one since it looked."""
+        self.wakes.heed()
         try:
             self.wakes.ask()
         except OSError:
@@ -198,8 +207,9 @@ class BoardLink:
     def _portions(self, newest: Sequence[tuple[Record, int]], now_ns: int) -> list[Portion]:
         """Of items with the numbers of their newest puts."""
         found, left_ns, get = [], now_ns - self._skew_ns, self._own.get
-        with contextlib.suppress(OSError):  # told for each item below
-            self._own.read_ahead(newest)
+        if len(newest) > 1:
+            with contextlib.suppress(OSError):  # told for each item below
+                self._own.read_ahead(newest)
         for record, number in newest:
             try:
                 bank = get(record, number)
@@ -227,7 +237,9 @@ class BoardLink:
         if items and items[0].number >= RESERVED:
             items = self._announcements.take(part.sender, items)
         if items:
-            peer.items.take(items, came_ns, way_bound_us(heard.way_ns), part.round, heard.missing)
+            way_ns = heard.way_ns  # values are older than told by this at most, and by what it and their ages were rounded
+            error_us = NO_ERROR_BOUND if way_ns is None else min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)
+            peer.items.take(items, came_ns, error_us, part.round, heard.missing)
         self._note_frame(peer, heard.way_ns, came_ns)
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
@@ -277,8 +289,3 @@ class BoardLink:
         left_out = self._primaries.left_out if self._primaries is not None else 0
         waited = sum(sum(turns.waited.values()) for turns in self._turns.values())
         return counts + Counter({WAITED: waited, LEFT_OUT: left_out})
-
-
-def way_bound_us(way_ns: int | None) -> int:
-    """By how much a value can be older than told: the longest way, and what it and the age lost when they were rounded."""
-    return NO_ERROR_BOUND if way_ns is None else min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)

@@ -275,7 +275,7 @@ class MainLoop:
             if self._board.wakes.fileno() >= 0:
                 self._neglect(self._board.wakes.fileno())
             self._board.close()
-        self._board, self._is_told = None, False
+        self._board, self._urgent_ns, self._is_told = None, None, False
 
     def _start_worker(self) -> None:
         """Start the other process; the node is born, or told what was lost, when its inventory comes."""
@@ -298,8 +298,8 @@ class MainLoop:
         for descriptor, _ in came:
             if descriptor in self._inputs:  # not the alarm, nor what was closed in this turn
                 self._inputs[descriptor]()
-        if self._urgent_ns is not None and clock.now_ns() >= self._urgent_ns:
-            self._send_urgent()
+        if self._urgent_ns is not None and self._board is not None and clock.now_ns() >= self._urgent_ns:
+            self._send_urgent(self._board, clock.now_ns())
         if self._media.is_slotted:
             self._take_slots()
         self._watch_worker()
@@ -460,14 +460,17 @@ class MainLoop:
 
     def _note_urgent(self) -> None:
         """A program told of an urgent put. Until that is seen to, it may tell as often as it likes: the loop does not listen."""
-        board = self._board
+        board, now_ns = self._board, clock.now_ns()
         if board is None:
             return
+        due_ns = board.urgent_due_ns(self._sent_ns)
+        if now_ns >= due_ns:
+            self._send_urgent(board, now_ns)
+            return
         board.wakes.heed()
-        self._urgent_ns = board.urgent_due_ns(self._sent_ns)
-        if clock.now_ns() < self._urgent_ns:
-            self._poll.modify(board.wakes.fileno(), 0)
-            self._is_told = True
+        self._urgent_ns = due_ns
+        self._poll.modify(board.wakes.fileno(), 0)
+        self._is_told = True
 
     def _listen_to_worker(self) -> None:
         try:
@@ -587,12 +590,12 @@ class MainLoop:
         board.tell_states(now_ns, lease_ns, lambda peer: self._media.round_of(peer, now_ns))
         board.tell_primaries(self._node.primaries() if self._node is not None else {}, now_ns)
 
-    def _send_urgent(self) -> None:
-        """Items that cannot wait for their round, without a beat. Where robots take turns they wait for this robot's slot."""
-        self._urgent_ns, board = None, self._board
-        if board is None:
-            return
-        now_ns = clock.now_ns()
+    def _send_urgent(self, board: BoardLink, now_ns: int) -> None:
+        """Items that cannot wait for their round, without a beat. Where robots take turns they wait for this robot's slot.
+
+        They leave first; what is to be noted for the next put is noted afterwards.
+        """
+        self._urgent_ns = None
         if self._media.at_once:
             items = board.urgent(now_ns)
             if items:

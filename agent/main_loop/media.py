@@ -104,7 +104,8 @@ class Media:
         self._links = tuple(Link(place, self._beat_ns) for place in range(len(settings.me.beats)))
         self._by_name: dict[str, Link] = {}
         self._slotted: tuple[Link, ...] = ()
-        self._open_casts(lanes.lane(0))
+        self._lane = lanes.lane(0)
+        self._open_casts(self._lane)
 
     def _open_casts(self, lane: FrameLane) -> None:
         if lane.is_shared and lane.casts is None:
@@ -271,21 +272,23 @@ class Media:
         Args:
             patience_ns: by how much longer than usual members may take to say what they heard: they rest.
         """
+        made: tuple[list[Sealed], int] | None = None
+        placed: int | None = None
         for link in self._links:
             if 0 < link.try_again_ns <= now_ns:
                 self._set_up(link, now_ns)
-        links = [link for link in self._links if self._goes_at_once(link, now_ns)]
-        if not links:
-            return 0
-        made: dict[int, tuple[list[Sealed], int]] = {}
-        for link in links:
-            lane = self._lanes.lane(0) if link.lane is None else link.lane
-            medium = 0 if link.lane is None else link.number
-            if medium not in made:
-                made[medium] = lane.seal(beat, items, now_ns, round_=round_)
+            if link.slots is not None and not self._goes_at_once(link, now_ns):
+                continue
             link.sent_ns = now_ns
-            self._deliver(link, lane, made[medium][0], now_ns, self._beat_ns, patience_ns)
-        return made[min(made)][1]
+            if link.lane is not None:
+                sealed, count = link.lane.seal(beat, items, now_ns, round_=round_)
+                placed = count if placed is None else placed
+                self._deliver(link, link.lane, sealed, now_ns, self._beat_ns, patience_ns)
+                continue
+            if made is None:
+                made = self._lane.seal(beat, items, now_ns, round_=round_)
+            self._deliver(link, self._lane, made[0], now_ns, self._beat_ns, patience_ns)
+        return made[1] if made is not None else placed or 0
 
     def _goes_at_once(self, link: Link, now_ns: int) -> bool:
         """On a medium with slots a robot without one speaks as seldom as those that have one."""
@@ -308,25 +311,25 @@ class Media:
         self, link: Link, lane: FrameLane, made: Sequence[Sealed], now_ns: int, period_ns: int, patience_ns: int
     ) -> None:
         """By cast to all, and by unicast to each member that has not said lately that it hears casts."""
-        casts = lane.casts
-        if link.casting is None or casts is None or link.casting.now is Cast.UNICAST:
+        casts, casting, unicast, place = lane.casts, link.casting, self._beats.unicast, link.place
+        if casting is None or casts is None or casting.now is Cast.UNICAST:
             for sealed in made:
                 for peer in sealed.to:
-                    self._beats.unicast(peer, link.place, sealed.datagrams)
-            if link.casting is not None and link.casting.round_over(0, 0):
+                    unicast(peer, place, sealed.datagrams)
+            if casting is not None and casting.round_over(0, 0):
                 self._cast_otherwise(link)
             return
         since_ns = now_ns - round(RECENT_PERIODS * period_ns) - patience_ns
         for sealed in made if any(one.to for one in made) else []:
-            refusal = self._beats.cast(link.place, link.casting.now, sealed.datagrams)
-            if refusal and link.casting.failed(refusal):
+            refusal = self._beats.cast(place, casting.now, sealed.datagrams)
+            if refusal and casting.failed(refusal):
                 self._cast_otherwise(link)
             for counter in range(lane.counter - len(sealed.datagrams) + 1, lane.counter + 1):
-                casts.left(link.place, counter, now_ns)
+                casts.left(place, counter, now_ns)
             ranks, reached = self._roster.ranks, link.reached
-            missing = [peer for peer in sealed.to if peer not in reached or not casts.hears(ranks[peer], link.place, since_ns)]
+            missing = [peer for peer in sealed.to if peer not in reached or not casts.hears(ranks[peer], place, since_ns)]
             for peer in missing:
-                self._beats.unicast(peer, link.place, sealed.datagrams)
+                unicast(peer, place, sealed.datagrams)
             link.by_unicast = tuple(missing)
             self._choose(link, sealed.to, now_ns)
 

@@ -14,7 +14,7 @@ from typing import Final
 
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
-from failover.core.board.banks import LOW_HALF, RETRIES, Found, sum_of
+from failover.core.board.banks import RETRIES, Found, sum_of
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import NOT_SENT, URGENT, Record
 from failover.errors import BoardError, OvertakenError
@@ -73,7 +73,8 @@ class OwnItems:
 
     def numbers(self, records: Iterable[Record]) -> dict[int, int]:
         """Numbers of the newest puts of some items, by the items' numbers; 0: none."""
-        return {record.id: self._word(record.at + layout.NEWEST_FIELD) for record in records}
+        pread, descriptor, field = os.pread, self._descriptor, layout.NEWEST_FIELD
+        return {record.id: int.from_bytes(pread(descriptor, 8, record.at + field), "little") for record in records}
 
     def newest(self) -> list[int]:
         """The numbers of the newest puts as they are now, by the indexes of the records; 0: none.
@@ -126,16 +127,17 @@ class OwnItems:
         known = self._known.get(record.id)
         if known is not None and known.number == number:
             return known
+        pread, descriptor, head, limit = os.pread, self._descriptor, layout.BANK_HEAD, layout.BANK_HEAD + record.size
         for _ in range(RETRIES):
             if number == 0:
                 return None
             bank = record.offset + number % record.banks * record.stride
-            content = os.pread(self._descriptor, layout.BANK_HEAD + record.size, bank)
-            if len(content) < layout.BANK_HEAD:
+            content = pread(descriptor, limit, bank)
+            if len(content) < head:
                 raise BoardError(f"{self._file.path}: item {record.name!r}: the file was made shorter")
             _, stamp_ns, total, size, error_us = _BANK.unpack_from(content)
-            value = content[layout.BANK_HEAD : layout.BANK_HEAD + (size & LOW_HALF)]
-            if self._word(bank) == number:
+            value = content[head : head + size]
+            if int.from_bytes(pread(descriptor, 8, bank), "little") == number:
                 if len(value) != size:
                     raise BoardError(f"{self._file.path}: item {record.name!r}: damaged: a value of {size} bytes")
                 if total in (0, sum_of(value, stamp_ns, number)):

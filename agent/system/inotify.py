@@ -7,7 +7,6 @@ Sources: inotify(7), utimensat(2); `fsnotify_change` in Linux: both times set at
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 from typing import Final
@@ -47,8 +46,10 @@ class Touches:
 
     def heed(self) -> None:
         """What was told until now is being seen to; nothing, if it has been already."""
-        with contextlib.suppress(BlockingIOError):
+        try:  # not `suppress`: the loop does this for each urgent put
             os.read(self._descriptor, EVENTS_SIZE)
+        except BlockingIOError:
+            return
 
     def close(self) -> None:
         """Give the descriptor back."""

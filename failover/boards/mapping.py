@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import struct
 from typing import ClassVar, Final
@@ -152,8 +151,10 @@ class MappedFile(SharedFile):
 
     def touch(self) -> None:
         """Set the file's times: that tells an agent of an urgent put. If the kernel refuses, the put waits for the round."""
-        with contextlib.suppress(OSError):
+        try:  # not `suppress`: a put waits for it
             os.utime(self.descriptor)
+        except OSError:
+            return
 
     def take_writer(self, record: Record, pid: int) -> bool:
         """Become the writer of an item; False if another process is."""

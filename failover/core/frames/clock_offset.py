@@ -45,8 +45,9 @@ class ClockOffset(Struct):
 
     def heard(self, left_ns: int, came_ns: int) -> None:
         """A frame of the peer left at ``left_ns`` of its clock and came at ``came_ns`` of ours."""
-        bound = came_ns - left_ns - _drift(came_ns)
-        self._ceiling_ns = bound if self._ceiling_ns is None else min(self._ceiling_ns, bound)
+        bound = came_ns - left_ns - came_ns * DRIFT_PPM // MILLION
+        if self._ceiling_ns is None or bound < self._ceiling_ns:
+            self._ceiling_ns = bound
 
     def echoed(self, ours_left_ns: int, left_ns: int, hold_ns: int, came_ns: int) -> int | None:
         """That frame echoes ours, which left at ``ours_left_ns`` of our clock; the peer had held it for ``hold_ns``.
@@ -54,8 +55,9 @@ class ClockOffset(Struct):
         Returns:
             `most_ns` of that frame.
         """
-        bound = ours_left_ns - (left_ns - hold_ns) - RESOLUTION_NS + _drift(ours_left_ns)
-        self._floor_ns = bound if self._floor_ns is None else max(self._floor_ns, bound)
+        bound = ours_left_ns - (left_ns - hold_ns) - RESOLUTION_NS + ours_left_ns * DRIFT_PPM // MILLION
+        if self._floor_ns is None or bound > self._floor_ns:
+            self._floor_ns = bound
         most_ns = self.most_ns(left_ns, came_ns)
         if most_ns is None:
             self.contradicted += 1

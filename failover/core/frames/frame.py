@@ -414,7 +414,7 @@ class Receiver:
     def __init__(self, me: str, team: str, roster: Roster) -> None:
         self._me = roster.ranks[me]
         self._tag, self._digest = team_tag(team), roster.short_digest
-        self._roster = roster
+        self._roster, self._others = roster, len(roster) - 1
         self._senders: dict[int, _Sender] = {}
 
     def accept(self, sender: str, key: bytes) -> None:
@@ -467,9 +467,12 @@ class Receiver:
         sender = self._senders.get(name)
         if sender is None:
             place = self._me - (self._me > rank)
-            is_cast = alike and count == len(self._roster) - 1 and _is_unsealed(datagram, range(place, place + 1))
+            is_cast = alike and count == self._others and _is_unsealed(datagram, range(place, place + 1))
             return Refused(Reason.UNSEALED if is_cast else Reason.UNKNOWN_KEY)
-        places = self._places(rank, count, alike, sender)
+        if alike and rank == sender.rank and count == self._others:
+            places = sender.places
+        else:
+            places = self._places(count, alike)
         if not places:
             return Refused(Reason.ROSTER)
         body = datagram[start:]
@@ -511,13 +514,11 @@ class Receiver:
             said.casts,
         )
 
-    def _places(self, rank: int, count: int, alike: bool, sender: _Sender) -> range:
-        """Which of the authenticators may be ours; none where the rank is not the sender's."""
+    def _places(self, count: int, alike: bool) -> range:
+        """Which of the authenticators may be ours, where they are not all those of our roster; none where they should be."""
         if count == 1:
             return _FIRST
-        if not alike:
-            return range(min(count, CODES_MAX))
-        return sender.places if rank == sender.rank and count == len(self._roster) - 1 else range(0)
+        return range(0) if alike else range(min(count, CODES_MAX))
 
 
 def _check(datagram: bytes, body: bytes, places: range, keys: Sequence[bytes]) -> Reason | None:

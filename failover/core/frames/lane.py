@@ -16,7 +16,6 @@ from failover.core.frames.assembly import Assembly
 from failover.core.frames.casts import Casts
 from failover.core.frames.clock_offset import ClockOffset
 from failover.core.frames.frame import (
-    AGE_US_MAX,
     NO_CASTS,
     Part,
     Portion,
@@ -174,19 +173,17 @@ class FrameLane:
             said = msgspec.structs.replace(said, echo=self._some(said.echo))
         casts = self.casts.says() if self.casts is not None else NO_CASTS
         parts, placed = bodies(said, beat, items, now_ns // US, self._room, casts)
-        made = [
-            Sealed(to, self._sealer.seal(parts, keys, medium=self._medium, flags=flags, round_=round_, again=number > 0))
-            for number, (to, keys) in enumerate(self._shares)
-        ]
+        made, seal = [], self._sealer.seal
+        for to, keys in self._shares:
+            sealed = seal(parts, keys, medium=self._medium, flags=flags, round_=round_, again=bool(made))
+            made.append(Sealed(to, sealed))
         if self._bounds_ways and made:
-            self._note_left(len(parts), now_ns)
+            left, counter = self._left, self._sealer.counter
+            for number in range(counter - len(parts) + 1, counter + 1):
+                left[number] = now_ns
+            while len(left) > LEFT_MAX:
+                left.popitem(last=False)
         return made, placed
-
-    def _note_left(self, count: int, now_ns: int) -> None:
-        for counter in range(self._sealer.counter - count + 1, self._sealer.counter + 1):
-            self._left[counter] = now_ns
-        while len(self._left) > LEFT_MAX:
-            self._left.popitem(last=False)
 
     def open(self, datagram: bytes, came_ns: int) -> Heard | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes.
@@ -241,14 +238,13 @@ class FrameLane:
 
     def _echo(self, now_ns: int) -> tuple[tuple[int, int, int], ...]:
         """Of whom we have heard lately; in a large team of some, in turn."""
-        recent = [(rank, peer) for rank, peer in self._peers.items() if peer.counter and now_ns - peer.came_ns < ECHOED_NS]
-        return self._some(
-            tuple((rank, peer.counter, min(max(now_ns - peer.came_ns, 0) // US, AGE_US_MAX)) for rank, peer in recent)
-        )
+        since_ns, echoes = now_ns - ECHOED_NS, []
+        for rank, peer in self._peers.items():
+            if peer.came_ns > since_ns and peer.counter:
+                echoes.append((rank, peer.counter, max(now_ns - peer.came_ns, 0) // US))
+        return self._some(tuple(echoes)) if len(echoes) > self._echoes else tuple(echoes)
 
     def _some(self, echoes: tuple[tuple[int, int, int], ...]) -> tuple[tuple[int, int, int], ...]:
-        """As many as a frame has room for, in turn."""
-        if len(echoes) <= self._echoes:
-            return echoes
+        """As many as a frame has room for, in turn: there are more."""
         self._echo_from = (self._echo_from + self._echoes) % len(echoes)
         return (echoes + echoes)[self._echo_from : self._echo_from + self._echoes]
