@@ -38,7 +38,8 @@ class OwnItems:
     """The items that this robot sends.
 
     Attributes:
-        records: by number, as the table was when it was last read.
+        records: by number, as the table was when it was last read; ``urgent``: those of them that are.
+        writers: item's number → the component that writes it, of those whose declaration names one.
     """
 
     def __init__(self, file: MappedFile) -> None:
@@ -46,6 +47,7 @@ class OwnItems:
         self._descriptor = file.descriptor
         self.records: dict[int, Record] = {}
         self.urgent: tuple[Record, ...] = ()
+        self.writers: dict[int, str] = {}
         self._known: dict[int, Found] = {}
         self._generation = -1
         self._looked_ns: int | None = None
@@ -69,6 +71,7 @@ class OwnItems:
         self.records = {record.id: record for record in found}
         self._known = {}
         self.urgent = tuple(record for record in found if record.flags & URGENT)
+        self.writers = {record.id: record.writer for record in found if record.writer}
         return True
 
     def numbers(self, records: Iterable[Record]) -> dict[int, int]:

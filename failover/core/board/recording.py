@@ -127,6 +127,7 @@ def topic_of(robot: str, item: str) -> str:
 def channel_of(robot: str, record: Record, private: bool) -> Channel:
     """The channel of an item; one of bytes where the declaration says no type, or one that does not fit (`misfit_of`)."""
     fields = {name: getattr(record, name) for name in Wanted.__struct_fields__}
+    fields |= {"flags": record.flags & ~layout.WRITTEN_BY, "writer": ""}  # whoever replays it is not that program
     if not record.text or misfit_of(record):
         octets = Opaque("bytes", record.size)
         fields |= {"text": canonical(octets), "kind": layout.BYTES, "digest": type_digest(octets)}
