@@ -155,7 +155,7 @@ class BoardLink:
         if medium == 0:
             self._urgent_ns = now_ns
         try:
-            numbers = own.numbers(own.urgent)
+            numbers = own.urgent_numbers()
         except OSError:
             self.dropped[UNREADABLE] += 1
             return []
@@ -186,11 +186,10 @@ class BoardLink:
 
     def has_urgent(self) -> bool:
         """Whether an urgent item was put since `urgent` looked for the links without slots."""
-        urgent = self._own.urgent
-        if not urgent:
+        if not self._own.urgent:
             return False
         try:
-            return self._own.numbers(urgent) != self._looked
+            return self._own.urgent_numbers() != self._looked
         except OSError:
             self.dropped[UNREADABLE] += 1
             return False
@@ -199,7 +198,7 @@ class BoardLink:
         """Urgent items that were put wait for this robot's slot."""
         self._urgent_ns = now_ns
         try:
-            self._looked = self._own.numbers(self._own.urgent)
+            self._looked = self._own.urgent_numbers()
         except OSError:
             self.dropped[UNREADABLE] += 1
 

@@ -199,7 +199,7 @@ class MainLoop:
             if watchdog_ns and now_ns - fed_ns >= watchdog_ns and self._node is not None:
                 self._notifier.alive()
                 fed_ns = now_ns
-            if needs_s := self._departure.needs_s(now_ns):
+            if self._departure.is_restart and (needs_s := self._departure.needs_s(now_ns)):
                 self._notifier.needs(needs_s)
         if not self._remembered:
             self._notifier.stopping()
@@ -303,9 +303,11 @@ class MainLoop:
             self._send_urgent(self._board, clock.now_ns())
         if self._media.is_slotted:
             self._take_slots()
-        self._watch_worker()
+        now_ns = clock.now_ns()
+        if now_ns - self._turned_ns >= TURNS_NS:
+            self._watch_worker(now_ns)
         if self._node is not None:
-            late_ns = clock.now_ns() - self._node.next_deadline_ns()
+            late_ns = now_ns - self._node.next_deadline_ns()
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
                 self._step(Tick())
@@ -317,6 +319,8 @@ class MainLoop:
 
         In a flood of what is refused the main loop leaves half of the time to others: it runs before all ordinary processes.
         """
+        if self._board is not None and self._listens and not self._rests and self._deaf_until_ns <= self._read_ns:
+            return  # it has no leisure, and stays as it is
         now_ns = clock.now_ns()
         has_leisure = self._node is not None and self._board is None and not self._media.is_slotted
         self._rests = has_leisure and self._node is not None and self._node.rests(now_ns)
@@ -325,15 +329,12 @@ class MainLoop:
             self._listens = listens
             self._poll.modify(self._beats.fileno(), select.EPOLLIN if listens else 0)
 
-    def _watch_worker(self) -> None:
+    def _watch_worker(self, now_ns: int) -> None:
         """Count how long the worker says nothing.
 
         A turn of our own that took long proves nothing about it, and neither does a time in which the kernel kept it from
         running: another one in its place would say as little.
         """
-        now_ns = clock.now_ns()
-        if now_ns - self._turned_ns < TURNS_NS:
-            return
         self._worker_unseen_ns += min(now_ns - self._turned_ns, int(SLEEP_LIMIT_S * NANOSECONDS_A_SECOND))
         self._turned_ns = now_ns
         if self._worker_unseen_ns < WORKER_LOOK_NS:
@@ -387,7 +388,8 @@ class MainLoop:
                     self._board.take(opened, came_ns)  # first: programs wait for it
                 self._copies.heard(opened.part, link, cast=is_cast)
                 self._note_way(opened.part, link, place, came_ns)
-                self._take_part(opened.part, link, now_ns, self._counts_from_ns(now_ns, came_ns))
+                counts_ns = self._counts_from_ns(now_ns, came_ns) if self._rests else 0
+                self._take_part(opened.part, link, now_ns, counts_ns)
             elif self._copies.admit(opened, link, now_ns, medium=medium_of(frame), cast=is_cast):
                 self._note_way_of_copy(opened, link, place, frame)
             else:
@@ -422,7 +424,7 @@ class MainLoop:
 
     def _counts_from_ns(self, now_ns: int, came_ns: int) -> int:
         """When a beat came that waited because this main loop rests: its sender was not late. 0: now, or a stall of ours."""
-        return came_ns if self._rests and now_ns - came_ns <= self._rest_ns + self._outbox.beat_ns else 0
+        return came_ns if now_ns - came_ns <= self._rest_ns + self._outbox.beat_ns else 0
 
     def _mind_earlier_lives(self, beat: Beat) -> None:
         """A peer that remembers a later life of ours believes none of our beats: begin one above that."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import struct
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from failover.boards.mapping import MappedFile
@@ -48,6 +48,7 @@ class OwnItems:
         self.records: dict[int, Record] = {}
         self.urgent: tuple[Record, ...] = ()
         self.writers: dict[int, str] = {}
+        self._urgent_at: tuple[tuple[int, int], ...] = ()
         self._known: dict[int, Found] = {}
         self._generation = -1
         self._looked_ns: int | None = None
@@ -71,13 +72,18 @@ class OwnItems:
         self.records = {record.id: record for record in found}
         self._known = {}
         self.urgent = tuple(record for record in found if record.flags & URGENT)
+        self._urgent_at = tuple((record.id, record.at + layout.NEWEST_FIELD) for record in self.urgent)
         self.writers = {record.id: record.writer for record in found if record.writer}
         return True
 
-    def numbers(self, records: Iterable[Record]) -> dict[int, int]:
-        """Numbers of the newest puts of some items, by the items' numbers; 0: none."""
-        pread, descriptor, field = os.pread, self._descriptor, layout.NEWEST_FIELD
-        return {record.id: int.from_bytes(pread(descriptor, 8, record.at + field), "little") for record in records}
+    def urgent_numbers(self) -> dict[int, int]:
+        """Numbers of the newest puts of the urgent items, by the items' numbers; 0: none.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        pread, descriptor = os.pread, self._descriptor
+        return {number: int.from_bytes(pread(descriptor, 8, at), "little") for number, at in self._urgent_at}
 
     def newest(self) -> list[int]:
         """The numbers of the newest puts as they are now, by the indexes of the records; 0: none.

@@ -302,14 +302,14 @@ class Node:
 
     def _take(self, event: Event, turn: Turn) -> list[Component]:
         """Take the event in; returns the components that it may have changed."""
+        if isinstance(event, Received):
+            return self._hear(event, turn)
         if isinstance(event, Leave):
             self._leave(turn)
         if isinstance(event, Drain):
             self._drain(event, turn)
         if isinstance(event, Tick | TeamChanged | Leave | Drain):
             return list(self._components.values())
-        if isinstance(event, Received):
-            return self._hear(event, turn)
         if isinstance(event, Noticed):
             self._note(event, turn)
             return []

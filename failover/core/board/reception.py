@@ -285,7 +285,7 @@ class Reception:
         if not (oldest_us < AGE_MAX_US and oldest_us * NS_PER_US < came_ns and max(puts) < plan.after and plan.fit(sizes)):
             return None
         stamps_ns = [came_ns - age_us * NS_PER_US for age_us in ages_us]
-        newer = tuple(map(gt, puts, plan.last_numbers))
+        newer: tuple[bool, ...] = tuple(map(gt, puts, plan.last_numbers))
         if all(newer):
             plan.put(values, sizes, stamps_ns, error_us)
             plan.last_numbers = puts

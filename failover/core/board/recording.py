@@ -186,7 +186,7 @@ def read_channel(metadata: Mapping[str, str]) -> Channel | None:
         raise RecordingError(f"damaged: the declaration of {metadata.get('item', 'an item')[:80]!r}: {said}") from None
     code = layout.KINDS.index(kind.kind) if isinstance(kind, Opaque) else layout.STRUCT
     wanted = Wanted(
-        name=metadata["item"], size=size_of(kind), kind=code, digest=type_digest(kind), text=canonical(kind), **numbers
+        name=metadata["item"], size=size_of(kind), kind=code, digest=type_digest(kind), text=canonical(kind), writer="", **numbers
     )
     return Channel(robot, wanted, metadata.get("private") == "1")
 

@@ -173,7 +173,8 @@ class FrameLane:
             said = msgspec.structs.replace(said, echo=self._some(said.echo))
         casts = self.casts.says() if self.casts is not None else NO_CASTS
         parts, placed = bodies(said, beat, items, now_ns // US, self._room, casts)
-        made, seal = [], self._sealer.seal
+        made: list[Sealed] = []
+        seal = self._sealer.seal
         for to, keys in self._shares:
             sealed = seal(parts, keys, medium=self._medium, flags=flags, round_=round_, again=bool(made))
             made.append(Sealed(to, sealed))
