@@ -12,7 +12,7 @@ import os
 import sys
 import time
 import weakref
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import partial
@@ -202,7 +202,7 @@ class ItemWriter:
         if not file.take_writer(record, os.getpid()):
             raise WriterTakenError(self._board.whose(file, record))
         number = first_of_epoch(place.words[place.newest], epoch(), record.banks) - 1
-        woken = partial(_wake, file, record)
+        woken = _waker(file, record)
         return writer_of(place, number, boottime.CLOCK, self._board.skew_ns, self.put_slowly, woken, file.always_wakes, FENCE)
 
     def _examined(self, source: Source, value: Any) -> bytes:
@@ -240,22 +240,27 @@ def _is_inside(writer: Writer) -> bool:
     return frame is not None
 
 
-def _wake(file: MappedFile, record: Record, stamp_ns: int) -> None:
-    """Wake those that wait for an item, or for any of several (BOARD.md, *Waiting*)."""
-    at = record.at + layout.WAITERS_FIELD
-    item, any_ = file.area[at : at + 2]
-    if item:  # what is not set stays as it is: the agent may ask in this moment
-        file.area[at] = 0
-    if any_:
-        file.area[at + 1] = 0
-    if any_ and record.flags & layout.URGENT:
-        file.touch()
-    base = file.address(0)
-    if item or file.always_wakes:
-        futex.wake(base + record.at + layout.NEWEST_FIELD)
-    if any_:
-        file.words[layout.CHANGED_AT // 8] = stamp_ns
-        futex.wake(base + layout.CHANGED_AT)
+def _waker(file: MappedFile, record: Record) -> Callable[[int], None]:
+    """What wakes those that wait for an item, or for any of several (BOARD.md, *Waiting*); it is given the stamp of the put."""
+    area, words, at = file.area, file.words, record.at + layout.WAITERS_FIELD
+    newest, changed = file.address(record.at + layout.NEWEST_FIELD), file.address(layout.CHANGED_AT)  # good while `area` is
+    is_urgent, always_wakes = bool(record.flags & layout.URGENT), file.always_wakes
+
+    def wake(stamp_ns: int) -> None:
+        item, any_ = area[at : at + 2]
+        if any_:  # what is not set stays as it is: the agent may ask in this moment
+            area[at + 1] = 0
+            if is_urgent:
+                file.touch()
+        if item:
+            area[at] = 0
+        if item or always_wakes:
+            futex.wake(newest)
+        if any_:
+            words[layout.CHANGED_AT // 8] = stamp_ns
+            futex.wake(changed)
+
+    return wake
 
 
 class Item:

@@ -586,8 +586,10 @@ def test_a_question_of_the_agent_that_comes_while_a_put_wakes_others_is_kept(
         file, at = item.source().file, item.source().record.at + layout.WAITERS_FIELD
         area, base = file.area, file.address(0)
         monkeypatch.setattr(MappedFile, "address", lambda _file, offset: base + offset)
+        monkeypatch.setattr(MappedFile, "take_writer", lambda *_: True)  # it is taken already
         area[at] = 1  # a program waits for this item
         file.area = Asked(area, at + 1)
+        board.writer("x").forget()  # it has the area of before
         item.put(b"b")
         file.area = area
         assert tuple(area[at : at + 2]) == (0, 1)
