@@ -8,7 +8,7 @@ from typing import Final
 AS_SOON_AS: Final = "failover captures it as soon as"
 """Begins the cure of a refusal for a moment only: that moment's end follows."""
 
-_KEPT: Final = frozenset("\n\t\N{NO-BREAK SPACE}")
+_KEPT: Final = frozenset("\n\t\xa0")
 
 
 def visible(text: str) -> str:
