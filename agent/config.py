@@ -361,6 +361,10 @@ class Settings:
         """The same agent in the team as it is now; the board stays."""
         return replace(self, team=replace(team, board=self.team.board))
 
+    def with_secret(self, secret: str) -> Settings:
+        """The same agent with another key of its own."""
+        return replace(self, secret_key=secret)
+
     def component(self, name: str) -> ComponentConfig:
         """The operator's settings for a component; the defaults where he gave none."""
         return self.config.components.get(name, ComponentConfig())

@@ -100,7 +100,8 @@ def _check_pair(settings: configuration.Settings) -> None:
         public = public_key_of(settings.secret_key)
     except LaneError as error:
         raise ConfigError(f"{key}: {error}") from error
-    if public != (enrolled := settings.me.public_key):
+    if public not in settings.me.keys:
+        enrolled = settings.me.public_key
         raise ConfigError(
             f"{key} does not belong to the public key of {robot} in {directory / team_directory.TEAM_FILE}: its public half is "
             f"{public[:8]}…, the team has {enrolled[:8]}…, so no other robot would accept this one; bring the right key or the "

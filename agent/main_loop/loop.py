@@ -509,9 +509,12 @@ class MainLoop:
 
     def _take_team(self, robots: dict[str, Robot]) -> None:
         """Between two turns: send to these members, hear these, and decide with these."""
-        if robots == self._settings.team.robots or self._me not in robots:
+        before = self._settings.team.robots
+        if robots == before or self._me not in robots:
             return
         settings = self._settings = self._settings.with_robots(robots)
+        if {name: robot.keyless for name, robot in robots.items()} == {name: robot.keyless for name, robot in before.items()}:
+            return  # other keys of the connections, which are the worker's
         members = settings.team.roster()
         self._beats.know(settings.peers)
         self._frames.change(members, self._lanes_for(members))

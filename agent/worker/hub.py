@@ -112,7 +112,7 @@ class Switchboard:
         self._own_troubles: list[str] = []
         self._signs: dict[tuple[str, str], float] = {}
         keys = self._keys()
-        if keys.present and keys.public != settings.me.public_key:
+        if keys.present and keys.public not in settings.me.keys:
             self._own_troubles.append(UNFIT_KEY)
         facts = Facts(frozenset(config.wireless))
         self._links = Links(settings.me, facts, anywhere=config.snapshots_over == "any")
@@ -130,14 +130,25 @@ class Switchboard:
         settings = self.settings
         if settings.config.insecure:
             return Keys("", "", {})
-        publics = {name: robot.public_key for name, robot in (*settings.former.items(), *settings.team.robots.items())}
-        return Keys(public_key_of(settings.secret_key), settings.secret_key, publics)
+        known = {**settings.former, **settings.team.robots}
+        publics = {name: robot.public_key for name, robot in known.items()}
+        following = {name: robot.next_key for name, robot in known.items() if robot.next_key}
+        return Keys(public_key_of(settings.secret_key), settings.secret_key, publics, following)
 
     async def take_team(self, team: Team) -> None:
         """Go on with these members: the main loop's frames and rules, and every connection."""
         self.settings = self.settings.with_team(team)
         await self.prepare_team()
         self._say(TeamIs(dict(team.robots)))
+        await self._connect_anew()
+
+    async def take_secret(self, secret: str) -> None:
+        """Go on with this secret key, whose public half all members know."""
+        self.settings = self.settings.with_secret(secret)
+        await self._connect_anew()
+
+    async def _connect_anew(self) -> None:
+        """Every connection, as far as members and keys are others now."""
         try:
             await self._connections.change(self.settings, self._keys())
         except LaneError as error:
@@ -430,7 +441,7 @@ class Switchboard:
         return [
             *self._own_troubles,
             *self._incompatible.values(),
-            *self.team_changes.conflicts.values(),
+            *self.team_changes.notes(),
             *self._replication_link.troubles(),
             *self._connections.troubles,
             *self._links.notes(),

@@ -1,4 +1,4 @@
-"""Members join and leave while the agents work: asked for here, granted to another robot, taken from it.
+"""Members join, leave and replace their keys while the agents work: asked for here, granted to another robot, taken from it.
 
 The rule is `failover.core.team_changes`: one member at a time, each change with the grants of all members. Here are the acts:
 asking the others, the team file, and, by `Lines.take_team`, the links and the main loop. No agent starts anew.
@@ -11,7 +11,7 @@ import functools
 import logging
 import os
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
@@ -29,7 +29,7 @@ from agent.worker.network.remote_orders import Errands, OrderOfPeer
 from failover.config import team as team_file
 from failover.config.team import Robot, Team
 from failover.core import acts, events
-from failover.core.team_changes import USE_NS, Grants, missing, step
+from failover.core.team_changes import TWO_KEYS, USE_NS, Grants, missing, step
 from failover.core.types import ENDED, HOLDING, PeerView
 from failover.errors import FailoverError
 
@@ -45,6 +45,15 @@ LEAVE_S: Final = 0.5
 LEAVE_PATIENCE_S: Final = 3.0
 """For the answer of a member that is taken out: until then this robot sends heartbeats to it still."""
 
+ROTATION_PATIENCE_S: Final = 90.0
+"""For another robot that replaces its key: two changes, and its connections made anew."""
+
+LOOK_S: Final = 0.1
+"""Between two looks for a connection, or for a rotation's end."""
+
+CONNECT_PATIENCE_S: Final = 10.0
+"""For connections with another key; a grant holds for longer than that."""
+
 UNHEARD_NS: Final = 10_000_000_000
 """A member that was not heard since this agent's start counts as one that lives for so long: it may be starting, too."""
 
@@ -54,6 +63,10 @@ RESTARTING: Final = "restarting"
 
 TEAM_IS: Final = "team_is"
 """The question which team a robot has: any member may ask it, and a former one as well."""
+
+ROTATE: Final = "team_rotate"
+ROTATED: Final = "team_rotated"
+"""The order to replace one's key, and the question how far that is."""
 
 TEAM_TOLD: Final = ("team_taken", TEAM_IS)
 """What a witness may say of the team, too: it is not believed alone."""
@@ -79,6 +92,7 @@ class Lines(Protocol):
     async def command(self, make: Callable[[int], events.Command]) -> acts.Answer: ...
     def hindrance(self, peer: str) -> str: ...
     async def take_team(self, team: Team) -> None: ...
+    async def take_secret(self, secret: str) -> None: ...
 
 
 class TeamChanges:
@@ -95,11 +109,26 @@ class TeamChanges:
         self._taking = asyncio.Lock()
         self._work: set[asyncio.Task[dict[str, Any]]] = set()
         self._behind: dict[str, int] = {}
+        self._rotation: asyncio.Task[dict[str, Any]] | None = None
         self.conflicts: dict[str, str] = {}
 
     def orders(self) -> dict[str, OrderOfPeer]:
         """What another robot may order."""
-        return {"team_grant": self._granted, "team_taken": self._taken, "team_let_go": self._let_go, TEAM_IS: self._is}
+        return {
+            "team_grant": self._granted,
+            "team_taken": self._taken,
+            "team_let_go": self._let_go,
+            TEAM_IS: self._is,
+            ROTATE: self._ordered_to_rotate,
+            ROTATED: self._how_far,
+        }
+
+    def notes(self) -> list[str]:
+        """What is wrong with the team, for the status."""
+        settings = self._lines.settings
+        is_half = bool(settings.me.next_key) and not self._busy.locked()
+        half = [TWO_KEYS.format(robot=settings.config.robot)] if is_half else []
+        return [*self.conflicts.values(), *half]
 
     def heard(self, peer: str, change: int, members: int) -> None:
         """A peer, or a former member, says on a new connection how often its team was changed."""
@@ -134,37 +163,67 @@ class TeamChanges:
         wanted = arguments_of(TeamArguments, "team", arguments)
         if not may(say.caller.uid, None):
             raise RefusedError("only root may change the team", "PermissionError")
-        if self._busy.locked():
-            raise RefusedError("another change of the team is under way at this robot; wait for it")
-        await self._busy.acquire()
-        work = asyncio.create_task(self._change_and_free(wanted))
-        self._work.add(work)
-        work.add_done_callback(self._work.discard)
-        work.add_done_callback(_note_refusal)
+        if wanted.act == "rotate" and wanted.robot not in ("", self._lines.settings.config.robot):
+            return await self._have_rotated(wanted.robot)
+        work = await self._begun(self._rotated() if wanted.act == "rotate" else self._change(wanted))
         try:
             return await asyncio.shield(work)
         except FailoverError as error:
             raise RefusedError(str(error), type(error).__name__) from error
 
-    async def _change_and_free(self, wanted: TeamArguments) -> dict[str, Any]:
+    async def _begun(self, change: Coroutine[Any, Any, dict[str, Any]]) -> asyncio.Task[dict[str, Any]]:
+        """Begin a change; it goes on whoever waits for it.
+
+        Raises:
+            RefusedError: another one is under way.
+        """
+        if self._busy.locked():
+            change.close()
+            raise RefusedError("another change of the team is under way at this robot; wait for it")
+        await self._busy.acquire()
+        work = asyncio.create_task(self._alone(change))
+        self._work.add(work)
+        work.add_done_callback(self._work.discard)
+        work.add_done_callback(_note_refusal)
+        return work
+
+    async def _alone(self, change: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
         try:
-            return await self._change(wanted)
+            return await change
         finally:
             self._grants.done(self._lines.settings.config.robot)
             self._busy.release()
 
     async def _change(self, wanted: TeamArguments) -> dict[str, Any]:
         settings, before = self._lines.settings, self._lines.settings.team
-        me, removed = settings.config.robot, wanted.robot if wanted.act == "remove" else ""
-        after = _wanted(before, wanted, me)
+        removed = wanted.robot if wanted.act == "remove" else ""
+        after = _wanted(before, wanted, settings.config.robot)
         check_team(settings, after)
-        self._check_that_it_can_be_written()
+        self.check_that_it_can_be_written()
         if removed:
             refuse(await self._objection(removed, after))
+        return await self.agreed(before, after, removed)
+
+    async def agreed(
+        self, before: Team, after: Team, removed: str = "", prepare: Callable[[], Awaitable[None]] | None = None
+    ) -> dict[str, Any]:
+        """Have all grant a change, and make it.
+
+        Args:
+            prepare: what this robot does once all have granted it, before any has it.
+
+        Raises:
+            RefusedError: nothing has changed.
+        """
+        settings = self._lines.settings
         peers = list(settings.peers)
         is_written = False
         try:
-            await self._be_granted(before, after, removed)
+            granted_ns = await self._be_granted(before, after, removed)
+            if prepare is not None:
+                await prepare()
+            if clock.now_ns() - granted_ns > USE_NS:
+                raise RefusedError("cannot change the team: its members took too long to agree; try again")
             async with self._taking:
                 if self._lines.settings.team != before:
                     raise RefusedError("the team has changed meanwhile; give the command again")
@@ -188,8 +247,12 @@ class TeamChanges:
         self._behind |= dict.fromkeys(gone, after.change - 1)
         return [peer for peer, took in zip(others, done, strict=True) if not took]
 
-    async def _be_granted(self, before: Team, after: Team, removed: str) -> None:
-        """Raises RefusedError: a member refuses, or cannot be asked; nothing has changed."""
+    async def _be_granted(self, before: Team, after: Team, removed: str) -> int:
+        """When all have been asked; they grant it.
+
+        Raises:
+            RefusedError: a member refuses, or cannot be asked; nothing has changed.
+        """
         me, asked_ns = self._lines.settings.config.robot, clock.now_ns()
         await self._tell_who_is_behind()
         if refusal := self._grants.ask(before.change, before.change, me, asked_ns, digest(after.robots)):
@@ -207,8 +270,7 @@ class TeamChanges:
                 f"cannot change the team: each of its {len(before.robots)} members must agree, and {', '.join(short)} cannot be "
                 "reached; nothing has changed. Bring it back, or take out one that is lost: failover team remove ROBOT"
             )
-        if clock.now_ns() - asked_ns > USE_NS:
-            raise RefusedError("cannot change the team: its members took too long to agree; try again")
+        return asked_ns
 
     async def _asked(self, peer: str, before: Team, after: Team) -> Answer:
         """What a member says; neither granted nor refused where it cannot be reached."""
@@ -238,6 +300,49 @@ class TeamChanges:
             return False
         self._behind.pop(peer, None)
         return True
+
+    # --- this robot's key ---
+
+    async def _rotated(self) -> dict[str, Any]:
+        from agent.worker.key_rotation import KeyRotation  # here: an agent that replaces no key does not load it
+
+        return await KeyRotation(self, self._lines).run()
+
+    async def until_reached(self, peer: str) -> None:
+        """Wait for a connection that was made anew, for a while."""
+        until_ns = clock.now_ns() + int(CONNECT_PATIENCE_S * 1e9)
+        while self._lines.hindrance(peer) and clock.now_ns() < until_ns:
+            await asyncio.sleep(LOOK_S)
+
+    async def _have_rotated(self, robot: str) -> dict[str, Any]:
+        """Have another robot replace its key. The connections over which it answers are made anew meanwhile."""
+        await self._lines.errands.send(robot, ROTATE, {}, patience_s=GRANT_PATIENCE_S)
+        until_ns, trouble = clock.now_ns() + int(ROTATION_PATIENCE_S * 1e9), "it does not answer"
+        while clock.now_ns() < until_ns:
+            await asyncio.sleep(LOOK_S)
+            try:
+                told = await self._lines.errands.send(robot, ROTATED, {}, patience_s=GRANT_PATIENCE_S)
+            except RefusedError as error:
+                trouble = str(error)
+                continue
+            if not told.get("under_way"):
+                refuse(str(told.get("refusal", "")))
+                return dict(told["answer"])
+        raise RefusedError(f"it is not known whether {robot} has replaced its key: {trouble}; failover team list there tells")
+
+    async def _ordered_to_rotate(self, peer: str, _arguments: dict[str, Any]) -> dict[str, Any]:
+        log.info("%s has this robot replace its key", peer)
+        self._rotation = await self._begun(self._rotated())
+        return {}
+
+    async def _how_far(self, _peer: str, _arguments: dict[str, Any]) -> dict[str, Any]:
+        work = self._rotation
+        if work is None:
+            return {"refusal": "its agent was started anew meanwhile; give the command again, it goes on where it was"}
+        if not work.done():
+            return {"under_way": True}
+        error = work.exception()
+        return {"refusal": str(error)} if error is not None else {"answer": work.result()}
 
     # --- how things stand ---
 
@@ -286,7 +391,7 @@ class TeamChanges:
         try:
             after = team_of(asked, before)
             check_team(self._lines.settings, after)
-            self._check_that_it_can_be_written()
+            self.check_that_it_can_be_written()
         except (FailoverError, AgentError) as error:
             return {"refusal": str(error)}
         if asked.have == before.change:
@@ -295,6 +400,8 @@ class TeamChanges:
                 return {"refusal": f"it has other members than {peer}: copy the same team.toml to both"}
         else:
             who = ""
+        if who in before.robots and who in after.robots and not _is_own_rotation(peer, who, before, after):
+            return {"refusal": f"{who} alone may replace its key, and nothing else of its entry"}
         removed = who if who not in after.robots else ""
         if removed and (objection := await self._objection_to(removed, after)):
             return {"refusal": objection}
@@ -338,12 +445,15 @@ class TeamChanges:
             if self._is_known(after):  # another one has told it meanwhile, or a later one
                 return {"change": self._lines.settings.team.change}
             check_team(self._lines.settings, after)
+            has_other_keys = self._has_other_keys(peer, after)
             if self._lines.settings.config.robot not in after.robots:
                 await self._leave(after, peer, is_ordered=is_granted)
             else:
                 await asyncio.to_thread(self._write, after)
                 await self._lines.take_team(after)
             self._grants = Grants()  # of a change with this number, which is made now
+        if has_other_keys:
+            await self.until_reached(peer)  # the answer takes a new connection
         return {"change": after.change}
 
     def _is_known(self, after: Team) -> bool:
@@ -391,9 +501,14 @@ class TeamChanges:
         log.critical("%s was taken out of team %s; its agent ends", self._lines.settings.config.robot, after.team)
         asyncio.get_running_loop().call_later(LEAVE_S, end_agent)
 
+    def _has_other_keys(self, peer: str, after: Team) -> bool:
+        before = self._lines.settings.team.robots
+        return peer in before and peer in after.robots and before[peer].keys != after.robots[peer].keys
+
     # --- the file ---
 
-    def _check_that_it_can_be_written(self) -> None:
+    def check_that_it_can_be_written(self) -> None:
+        """Raises RefusedError: the team's file cannot."""
         directory = Path(self._lines.settings.config.team_directory)
         if not os.access(directory, os.W_OK):
             raise RefusedError(f"it cannot write into {directory}; a service needs ReadWritePaths={directory}")
@@ -406,6 +521,12 @@ class TeamChanges:
             raise RefusedError(
                 f"cannot write {directory / team_file.TEAM_FILE}: {error.strerror}; a service needs ReadWritePaths={directory}"
             ) from error
+
+
+def _is_own_rotation(peer: str, who: str, before: Team, after: Team) -> bool:
+    from failover.config.members import is_rotation  # here: as above
+
+    return peer == who and is_rotation(before.robots[who], after.robots[who])
 
 
 def _stop(name: str, number: int) -> events.Command:
@@ -463,7 +584,7 @@ def team_of(told: TakenTeam, before: Team) -> Team:
 
 def _who(team: Team) -> dict[str, tuple[object, ...]]:
     """What tells members apart: all but their seats, which all get with the first change."""
-    return {name: (one.beats, one.bulk, one.role, one.public_key) for name, one in team.robots.items()}
+    return {name: (one.beats, one.bulk, one.role, one.public_key, one.next_key) for name, one in team.robots.items()}
 
 
 def told_of(team: Team) -> dict[str, Any]:
@@ -476,5 +597,9 @@ def told_of(team: Team) -> dict[str, Any]:
 
 def digest(robots: Mapping[str, Robot]) -> int:
     """By which two robots find out that they have different teams."""
-    content = msgspec.json.encode({name: robots[name] for name in sorted(robots)})
+    told = {name: msgspec.to_builtins(robots[name]) for name in sorted(robots)}
+    for one in told.values():
+        if not one["next_key"]:
+            del one["next_key"]  # a release that knows none has the same digest
+    content = msgspec.json.encode(told)
     return int.from_bytes(blake2b(content, digest_size=4).digest(), "big")

@@ -35,8 +35,9 @@ verb           arguments                                                result, 
 ``failback``   ``name`` *must*, ``to`` "": the target expected          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
 ``drain``      ``robot`` *must*, ``on`` true                            ``{robot, drained, sentence}``; for root
-``team``       ``act`` *must*: add or remove, ``robot`` *must*,         ``{team, robots, change, waiting}``: members that take it
-               ``member``: {beats, bulk, role, public_key}              when they are back; for root
+``team``       ``act`` *must*: add, remove or rotate, ``robot``         ``{team, robots, change, waiting}``: members that take it
+               *must* ("": this one), ``member``: {beats, bulk, role,   when they are back; of rotate also ``robot public_key``;
+               public_key}                                              for root
 ``promote``    ``name`` *must*, ``robot`` = newest checkpoint's,         ``{name, to, epoch, promoted, sentence, risks}``; unless
                ``sure`` false                                           ``sure`` nothing is done, and they tell what would be
 =============  =======================================================  ========================================================

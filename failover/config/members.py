@@ -1,4 +1,4 @@
-"""A team with one member more, or one less: the next change of its team file."""
+"""A team with one member more, one less, or another key of one: the next change of its team file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from failover.config.addresses import check_addresses
 from failover.config.team import FORMER_LIMIT, ROBOT_LIMIT, Robot, Team, enrol
 from failover.core.frames.roster import roster
-from failover.core.team_changes import seats
+from failover.core.team_changes import is_step_of_keys, seats
 from failover.errors import TeamFileError
 
 
@@ -42,6 +42,32 @@ def left(team: Team, name: str, me: str) -> Team:
     former = {other: robot for other, robot in seated.former.items() if other != name} | {name: seated.robots[name]}
     newest = dict(list(former.items())[-FORMER_LIMIT:])
     return replace(seated, robots=robots, change=team.change + 1, former=newest)
+
+
+def with_next_key(team: Team, name: str, key: str) -> Team:
+    """The team with a second key of a member beside the one that it has: both count.
+
+    Raises:
+        TeamFileError: it is no key, or another member has it.
+    """
+    return _with_keys(team, name, team.robots[name].public_key, key)
+
+
+def with_one_key(team: Team, name: str, key: str) -> Team:
+    """The team with this key of a member alone: from now on its other one is refused."""
+    return _with_keys(team, name, key, "")
+
+
+def _with_keys(team: Team, name: str, key: str, following: str) -> Team:
+    seated = _seated(team)
+    member = replace(seated.robots[name], public_key=key, next_key=following)
+    return replace(enrol(seated, name, member), change=team.change + 1)
+
+
+def is_rotation(before: Robot, after: Robot) -> bool:
+    """Whether a member's entry differs by one step of its keys, and by nothing else (but a first seat)."""
+    is_same = replace(before.keyless, seat=after.seat) == after.keyless and before.seat in (-1, after.seat)
+    return is_same and is_step_of_keys((before.public_key, before.next_key), (after.public_key, after.next_key))
 
 
 def _seated(team: Team) -> Team:

@@ -4,6 +4,7 @@
 
     team.toml            the same on every robot; nothing secret in it
     keys/ROBOT.secret    that robot's own secret key, 0600; only on that robot
+    keys/ROBOT.next      the one that it will use next, while it replaces its key
 
 `failover team create` begins one, `enrol` adds a robot, and the operator carries team.toml to the others. Keys are CURVE
 keys (Curve25519, 32 bytes) written as 40 characters of Z85. Source: rfc.zeromq.org/spec/32.
@@ -19,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from checkpoint.store.whole_file import write_whole
+from checkpoint.store.whole_file import sync_directory, write_whole
 from failover.config import strict_toml
 from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
 from failover.core.frames.roster import Roster, roster
@@ -58,7 +59,7 @@ class Robot:
         role: robot: runs components and protects those of others; server: keeps checkpoints of all; witness: votes only.
         beats: "host:port" for each of its links; beats go to all of them.
         bulk: "host:port" on the wired link, for snapshots.
-        public_key: Z85, or "" in a team without keys.
+        public_key: Z85, or "" in a team without keys; ``next_key``: the one that takes its place, while both count.
         seat: its number in the team, which stays while members come and go; -1: by the order of names.
     """
 
@@ -67,6 +68,17 @@ class Robot:
     role: Role = "robot"
     public_key: str = ""
     seat: int = -1
+    next_key: str = ""
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The public keys that prove to be this member: one, two while one replaces the other, none in a team without."""
+        return tuple(key for key in (self.public_key, self.next_key) if key)
+
+    @property
+    def keyless(self) -> Robot:
+        """All but its keys: what a member needs to know to be heard."""
+        return replace(self, public_key="", next_key="")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +150,10 @@ def check_team(where: str, team: Team) -> None:
 
 def _check_keys_differ(where: str, team: Team) -> None:
     owners: dict[str, str] = {}
-    for name, robot in team.robots.items():
-        if robot.public_key and owners.setdefault(robot.public_key, name) != name:
+    for name, key in ((name, key) for name, robot in team.robots.items() for key in robot.keys):
+        if owners.setdefault(key, name) != name:
             raise TeamFileError(
-                f"{where}: {name} and {owners[robot.public_key]} have the same public key: each could speak for the other; give "
+                f"{where}: {name} and {owners[key]} have the same public key: each could speak for the other; give "
                 f"one of them its own: failover team enrol {name} HOST --replace"
             )
 
@@ -162,10 +174,13 @@ def check_robot(where: str, name: str, robot: Robot) -> None:
         raise TeamFileError(f"{where}: robot {name} has no beat address; give at least one host:port")
     for address in (*robot.beats, robot.bulk):
         split_address(address, f"{where}: robot {name}")
-    if robot.public_key and len(robot.public_key) != KEY_CHARACTERS:
-        raise TeamFileError(f"{where}: the public key of {name} has {len(robot.public_key)} characters, not {KEY_CHARACTERS}")
-    if not _is_z85(robot.public_key):
-        raise TeamFileError(f"{where}: the public key of {name} is not Z85: copy it again, every character of it")
+    for key in robot.keys:
+        if len(key) != KEY_CHARACTERS:
+            raise TeamFileError(f"{where}: the public key of {name} has {len(key)} characters, not {KEY_CHARACTERS}")
+        if not _is_z85(key):
+            raise TeamFileError(f"{where}: the public key of {name} is not Z85: copy it again, every character of it")
+    if robot.next_key and robot.public_key in ("", robot.next_key):
+        raise TeamFileError(f"{where}: next_key of {name} is for a second key, beside another public_key; take it out")
 
 
 def _is_z85(text: str) -> bool:
@@ -227,11 +242,9 @@ def enrol(team: Team, name: str, robot: Robot) -> Team:
     if robot.seat < 0 and any(seat >= 0 for seat in taken.values()):
         robot = replace(robot, seat=seats(taken | {name: taken.get(name, -1)}, [*taken, name], mark)[name])
         mark = mark if robot.seat == taken.get(name) else (robot.seat + 1) % ROBOT_LIMIT
-    places = {robot.public_key, robot.bulk, *robot.beats} - {""}
+    places = {*robot.keys, robot.bulk, *robot.beats}
     former = {
-        other: one
-        for other, one in team.former.items()
-        if other != name and places.isdisjoint({one.public_key, one.bulk, *one.beats})
+        other: one for other, one in team.former.items() if other != name and places.isdisjoint({*one.keys, one.bulk, *one.beats})
     }
     enrolled = replace(team, robots={**team.robots, name: robot}, next_seat=mark, former=former)
     _check_keys_differ("the new robot", enrolled)
@@ -288,6 +301,43 @@ def read_secret_key(directory: Path, robot: str) -> str:
     return secret
 
 
+def next_key_path(directory: Path, robot: str) -> Path:
+    """Where a robot keeps the secret key that it will use next."""
+    return directory / "keys" / f"{robot}.next"
+
+
+def write_next_key(directory: Path, robot: str, secret: str) -> None:
+    """Put aside the secret key that will be used next, in the place of one that never was.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    write_whole(next_key_path(directory, robot), f"{secret}\n".encode(), mode=0o600, lasts="name")
+
+
+def read_next_key(directory: Path, robot: str) -> str:
+    """That key; "" where there is none, or one that is cut off."""
+    try:
+        secret = next_key_path(directory, robot).read_text().strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+    return secret if len(secret) == KEY_CHARACTERS else ""
+
+
+def use_next_key(directory: Path, robot: str) -> None:
+    """Let that key take the place of the secret key, which is no more; its file stays the owner's.
+
+    Raises:
+        OSError: it cannot.
+    """
+    following, present = next_key_path(directory, robot), secret_key_path(directory, robot)
+    owner = present.stat()
+    if (owner.st_uid, owner.st_gid) != (os.geteuid(), os.getegid()):
+        os.chown(following, owner.st_uid, owner.st_gid)
+    following.replace(present)
+    sync_directory(present.parent)
+
+
 def forget_secret_key(directory: Path, robot: str) -> None:
     """Remove a secret key that was carried to its robot."""
     with contextlib.suppress(FileNotFoundError):
@@ -309,5 +359,6 @@ def _table_of(kind: str, name: str, robot: Robot) -> list[str]:
     beats = ", ".join(f'"{address}"' for address in robot.beats)
     lines = ["", f'[{kind}."{name}"]', f'role = "{robot.role}"', f"beats = [{beats}]", f'bulk = "{robot.bulk}"']
     lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
+    lines += [f'next_key = "{robot.next_key}"'] if robot.next_key else []
     lines += [f"seat = {robot.seat}"] if robot.seat >= 0 else []
     return lines

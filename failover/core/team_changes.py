@@ -12,12 +12,16 @@ granted, for each robot that asks needs the other one's grant. Source: Ongaro, C
 4.2 (changes by one server); a majority of grants, as there, would let a member fall behind by two.
 
 Two robots that are alone (rule = pair) promise less: where each takes the other one for dead, each may take the other one out.
+
+A robot replaces its key by two changes: the first puts a new key beside the old one, the second takes the old one out. As no
+member is two changes behind, any two members have a key of that robot in common. The robot uses the new one from the moment at
+which all have granted the second change: they have the first one then. It is the only one that may change its keys.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Final
+from typing import Final, Literal
 
 from msgspec import Struct
 
@@ -74,6 +78,39 @@ def step(before: Mapping[str, object], after: Mapping[str, object]) -> str:
     """The one member by which two teams differ; "" if they differ by none, or by more."""
     changed = [name for name in {*before, *after} if before.get(name) != after.get(name)]
     return changed[0] if len(changed) == 1 else ""
+
+
+TWO_KEYS: Final = "two keys of {robot} count, the old one still: failover team rotate {robot} goes on"
+"""Said as long as a robot's key is not replaced yet."""
+
+Rotation = Literal["begin", "switch", "finish", "undo", "unfit"]
+"""What is next where a robot's key is replaced. ``begin``: a new key beside the one there is. ``switch``: use the new one, and
+take the old one out. ``finish``: take the old one out; the new one is in use. ``undo``: take the new one out; its secret half is
+lost. ``unfit``: the robot has the secret half of none."""
+
+
+def rotation(keys: tuple[str, str], in_use: str, prepared: str) -> Rotation:
+    """How a rotation that was perhaps broken off goes on.
+
+    Args:
+        keys: of that robot, as the team has them: the old one, and "" or the new one.
+        in_use: the public half of what it uses; ``prepared``: of what it has put aside to use next, "" for nothing.
+    """
+    new = keys[1]
+    if not in_use or in_use not in keys:
+        return "unfit"
+    if not new:
+        return "begin"
+    if in_use == new:
+        return "finish"
+    return "switch" if prepared == new else "undo"
+
+
+def is_step_of_keys(before: tuple[str, str], after: tuple[str, str]) -> bool:
+    """Whether a member's keys change as one change may: a second one comes, or one of two goes. Then both have one in common."""
+    if "" in before:
+        return before[0] != "" and after[0] == before[0] and after[1] not in ("", before[0])
+    return after in ((before[0], ""), (before[1], ""))
 
 
 def missing(team: Collection[str], granted: Collection[str], removed: str = "", *, lives: bool = True) -> list[str]:

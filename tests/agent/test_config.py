@@ -327,6 +327,9 @@ def test_a_secret_key_that_does_not_fit_the_team_fails_the_check(
     assert refusal.startswith(f"failover-agent: {key}") and said in refusal
     key.write_text(right + "\n")
     assert agent_main(["check", "--config", str(path)]) == 0
+    members["robot1"] = replace(members["robot1"], public_key=new_keys()[0], next_key=public)
+    team.write(directory / "team", Team("lab", members))
+    assert agent_main(["check", "--config", str(path)]) == 0, "of two that count while one replaces the other"
 
 
 def test_a_secret_key_that_others_can_read_is_refused(directory: Path) -> None:

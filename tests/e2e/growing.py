@@ -57,7 +57,7 @@ class GrowingStage(SwitchStage):
     def words(self, name: str, act: str, *words: str) -> list[str]:
         """A command of ``failover team``, as a person gives it on that machine."""
         inside = ["nsenter", "--net", f"--target={self.machine(name).process.pid}"] if self.means.own_network else []
-        has_agent = act in ("invite", "list", "remove")
+        has_agent = act in ("invite", "list", "remove", "rotate")
         socket = ["--socket", str(self.machine(name).socket)] if has_agent else []
         where = ["--directory", str(self.place(name)), *socket]
         return [*inside, sys.executable, "-m", "failover.cli.main", "team", act, *words, *where]

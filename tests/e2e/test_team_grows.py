@@ -10,7 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+import zmq
 from msgspec.structs import replace
+from zmq.utils.monitor import parse_monitor_message
 
 from failover.config.invitation import SECRET_SIZE, read
 from tests.e2e import robots
@@ -125,6 +127,93 @@ def test_a_robot_that_runs_a_program_is_not_taken_out_and_one_that_runs_none_end
         robots.until(lambda: "robot 'robot2' is not in" in log.read_text(), "an agent there to say why it does not begin")
         shown = robots.component(stage.machine("robot1"), "count")
         assert shown["role"] == "primary"
+
+
+# --- Keys that are replaced -------------------------------------------------------------------------------------------
+
+
+class Watch:
+    """What the status of some robots says again and again, until it is told to end."""
+
+    def __init__(self, stage: GrowingStage, *names: str) -> None:
+        self._machines = [stage.machine(name) for name in names]
+        self._is_over = threading.Event()
+        self.components: set[tuple[object, ...]] = set()
+        self.peers: set[str] = set()
+        self.looks = 0
+
+    def _look(self) -> None:
+        while not self._is_over.wait(0.02):
+            for machine in self._machines:
+                status = machine.status()
+                self.peers |= {peer["state"] for peer in status["peers"]}
+                for one in status["components"]:
+                    runs = (one["protection"], one["state"]) if one["role"] == "primary" else ()
+                    self.components.add((machine.name, one["primary"], one["epoch"], one["restores"], *runs))
+            self.looks += 1
+
+    def __enter__(self) -> Watch:
+        self._looking = threading.Thread(target=self._look)
+        self._looking.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+        self._looking.join()
+
+
+def knocks(address: str, server_key: str, secret: str) -> str:
+    """How a robot answers to one who connects with this secret key: the name of ZeroMQ's event."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as link:
+        link.setsockopt(zmq.LINGER, 0)
+        link.curve_secretkey, link.curve_publickey = secret.encode(), zmq.curve_public(secret.encode())
+        link.curve_serverkey = server_key.encode()
+        monitor = link.get_monitor_socket(
+            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+        )
+        link.connect(f"tcp://{address}")
+        assert monitor.poll(robots.PATIENCE_S * 1_000)
+        event = parse_monitor_message(monitor.recv_multipart())["event"]
+        link.disable_monitor()
+        return str(event.name)
+
+
+def test_a_robot_gets_other_keys_while_its_program_runs_on_protected(tmp_path: Path) -> None:
+    with machines(tmp_path, 2) as stage:
+        stage.create("robot1")
+        stage.brought("robot1", "robot2")
+        together(stage, "robot1", "robot2")
+        first, second = stage.machine("robot1"), stage.machine("robot2")
+        robots.run(first, "count", *COUNTING)
+        robots.until_protected(first)
+        pid, before = robots.component(first, "count")["pid"], agents(stage, "robot1", "robot2")
+        key = stage.place("robot1") / "keys" / "robot1.secret"
+        old, leaked = stage.members("robot1").robots["robot1"], key.read_text().strip()
+        there = stage.members("robot1").robots["robot2"]
+        assert knocks(there.bulk, there.public_key, leaked) == "HANDSHAKE_SUCCEEDED"
+        with Watch(stage, "robot1", "robot2") as watch:
+            ran = stage.typed("robot1", "rotate")
+            assert ran.returncode == 0 and "robot1 has new keys" in ran.stdout, ran.stderr
+            assert knocks(there.bulk, there.public_key, leaked) == "HANDSHAKE_FAILED_AUTH", "at once"
+            assert knocks(old.bulk, old.public_key, leaked) == "HANDSHAKE_FAILED_NO_DETAIL", "it proves the old one no more"
+            ran = stage.typed("robot1", "rotate", "robot2")
+            assert ran.returncode == 0 and "robot2 has new keys" in ran.stdout, ran.stderr
+            looks = watch.looks
+            robots.until(lambda: watch.looks > looks + 50, "some more looks")
+        assert watch.peers <= {"live", "suspect"}
+        assert watch.components == {
+            ("robot1", "robot1", 1, 0, "protected", "running"),
+            ("robot2", "robot1", 1, 0),
+        }
+        assert robots.component(first, "count")["pid"] == pid and agents(stage, "robot1", "robot2") == before
+        together(stage, "robot1", "robot2")
+        now = stage.members("robot1")
+        assert now == stage.members("robot2") and now.change == 5
+        for name in stage.names:
+            assert now.robots[name].next_key == "" and len(list((stage.place(name) / "keys").iterdir())) == 1
+        assert {now.robots[name].public_key for name in stage.names}.isdisjoint({old.public_key, there.public_key})
+        assert key.stat().st_mode & 0o777 == 0o600
+        robots.counts_on_elsewhere(first, second, 20)
 
 
 # --- Invitations that are refused --------------------------------------------------------------------------------------

@@ -212,7 +212,7 @@ class PieceArguments(msgspec.Struct, forbid_unknown_fields=True):
 class TeamArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``team``."""
 
-    act: Literal["add", "remove"]
+    act: Literal["add", "remove", "rotate"]
     robot: str
     member: Robot | None = None
 

@@ -3,8 +3,11 @@
 One ROUTER socket receives from all peers; one DEALER socket sends to each peer. A connection carries one direction's messages, in
 order. Messages queued for a connection are lost with the connection: the core repeats messages that still matter.
 
-The link identifies a sender by key, not by claim: the ZAP answer below admits only public keys of the team file and names their
-owner. Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
+The link identifies a sender by key, not by claim: the ZAP answer below admits only public keys of the team file. While a member
+replaces its key, two are its own. ZeroMQ asks once, when a connection is made, and notes the key with each message. Whose that
+is now is looked up then, so that a key that does not count any more is refused at once.
+
+Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3), zmq_socket_monitor(3).
 """
 
 from __future__ import annotations
@@ -83,11 +86,20 @@ class LinkState(enum.StrEnum):
 
 
 class Keys(Struct, frozen=True):
-    """This robot's pair of keys and all members' public keys by name; Z85. Empty strings: no encryption."""
+    """This robot's pair of keys and all members' public keys by name; Z85. Empty strings: no encryption.
+
+    Attributes:
+        following: of the members that replace their key now: the one that counts besides.
+    """
 
     public: str
     secret: str
     peers: Mapping[str, str]
+    following: Mapping[str, str] = {}
+
+    def of(self, peer: str) -> tuple[str, ...]:
+        """Each key by which a peer may be known."""
+        return tuple(key for key in (self.peers.get(peer), self.following.get(peer)) if key)
 
     @property
     def present(self) -> bool:
@@ -177,7 +189,9 @@ class PeerConnection:
         self.state = LinkState.CONNECTING
         self.reason = ""
         self._callbacks = callbacks
-        self._own_key, self._their_key = shown(keys.public), shown(keys.peers.get(peer, ""))
+        self._own_key = shown(keys.public)
+        self._their_keys = deque(keys.of(peer))
+        self._misfits = 0
         self._words: deque[bytes] = deque(maxlen=QUEUE_LIMIT)
         self._chunk: tuple[bytes, asyncio.Future[None]] | None = None
         self._wake = asyncio.Event()
@@ -193,7 +207,7 @@ class PeerConnection:
         if keys.present:
             self._socket.curve_publickey = keys.public.encode()
             self._socket.curve_secretkey = keys.secret.encode()
-            self._socket.curve_serverkey = keys.peers[peer].encode()
+            self._socket.curve_serverkey = self.their_key.encode()
         self._monitor = self._socket.get_monitor_socket()
         self._address = f"tcp://{address}"
         self._loop = asyncio.get_running_loop()
@@ -201,6 +215,16 @@ class PeerConnection:
         self._tasks = (asyncio.create_task(self._watch()), asyncio.create_task(self._send()))
         for task in self._tasks:
             task.add_done_callback(end_worker_on_mistake)
+
+    @property
+    def their_key(self) -> str:
+        """The key that the peer must prove to have on this connection; "" without keys."""
+        return self._their_keys[0] if self._their_keys else ""
+
+    def know(self, keys: tuple[str, ...]) -> None:
+        """The peer may prove to have any of these; the one that this connection is for is among them."""
+        if keys:
+            self._their_keys = deque((self.their_key, *(key for key in keys if key != self.their_key)))
 
     def say(self, message: Bulk) -> bool:
         """Queue a small message; it overtakes chunks. False: there is no connection, it was dropped."""
@@ -264,24 +288,40 @@ class PeerConnection:
             event = parse_monitor_message(await self._monitor.recv_multipart())
             kind = event["event"]
             if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._misfits = 0
                 self._enter(LinkState.CONNECTED, "")
             elif kind in HANDSHAKE_FAILURES:
-                reason = _refusal(self.peer, kind, self._own_key, self._their_key)
-                self._enter(LinkState.REFUSED, reason)
-                self._callbacks.unread(self.peer, reason)
-                if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                    self._loop.call_later(RECONNECT_MOST_MS / 1_000, self._knock_again)
+                self._refused(kind)
             elif kind == zmq.EVENT_DISCONNECTED and self.state is not LinkState.REFUSED:
                 self._enter(LinkState.CONNECTING, "the connection was lost")
             elif kind == zmq.EVENT_CLOSED and self.state is LinkState.CONNECTING:
                 self._enter(LinkState.CONNECTING, "no agent listens there")
 
+    def _refused(self, kind: int) -> None:
+        """A handshake failed. Of a peer with two keys the other one is tried before anything is said."""
+        is_misfit = kind != zmq.EVENT_HANDSHAKE_FAILED_AUTH  # else the key is the peer's, and ours is not known there
+        self._misfits += is_misfit
+        if is_misfit and len(self._their_keys) > 1 and self._misfits % len(self._their_keys):
+            self._their_keys.rotate()
+            self._connect_anew()
+            return
+        reason = _refusal(self.peer, kind, self._own_key, shown(self.their_key))
+        self._enter(LinkState.REFUSED, reason)
+        self._callbacks.unread(self.peer, reason)
+        if not is_misfit or len(self._their_keys) > 1:
+            self._loop.call_later(RECONNECT_MOST_MS / 1_000, self._knock_again)
+
     def _knock_again(self) -> None:
         """ZeroMQ does not by itself where a key was refused; and both robots are to know that the other one lives."""
         if self.state is LinkState.REFUSED and not self._socket.closed:
-            with contextlib.suppress(zmq.ZMQError):
-                self._socket.disconnect(self._address)
-            self._socket.connect(self._address)
+            self._connect_anew()
+
+    def _connect_anew(self) -> None:
+        with contextlib.suppress(zmq.ZMQError):
+            self._socket.disconnect(self._address)
+        if self._their_keys:
+            self._socket.curve_serverkey = self.their_key.encode()
+        self._socket.connect(self._address)
 
     def _enter(self, state: LinkState, reason: str) -> None:
         if (state, reason) == (self.state, self.reason):
@@ -335,19 +375,32 @@ class ReplicationLink:
         self._owners = _owners(keys)
 
     async def change(self, peers: Mapping[str, str], keys: Keys) -> None:
-        """Go on with these peers: who has left is refused from now on, who has come is connected to."""
+        """Go on with these peers: who has left is refused from now on, who has come is connected to.
+
+        A connection goes on as long as both keys that it was made with count. Where our own key is another one now, all that
+        we have made are made anew with it, and peers must know it to connect to us from now on.
+
+        Raises:
+            LaneError: the address cannot be had any more.
+        """
         before, self._peers = self._peers, peers
         former, self._keys = self._keys, keys
         self._owners = _owners(keys)
         self._arrivals.expect(self._hosts())
         for peer, link in list(self.links.items()):
-            if (peers.get(peer), keys.peers.get(peer)) != (before.get(peer), former.peers.get(peer)):
-                self.links.pop(peer, None)
-                await link.close()
-                self._mismatch.pop(peer, None)
-                self._callbacks.changed(peer, LinkState.DOWN, "its entry in the team has changed")
+            is_proved = not keys.present or link.their_key in keys.of(peer)
+            if peers.get(peer) == before.get(peer) and is_proved and keys.public == former.public:
+                link.know(keys.of(peer))
+                continue
+            self.links.pop(peer, None)
+            await link.close()
+            self._mismatch.pop(peer, None)
+            self._callbacks.changed(peer, LinkState.DOWN, "its entry in the team, or this robot's own key, has changed")
         if self._router is None:
             return
+        if keys.public != former.public:
+            self._router.curve_secretkey = keys.secret.encode()
+            await self._listen_anew(self._router)
         for peer in peers:
             if peer not in self.links:
                 self._connect(peer)
@@ -375,6 +428,7 @@ class ReplicationLink:
         try:
             self._listen(router)
         except LaneError:
+            self._router = None
             router.disable_monitor()
             monitor.close(0)
             router.close(0)
@@ -489,7 +543,7 @@ class ReplicationLink:
                 elif peer:
                     self._misunderstood[peer] += 1
                 else:
-                    self._refused("a sender under another robot's name")
+                    self._refused("a sender under another robot's name, or with a key that does not count any more")
         finally:
             router.close(0)
 
@@ -510,7 +564,7 @@ class ReplicationLink:
         claimed = bytes(frames[0].bytes).decode(errors="replace")
         if claimed not in self._peers:
             return ""
-        if self._keys.present and frames[1].get("User-Id") != claimed:
+        if self._keys.present and self._owners.get(frames[1].get("User-Id")) != claimed:
             return ""
         return claimed
 
@@ -519,13 +573,14 @@ class ReplicationLink:
         try:
             while True:
                 version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
-                owner = self._owners.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
+                key = _presented(credentials) if mechanism == b"CURVE" else ""
+                owner = self._owners.get(key)
                 if owner is None:
                     self._refuse(address.decode(errors="replace"), credentials)
                 else:
                     self._arrivals.is_of_member(address.decode(errors="replace"))
                     self._mismatch.pop(owner, None)
-                status = (b"200", b"OK", owner.encode()) if owner else (b"400", b"not in the team", b"")
+                status = (b"200", b"OK", key.encode()) if owner else (b"400", b"not in the team", b"")
                 await gate.send_multipart([version, request, *status, b""])
         finally:
             gate.close(0)
@@ -535,7 +590,7 @@ class ReplicationLink:
         self._refused(address)
         host = plain(address)
         peers = [peer for peer, there in self._peers.items() if plain(split_address(there, "bulk address")[0]) == host]
-        key = shown(z85.encode(credentials[0]).decode()) if len(credentials) == 1 and len(credentials[0]) == KEY_SIZE else "none"
+        key = shown(_presented(credentials))
         for peer in peers:
             known = shown(self._keys.peers[peer])
             self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
@@ -551,9 +606,14 @@ class ReplicationLink:
         self._stranger = stranger
 
 
-def _owners(keys: Keys) -> dict[bytes, str]:
+def _owners(keys: Keys) -> dict[str, str]:
     """Public key → whose it is."""
-    return {z85.decode(key.encode()): name for name, key in keys.peers.items() if key}
+    return {key: name for name in keys.peers for key in keys.of(name)}
+
+
+def _presented(credentials: list[bytes]) -> str:
+    """The key of one who connects, Z85; "" for none."""
+    return z85.encode(credentials[0]).decode() if len(credentials) == 1 and len(credentials[0]) == KEY_SIZE else ""
 
 
 def _limits(socket: zmq.asyncio.Socket) -> None:

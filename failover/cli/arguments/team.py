@@ -1,4 +1,4 @@
-"""team create, invite, join, list, remove, enrol, show: who belongs to the team."""
+"""team create, invite, join, list, remove, rotate, enrol, show: who belongs to the team."""
 
 from __future__ import annotations
 
@@ -56,6 +56,10 @@ def team(room: argparse.ArgumentParser) -> None:
     remove.add_argument("name", metavar="ROBOT", help="the member")
     _add_socket(remove)
     remove.set_defaults(function="failover.cli.verbs.team:remove")
+    rotate = add_act(acts, "rotate", shared, "replace a robot's keys", ROTATE_DESCRIPTION)
+    rotate.add_argument("name", metavar="ROBOT", nargs="?", default="", help="whose keys (default: this robot's)")
+    _add_socket(rotate)
+    rotate.set_defaults(function="failover.cli.verbs.team:rotate")
     enrol = add_act(acts, "enrol", shared, "add a robot, a server or a witness and make its key", ENROL_DESCRIPTION)
     enrol.add_argument("name", metavar="ROBOT", help="the robot's name")
     enrol.add_argument(
@@ -132,6 +136,16 @@ REMOVE_DESCRIPTION: Final = """
     votes, and its agent ends. A robot that runs components must hand them over first. One that is lost can be taken out, too.
 
       failover team remove r3
+    """
+
+ROTATE_DESCRIPTION: Final = """
+    Replace the keys of a robot, as a routine or because a copy of the secret one got lost. The robot makes the new pair itself.
+    For some seconds both of its public keys count, until every member has the new one; then the old one is refused. Agents and
+    programs run on, and stay protected. Every member must be there and agree. A rotation that was broken off goes on when the
+    command is given again.
+
+      failover team rotate
+      failover team rotate r3
     """
 
 ENROL_DESCRIPTION: Final = """

@@ -1,4 +1,4 @@
-"""team create, enrol, remove, list, show: the members of the team, and the key by which each robot is known."""
+"""team create, enrol, remove, rotate, list, show: the members of the team, and the key by which each robot is known."""
 
 from __future__ import annotations
 
@@ -93,6 +93,14 @@ def remove(arguments: argparse.Namespace) -> int:
     return _tell(arguments, {**answer, "removed": arguments.name}, sentence)
 
 
+def rotate(arguments: argparse.Namespace) -> int:
+    """Replace a robot's keys; it makes them itself."""
+    answer = change_by_agent(arguments, "rotate", arguments.name)
+    later = f"; {', '.join(answer['waiting'])} will hear of it when they are back" if answer["waiting"] else ""
+    sentence = f"{answer['robot']} has new keys, and its former one is refused: its public key is {answer['public_key']}{later}"
+    return _tell(arguments, answer, sentence)
+
+
 def enrol(arguments: argparse.Namespace) -> int:
     """Add a member, with a key made here or brought along. One that is replaced keeps its role unless another is given."""
     directory = Path(arguments.directory)
@@ -151,6 +159,8 @@ def members_now(arguments: argparse.Namespace) -> int:
     lines = [(name, members.robots[name].role, seen[name], " ".join(members.robots[name].beats)) for name in order]
     if lines:
         render.table(("robot", "role", "state", "addresses"), lines)
+    for name in (name for name in order if members.robots[name].next_key):
+        print(f"two keys of {name} count: failover team rotate {name} goes on")
     return 0
 
 
@@ -160,6 +170,7 @@ def show(arguments: argparse.Namespace) -> int:
     if arguments.json:
         robots = {
             name: {"role": robot.role, "beats": robot.beats, "bulk": robot.bulk, "public_key": robot.public_key}
+            | ({"next_key": robot.next_key} if robot.next_key else {})
             for name, robot in members.robots.items()
         }
         board = members.items()
@@ -167,7 +178,7 @@ def show(arguments: argparse.Namespace) -> int:
         render.as_json({"team": members.team, "robots": robots, "board": of_board})
         return 0
     lines = [
-        (name, robot.role, " ".join(robot.beats), robot.bulk, robot.public_key or "none")
+        (name, robot.role, " ".join(robot.beats), robot.bulk, ", ".join(robot.keys) or "none")
         for name, robot in sorted(members.robots.items())
     ]
     print(f"team {members.team}: {len(lines)} members")

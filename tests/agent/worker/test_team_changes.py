@@ -1,4 +1,4 @@
-"""Changes of the team at several members at once: lost answers, rivals, clients that go, one robot's word.
+"""Changes of the team at several members at once: lost answers, rivals, clients that go, one robot's word, keys replaced.
 
 The members are real but for the lines between them: files, settings and grants are theirs. What a line loses is told by the test.
 """
@@ -19,6 +19,7 @@ from agent import config as configuration
 from agent.errors import RefusedError
 from agent.main_loop.messages import Told
 from agent.worker import team_changes
+from agent.worker.network.replication_link import new_keys, public_key_of
 from agent.worker.team_changes import TeamChanges, told_of
 from failover.config import members, team
 from failover.config.team import Robot, Role, Team
@@ -40,14 +41,21 @@ class Member:
         team.write(place / "team", town.team)
         path = place / "agent.toml"
         places = "".join(f'{part}_directory = "{place / part}"\n' for part in ("team", "state", "runtime"))
-        path.write_text(f'robot = "{name}"\ninsecure = true\n{places}')
-        self.settings = configuration.load(path)
+        path.write_text(f'robot = "{name}"\ninsecure = {"false" if town.secrets else "true"}\n{places}')
+        if town.secrets:
+            team.write_secret_key(place / "team", name, town.secrets[name])
         self.place = place / "team"
+        self.begin(path)
+
+    def begin(self, path: Path) -> None:
+        """As its agent starts: with what is on the disk."""
+        self.settings = configuration.load(path)
+        self.changes = TeamChanges(self)
         self.runs: list[ComponentView] = []
         self.stopped: list[str] = []
         self.taken: list[Team] = []
+        self.secrets: list[str] = []
         self.errands: Any = self
-        self.changes = TeamChanges(self)
 
     @property
     def on_disk(self) -> list[str]:
@@ -74,6 +82,10 @@ class Member:
         self.taken.append(after)
         self.settings = self.settings.with_team(after)
 
+    async def take_secret(self, secret: str) -> None:
+        self.settings = self.settings.with_secret(secret)
+        self.secrets.append(secret)
+
     async def send(self, peer: str, verb: str, arguments: dict[str, Any], by: int = 0, patience_s: float = 0) -> dict[str, Any]:
         """As `Errands.send`."""
         if self.hindrance(peer):
@@ -97,10 +109,14 @@ async def _nothing(_one: str, _other: str, _verb: str) -> None:
 class Town:
     """The members, and who cannot reach whom."""
 
-    def __init__(self, place: Path, *names: str, roles: dict[str, Role] | None = None) -> None:
+    def __init__(self, place: Path, *names: str, roles: dict[str, Role] | None = None, keyed: bool = False) -> None:
+        pairs = {name: new_keys() for name in names} if keyed else {}
+        self.secrets = {name: secret for name, (_, secret) in pairs.items()}
         self.team = Team("lab", {name: robot(number, (roles or {}).get(name, "robot")) for number, name in enumerate(names, 1)})
         self.team = replace(members.joined(self.team, "z", robot(8)), change=0)
         self.team = replace(self.team, robots={name: one for name, one in self.team.robots.items() if name != "z"})
+        known = {name: replace(one, public_key=pairs[name][0] if pairs else "") for name, one in self.team.robots.items()}
+        self.team = replace(self.team, robots=known)
         self.cuts: set[frozenset[str]] = set()
         self.before: Callable[[str, str, str], Awaitable[None]] = _nothing
         self.after: Callable[[str, str, str], Awaitable[None]] = _nothing
@@ -445,3 +461,217 @@ def test_a_robot_that_was_not_heard_since_the_start_may_be_starting_too(tmp_path
 def test_a_robot_whose_agent_restarts_lives() -> None:
     assert team_changes._may_live(PeerView("r2", "restarting", 1, 3_000_000_000, False, 0, awaited_ns=10_000_000_000))
     assert not team_changes._may_live(PeerView("r2", "dead", 1, 3_000_000_000, False, 0))
+
+
+# --- Keys that are replaced -------------------------------------------------------------------------------------------
+
+
+class PowerCutError(Exception):
+    """The machine ends here."""
+
+
+def knows(town: Town, whose: str) -> None:
+    """Each member knows the key that this robot uses now, on its disk and as it works."""
+    used = public_key_of(town[whose].settings.secret_key)
+    assert used == public_key_of(team.read_secret_key(town[whose].place, whose))
+    for member in town.members.values():
+        assert used in member.settings.team.robots[whose].keys and used in team.read(member.place).robots[whose].keys
+
+
+def test_a_robot_gets_other_keys_and_keeps_nothing_of_the_old_one(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c", keyed=True)
+
+        async def look(*_: str) -> None:
+            knows(town, "a")
+
+        town.before = town.after = look
+        answer = await town["a"].change("rotate", "")
+        knows(town, "a")
+        assert (answer["robot"], answer["change"], answer["waiting"]) == ("a", 2, [])
+        assert town["a"].secrets == [town["a"].settings.secret_key] and not town["b"].secrets
+        for member in town.members.values():
+            assert member.settings.team.robots["a"].keys == (answer["public_key"],) != town.team.robots["a"].keys
+            assert member.taken[0].robots["a"].keys[0] == town.team.robots["a"].public_key
+        assert [path.name for path in (town["a"].place / "keys").iterdir()] == ["a.secret"]
+        assert town["a"].changes.notes() == []
+
+    asyncio.run(live())
+
+
+def test_another_robot_has_it_done_and_hears_how_it_went(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c", keyed=True)
+        answer = await town["b"].change("rotate", "a")
+        assert answer["robot"] == "a" and town["c"].settings.team.robots["a"].keys == (answer["public_key"],)
+        town.cut_off("c")
+        with pytest.raises(RefusedError, match="c cannot be reached; nothing has changed"):
+            await town["b"].change("rotate", "a")
+        assert town["b"].settings.team.robots["a"].keys == (answer["public_key"],)
+        with pytest.raises(RefusedError, match="cannot ask"):
+            await town["b"].change("rotate", "c")
+
+    asyncio.run(live())
+
+
+def test_a_member_that_goes_away_between_keeps_the_old_key_valid_and_the_command_goes_on_later(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c", keyed=True)
+
+        async def goes(_one: str, other: str, verb: str) -> None:
+            if (other, verb) == ("c", "team_taken"):
+                town.cut_off("c")
+                raise RefusedError("lost")
+
+        town.before = goes
+        with pytest.raises(RefusedError, match="two keys of a count, the old one still: failover team rotate a goes on"):
+            await town["a"].change("rotate", "")
+        knows(town, "a")
+        assert "two keys of a count" in town["a"].changes.notes()[0]
+        assert not town["a"].secrets, "c knows the old one alone"
+        town.cuts.clear()
+        town.before = _nothing
+        prepared = public_key_of(team.read_next_key(town["a"].place, "a"))
+        answer = await town["a"].change("rotate", "")
+        assert answer["public_key"] == prepared
+        assert all(member.settings.team.robots["a"].keys == (prepared,) for member in town.members.values())
+
+    asyncio.run(live())
+
+
+def test_at_whatever_moment_its_power_fails_every_member_knows_the_key_that_it_uses_and_the_command_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends before and after each message, and before and after each file that it writes."""
+    moments = 0
+
+    async def live(place: Path, fails_at: int) -> bool:
+        town = Town(place, "a", "b", "c", keyed=True)
+        passed = 0
+
+        def pass_on() -> None:
+            nonlocal passed
+            passed += 1
+            if passed > fails_at:
+                raise PowerCutError
+
+        async def look(one: str, *_: str) -> None:
+            if one == "a":
+                pass_on()
+                knows(town, "a")
+
+        def fragile(write: Callable[..., None]) -> Callable[..., None]:
+            def written(directory: Path, *rest: Any) -> None:
+                is_here = directory == town["a"].place
+                if is_here:
+                    pass_on()
+                write(directory, *rest)
+                if is_here:
+                    pass_on()
+
+            return written
+
+        with monkeypatch.context() as patch:
+            for name in ("write", "write_next_key", "use_next_key"):
+                patch.setattr(team, name, fragile(getattr(team, name)))
+            town.before = town.after = look
+            try:
+                await town["a"].change("rotate", "")
+            except (PowerCutError, RefusedError):
+                pass
+            else:
+                assert fails_at >= passed
+                return False
+        town.before = town.after = _nothing
+        town["a"].begin(place / "a" / "agent.toml")
+        knows(town, "a")
+        for peer in "bc":  # it greets
+            mine = town["a"].settings.team
+            town[peer].changes.heard("a", mine.change, team_changes.digest(mine.robots))
+            theirs = town[peer].settings.team
+            town["a"].changes.heard(peer, theirs.change, team_changes.digest(theirs.robots))
+            town[peer].changes._grants.until_ns = 0  # a minute later
+        for member in town.members.values():
+            await member.changes._tell_who_is_behind()
+        knows(town, "a")
+        answer = await town["a"].change("rotate", "")
+        for member in town.members.values():
+            assert member.settings.team.robots["a"].keys == (answer["public_key"],)
+            assert not member.changes.conflicts
+        knows(town, "a")
+        assert answer["public_key"] != town.team.robots["a"].public_key
+        return True
+
+    while True:
+        place = tmp_path / str(moments)
+        if not asyncio.run(live(place, moments)):
+            break
+        moments += 1
+    assert moments > 20
+
+
+def test_a_key_whose_secret_half_was_lost_is_taken_out_and_another_one_comes(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", keyed=True)
+        town.before = town.loses("team_taken", "b")
+        with pytest.raises(RefusedError, match="two keys of a count"):
+            await town["a"].change("rotate", "")
+        town.before = _nothing
+        lost = town["a"].settings.me.next_key
+        team.next_key_path(town["a"].place, "a").write_text("x" * 20)
+        answer = await town["a"].change("rotate", "")
+        assert answer["change"] == 4 and answer["public_key"] not in (lost, town.team.robots["a"].public_key)
+        knows(town, "a")
+
+    asyncio.run(live())
+
+
+def test_a_disk_that_has_the_new_key_though_it_refused_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the new key would be taken out of the team, and this robot be shut out at its next start."""
+    use = team.use_next_key
+
+    def fails(*where: Any) -> None:
+        use(*where)
+        raise OSError(5, "Input/output error")
+
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", keyed=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(team, "use_next_key", fails)
+            with pytest.raises(RefusedError, match=r"Input/output error.*two keys of a count"):
+                await town["a"].change("rotate", "")
+        answer = await town["a"].change("rotate", "")
+        knows(town, "a")
+        assert answer["change"] == 2
+
+    asyncio.run(live())
+
+
+def test_no_other_robot_changes_a_members_keys_and_none_its_own_address(tmp_path: Path) -> None:
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c", keyed=True)
+        grant = town["b"].changes.orders()["team_grant"]
+        stolen = members.with_next_key(town.team, "a", new_keys()[0])
+        asked = {"proposer": "c", "have": 0}
+        assert "a alone may replace its key" in (await grant("c", told_of(stolen) | asked))["refusal"]
+        entry = replace(town.team.robots["c"], bulk="127.0.0.1:7999")
+        moved = replace(town.team, robots={**town.team.robots, "c": entry}, change=1)
+        assert "nothing else of its entry" in (await grant("c", told_of(moved) | asked))["refusal"]
+        at_once = members.with_one_key(town.team, "c", new_keys()[0])
+        assert "c alone may replace its key" in (await grant("c", told_of(at_once) | asked))["refusal"]
+        own = members.with_next_key(town.team, "c", new_keys()[0])
+        assert (await grant("c", told_of(own) | asked))["refusal"] == ""
+
+    asyncio.run(live())
+
+
+def test_without_keys_there_is_none_to_replace_and_one_that_does_not_fit_is_not_replaced(tmp_path: Path) -> None:
+    async def live() -> None:
+        with pytest.raises(RefusedError, match="runs without keys"):
+            await Town(tmp_path / "open", "a", "b")["a"].change("rotate", "")
+        town = Town(tmp_path / "keyed", "a", "b", keyed=True)
+        team.secret_key_path(town["a"].place, "a").write_text(new_keys()[1])
+        with pytest.raises(RefusedError, match="does not belong to its public key"):
+            await town["a"].change("rotate", "")
+
+    asyncio.run(live())

@@ -159,8 +159,9 @@ def test_with_a_team_that_cannot_be(act: list[str], capsys: pytest.CaptureFixtur
     assert told(capsys, "team", *act, *directory) == main.FAILED
 
 
-def test_without_an_agent_no_member_leaves(capsys: pytest.CaptureFixture[str]) -> None:
-    assert told(capsys, "team", "remove", "r", "--socket", "nowhere") == main.NO_AGENT
+@pytest.mark.parametrize("act", ["remove r", "rotate", "rotate r"])
+def test_without_an_agent_no_member_leaves_and_no_key_changes(act: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "team", *act.split(), "--socket", "nowhere") == main.NO_AGENT
 
 
 @pytest.mark.parametrize("at", ["nowhere", "directory", "junk"])

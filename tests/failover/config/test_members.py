@@ -48,3 +48,45 @@ def test_two_members_with_one_key_are_refused(tmp_path: Path) -> None:
         team.read(tmp_path)
     with pytest.raises(TeamFileError, match="same public key"):
         members.joined(replace(twice, robots={"a": twice.robots["a"]}), "b", twice.robots["b"])
+
+
+# --- Keys -------------------------------------------------------------------------------------------------------------
+
+KEYED = Team("lab", {"a": robot(1, "k" * 40), "b": robot(2, "l" * 40)})
+
+
+def test_a_second_key_comes_and_the_first_goes_and_the_file_has_both_meanwhile(tmp_path: Path) -> None:
+    both = members.with_next_key(KEYED, "a", "m" * 40)
+    team.write(tmp_path, both)
+    assert team.read(tmp_path) == both and both.robots["a"].keys == ("k" * 40, "m" * 40) and both.change == 1
+    one = members.with_one_key(both, "a", "m" * 40)
+    assert one.robots["a"].keys == ("m" * 40,) and one.change == 2
+    assert {name: one.seat for name, one in one.robots.items()} == {"a": 0, "b": 1}
+    assert members.is_rotation(KEYED.robots["a"], both.robots["a"]), "though it has got its first seat"
+    assert members.is_rotation(both.robots["a"], one.robots["a"])
+
+
+def test_no_key_takes_the_place_of_another_one_at_once_and_no_address_changes_with_it() -> None:
+    before = KEYED.robots["a"]
+    after = replace(before, next_key="m" * 40)
+    assert not members.is_rotation(before, replace(before, public_key="m" * 40))
+    assert not members.is_rotation(before, replace(after, bulk="10.0.0.9:7421"))
+    assert not members.is_rotation(replace(before, seat=1), replace(after, seat=2))
+    assert not members.is_rotation(before, before)
+
+
+def test_a_second_key_that_is_another_members_or_no_second_one_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TeamFileError, match="same public key"):
+        members.with_next_key(KEYED, "a", "l" * 40)
+    with pytest.raises(TeamFileError, match="next_key of a is for a second key"):
+        members.with_next_key(KEYED, "a", "k" * 40)
+    with pytest.raises(TeamFileError, match="has 3 characters"):
+        members.with_next_key(KEYED, "a", "mmm")
+    team.write(tmp_path, replace(KEYED, robots={"a": replace(robot(1), next_key="m" * 40)}))
+    with pytest.raises(TeamFileError, match="next_key of a is for a second key"):
+        team.read(tmp_path)
+
+
+def test_a_former_member_with_a_key_that_is_to_be_another_ones_is_forgotten() -> None:
+    gone = replace(KEYED, former={"z": robot(9, "m" * 40)})
+    assert not members.with_next_key(gone, "a", "m" * 40).former

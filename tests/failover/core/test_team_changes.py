@@ -1,12 +1,12 @@
-"""Grants of changes of the team, majorities of them, seats."""
+"""Grants of changes of the team, majorities of them, seats, keys that are replaced."""
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, product
 
 import pytest
 
-from failover.core.team_changes import GRANT_NS, SEATS, Grants, missing, seats, step
+from failover.core.team_changes import GRANT_NS, SEATS, Grants, is_step_of_keys, missing, rotation, seats, step
 
 
 def test_a_grant_is_given_to_one_robot_at_a_time() -> None:
@@ -80,3 +80,36 @@ def test_a_seat_that_became_free_is_given_again_when_all_others_are_used_up() ->
     assert seats({"a": 0, "c": -1}, ["a", "c"], 2) == {"a": 0, "c": 2}, "1 was the seat of one that left"
     assert seats({"a": 0, "c": -1}, ["a", "c"], SEATS - 1) == {"a": 0, "c": SEATS - 1}
     assert seats({"a": 0, "b": SEATS - 1, "c": -1}, ["a", "b", "c"], SEATS - 1) == {"a": 0, "b": SEATS - 1, "c": 1}
+
+
+# --- Keys -------------------------------------------------------------------------------------------------------------
+
+PAIRS = tuple(product(("", "A", "B", "C"), repeat=2))
+
+
+def test_one_change_of_keys_leaves_one_that_both_know() -> None:
+    steps = [(before, after) for before, after in product(PAIRS, PAIRS) if is_step_of_keys(before, after)]
+    for before, after in steps:
+        assert {*before} & {*after} - {""}, (before, after)
+        assert len({*before} ^ {*after} - {""}) <= 2 and before != after
+    assert (("A", ""), ("A", "B")) in steps
+    assert {after for before, after in steps if before == ("A", "B")} == {("A", ""), ("B", "")}
+    assert not any("" in before and after[1] == "" for before, after in steps), "no key in the place of another one at once"
+
+
+@pytest.mark.parametrize(
+    ("keys", "in_use", "prepared", "stage"),
+    [
+        (("A", ""), "A", "", "begin"),
+        (("A", ""), "A", "B", "begin"),  # put aside, and told to no member
+        (("A", "B"), "A", "B", "switch"),
+        (("A", "B"), "B", "", "finish"),
+        (("A", "B"), "A", "", "undo"),
+        (("A", "B"), "A", "C", "undo"),
+        (("A", ""), "B", "", "unfit"),
+        (("A", ""), "", "", "unfit"),
+        (("", ""), "A", "", "unfit"),
+    ],
+)
+def test_a_rotation_that_broke_off_goes_on(keys: tuple[str, str], in_use: str, prepared: str, stage: str) -> None:
+    assert rotation(keys, in_use, prepared) == stage

@@ -206,3 +206,69 @@ def test_one_address_holds_no_more_than_its_share() -> None:
             one.close()
 
     run(keys1, keys2, body)
+
+
+# --- A key that is replaced -------------------------------------------------------------------------------------------
+
+
+def test_both_keys_of_a_peer_count_and_the_old_one_is_refused_at_once_on_a_connection_that_stands() -> None:
+    keys1, keys2 = team_keys()
+    public, secret = new_keys()
+    both = Keys(keys1.public, keys1.secret, keys1.peers, {"robot2": public})
+    after = Keys(keys1.public, keys1.secret, {**keys1.peers, "robot2": public})
+
+    async def body(pair: Pair) -> None:
+        one, other = pair.links["robot1"], pair.links["robot2"]
+        addresses = {name: f"127.0.0.1:{port}" for name, port in pair.ports.items()}
+        await until(pair.connected)
+        to_other = one.links["robot2"]
+        await one.change({"robot2": addresses["robot2"]}, both)
+        other.say("robot1", Cancel(1))
+        await until(lambda: ("robot2", Cancel(1)) in pair.heard["robot1"])
+        assert one.links["robot2"] is to_other and pair.connected(), "a second key interrupts nothing"
+
+        await one.change({"robot2": addresses["robot2"]}, after)
+        before = one.strangers
+        other.say("robot1", Cancel(2))  # by the old key, on the connection that was admitted with it
+        await until(lambda: one.strangers > before)
+        assert ("robot2", Cancel(2)) not in pair.heard["robot1"]
+        await until(lambda: pair.state("robot1") is LinkState.REFUSED)  # it proves the old key, too
+
+        await other.change({"robot1": addresses["robot1"]}, Keys(public, secret, {**keys2.peers, "robot2": public}))
+        await until(pair.connected)
+        other.say("robot1", Cancel(3))
+        await until(lambda: ("robot2", Cancel(3)) in pair.heard["robot1"])
+        one.say("robot2", Cancel(4))
+        await until(lambda: ("robot1", Cancel(4)) in pair.heard["robot2"])
+
+    run(keys1, keys2, body)
+
+
+@pytest.mark.parametrize("uses", ["the old one", "the new one"])
+def test_a_peer_with_two_keys_is_found_by_the_one_that_it_uses_and_no_refusal_is_told(uses: str) -> None:
+    keys1, keys2 = team_keys()
+    public, secret = new_keys()
+    both = Keys(keys1.public, keys1.secret, keys1.peers, {"robot2": public})
+    used = keys2 if uses == "the old one" else Keys(public, secret, keys2.peers)
+
+    async def body(pair: Pair) -> None:
+        await until(pair.connected)
+        pair.links["robot1"].say("robot2", Cancel(1))
+        pair.links["robot2"].say("robot1", Cancel(2))
+        await until(lambda: bool(pair.heard["robot1"] and pair.heard["robot2"]))
+        assert pair.unread == {"robot1": [], "robot2": []}
+
+    run(both, used, body)
+
+
+def test_a_peer_that_has_neither_of_its_two_keys_is_refused_and_told_of() -> None:
+    keys1, keys2 = team_keys()
+    lost, other = new_keys(), new_keys()
+    both = Keys(keys1.public, keys1.secret, {**keys1.peers, "robot2": lost[0]}, {"robot2": other[0]})
+
+    async def body(pair: Pair) -> None:
+        await until(lambda: pair.state("robot1") is LinkState.REFUSED)
+        await until(lambda: len(pair.unread["robot1"]) > 3)  # again and again
+        assert pair.heard == {"robot1": [], "robot2": []}
+
+    run(both, keys2, body)
