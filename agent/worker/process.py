@@ -465,8 +465,17 @@ class Worker(Switchboard):
         complaints = self._alerts.complaints.values() if self._alerts is not None else ()
         notices = [*self.notices(), *complaints, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
-        ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory())
+        ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory(), self._arriving)
         return team_view(self.settings, self._life, told, ours)
+
+    def _arriving(self, component: str) -> list[dict[str, Any]]:
+        """What of a component is on its way to other robots, as the status shows it."""
+        kinds = {"checkpoint": self._shipper.on_their_way(component), "files": self._bringing.on_their_way(component)}
+        return [
+            {"to": one.peer, "what": what, "arrived": one.arrived, "size": one.size}
+            for what, going in kinds.items()
+            for one in going
+        ]
 
     def _lost(self) -> list[str]:
         """Two copies of a component ran, and no person has looked yet at the state of the one that lost."""

@@ -99,7 +99,7 @@ peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others s
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
-    restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reasons,
+    restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, arriving, reasons,
     output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
@@ -121,6 +121,8 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     lacks: what this robot, a standby, would need to resume it and has not: a device, a file, a feature; by
         sentence, None before the first look; prepared_first: a hook gets it ready before, and may bring that
     contested: at its primary: which of its files others hold open for writing, so that a restore is refused; by sentence
+    arriving: [{to, what, arrived, size}]: at its primary, what is on its way to other robots, and how many bytes of it have
+        arrived, by their own word; what: checkpoint | files (those of the program that the robot lacks)
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
     resumed: {at, robot, state_at, sequence}: of its last restore at this robot: when its program acted here first (seconds

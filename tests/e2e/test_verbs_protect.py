@@ -99,8 +99,8 @@ def test_a_stranger_that_is_released_runs_on_and_can_be_protected_again(pair: Pa
     written = tmp_path / "stranger.out"
     pid = stranger(first, COUNT, written)
     for giver in (first, second):
-        assert robots.failover(first, "protect", str(pid), "--name", "count").returncode == 0
-        robots.until(lambda: robots.component(first, "count").get("protection") == "protected", "a checkpoint at robot2")
+        assert robots.failover(first, "protect", str(pid), "--name", "count", "--wait").returncode == 0
+        assert robots.component(first, "count")["protection"] == "protected", "it waits until robot2 has a checkpoint"
         released = robots.failover(giver, "release", "count")
         assert released.returncode == 0, released
         assert f"runs on as pid {pid}, unprotected" in released.stdout

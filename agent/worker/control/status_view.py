@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -73,6 +73,7 @@ class WorkerView(Struct, frozen=True):
         interfaces: as the status shows them.
         store: None at a witness.
         memory: None at a witness.
+        arriving: what of a component is on its way to other robots, as the status shows it.
     """
 
     links: Mapping[str, PeerConnection]
@@ -81,6 +82,7 @@ class WorkerView(Struct, frozen=True):
     supervisors: Mapping[str, Supervisor] = field(default_factory=dict)
     store: Store | None = None
     memory: Memory | None = None
+    arriving: Callable[[str], list[dict[str, Any]]] = lambda _: []
 
 
 def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> dict[str, Any]:
@@ -109,7 +111,8 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "media": [_medium(one) for one in told.media],
         "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in _members(view, settings)],
         "components": [
-            _component(one, ours.supervisors.get(one.name), settings, ours.store) for one in (view.components if view else ())
+            _component(one, ours.supervisors.get(one.name), settings, ours.store) | {"arriving": ours.arriving(one.name)}
+            for one in (view.components if view else ())
         ],
         "beats": {
             "sent": beats.sent,

@@ -21,7 +21,7 @@ from msgspec import Struct, field
 from agent.errors import LaneError
 from agent.system.threads import to_its_end
 from agent.worker.replication.receive_files import is_in_place, is_plausible, named, size_told
-from agent.worker.replication.transfer import Shipper
+from agent.worker.replication.transfer import Arriving, Shipper
 from checkpoint.errors import CheckpointError
 from checkpoint.snapshot.required_files import Need
 from checkpoint.store.content_store import digest_of_descriptor
@@ -88,6 +88,15 @@ class Bringing:
         self._numbers = itertools.count(time.monotonic_ns())
         self._asked: dict[int, tuple[str, asyncio.Future[Lacking]]] = {}
         self._peers: dict[str, _Peer] = {}
+        self._sums: dict[tuple[str, str], tuple[int, int, bytes]] = {}
+
+    def on_their_way(self, component: str) -> tuple[Arriving, ...]:
+        """How much of a component's files the peers have that lack some."""
+        going = [(peer, *sums) for (owner, peer), sums in self._sums.items() if owner == component]
+        return tuple(Arriving(peer, size - rest + self._part(peer, digest), size) for peer, size, rest, digest in going)
+
+    def _part(self, peer: str, digest: bytes) -> int:
+        return sum(one.arrived for one in self._shipper.on_their_way(digest) if one.peer == peer)
 
     async def bring(self, peer: str, component: str, files: tuple[Need, ...]) -> None:
         """Return once the peer has all of these.
@@ -105,6 +114,7 @@ class Bringing:
             if lacking:
                 await self._send_all(peer, known, component, lacking)
         finally:
+            self._sums.pop((component, peer), None)
             self._note(component, peer, "")
         known.sure[component] = _Sure(files, time.monotonic() + SURE_S)
 
@@ -158,9 +168,10 @@ class Bringing:
         """Send each once, also where several wait for it; the smallest first, so that most is there soon."""
         until_s = time.monotonic() + PATIENCE_S
         waiting = sorted(lacking.values(), key=lambda need: need.size)
-        rest = sum(need.size for need in waiting)
+        size = rest = sum(need.size for need in waiting)
         log.info("%s lacks %s of the files of %s: %s", peer, size_told(rest), component, named_needs(waiting))
         for need in waiting:
+            self._sums[component, peer] = size, rest, need.digest
             self._note(component, peer, f"protected from {peer} after {size_told(rest)} of program files have arrived there")
             task = known.under_way.get(need.digest)
             if task is None:

@@ -76,16 +76,30 @@ Offered = Offer | Content
 
 
 class _Outgoing(Struct):
-    """One transfer that leaves, as far as it has been taken. ``doubted``: what its receiver said last may be lost."""
+    """One transfer that leaves, as far as it has been taken. ``doubted``: what its receiver said last may be lost.
+
+    Attributes:
+        subject: the component whose snapshot it is, or the digest of a file; size: in bytes.
+    """
 
     peer: str
     what: str
+    subject: str | bytes
+    size: int
     until: int = 0
     sent: bool = False
     taken: bool = False
     doubted: bool = False
     refused: str = ""
     moved: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class Arriving(Struct, frozen=True):
+    """What is on its way to a peer, in bytes. ``arrived``: of ``size``."""
+
+    peer: str
+    arrived: int
+    size: int
 
 
 class Shipper:
@@ -112,7 +126,8 @@ class Shipper:
             LaneError: the connection went down, the peer refused, or it was silent for `PATIENCE_S`.
         """
         number = next(self._numbers)
-        transfer = self._outgoing[number] = _Outgoing(peer, SNAPSHOT if isinstance(offer, Offer) else FILE)
+        what, subject = (SNAPSHOT, offer.component) if isinstance(offer, Offer) else (FILE, offer.digest)
+        transfer = self._outgoing[number] = _Outgoing(peer, what, subject, offer.size)
         try:
             if not await self._offered_whole(peer, transfer, replace(offer, transfer=number), descriptor):
                 return
@@ -161,6 +176,11 @@ class Shipper:
                 transfer.refused = message.reason or "no reason given"
         transfer.doubted = False
         transfer.moved.set()
+
+    def on_their_way(self, subject: str | bytes) -> tuple[Arriving, ...]:
+        """How much of a component's snapshots, or of a file, the peers have by their own word."""
+        going = (one for one in self._outgoing.values() if one.subject == subject)
+        return tuple(Arriving(one.peer, min(max(one.until - WINDOW, 0), one.size), one.size) for one in going)
 
     def answers_may_be_lost(self, peer: str) -> None:
         """The peer has connected anew: its last words may be lost. While it is at a transfer, it says so each second."""

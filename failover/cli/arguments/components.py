@@ -35,6 +35,7 @@ def run(room: argparse.ArgumentParser) -> None:
         "--name", metavar="NAME", help="its name, a path such as /lab/robot1/mapper (default: made from the command)"
     )
     room.add_argument("--detach", action="store_true", help="print the name and return; see failover logs")
+    _add_wait(room, "with --detach: ")
     room.add_argument(
         "--no-isolate", dest="isolate", action="store_false", help="keep it in this machine's PIDs and clocks (default: its own)"
     )
@@ -84,7 +85,14 @@ def protect(room: argparse.ArgumentParser) -> None:
     add_devices(room)
     add_connections(room, f"{RESETS}; carry: a handover takes those of TCP along; {REFUSES} (default: as agent.toml says: reset)")
     add_shared_memory(room, "as agent.toml says: refuse")
+    _add_wait(room)
     add_agent(room)
+
+
+def _add_wait(room: argparse.ArgumentParser, when: str = "") -> None:
+    room.add_argument(
+        "--wait", action="store_true", help=f"{when}return when another robot holds a checkpoint, and show how far that is"
+    )
 
 
 def named(room: argparse.ArgumentParser) -> None:

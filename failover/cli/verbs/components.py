@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from failover.cli.arguments.components import HOOKS
 from failover.cli.connection import connect
-from failover.cli.output import render, team_tree
+from failover.cli.output import progress, render, team_tree
 from failover.client.control import Control, Output, Update
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
 
@@ -23,6 +23,11 @@ RECONNECT_S: Final = 30.0
 """How long ``failover run`` waits for its agent to come back: a restart takes a second, an upgrade some more."""
 
 RECONNECT_EVERY_S: Final = 0.2
+
+LOOK_EVERY_S: Final = 0.2
+"""Between two looks whether a component is protected."""
+
+ENDED: Final = ("ended", "failed", "released")
 
 
 # --- run -------------------------------------------------------------------------------------------------------------
@@ -41,10 +46,15 @@ def run(arguments: argparse.Namespace) -> int:
         wanted["name"] = arguments.name
     if arguments.user:
         wanted["user"] = arguments.user
+    if arguments.wait and not arguments.detach:
+        raise FailoverError("--wait goes with --detach: without it, run shows the program's output until its end")
     follower = _Follower(arguments)
     with connect(arguments) as agent:
         if arguments.detach:
-            return _started(agent.ask("run", **wanted), arguments)
+            answer = agent.ask("run", **wanted)
+            if arguments.wait:
+                until_protected(agent, str(answer.get("started", answer)["name"]), is_quiet=arguments.json)
+            return _started(answer, arguments)
         with follower.passing_signals_on():
             return exit_like(follower.follow(agent, wanted))
 
@@ -129,6 +139,37 @@ class _Follower:
             print(f"failover: {error}", file=sys.stderr)
 
 
+def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> None:
+    """Return when another robot holds a checkpoint of a component; tell meanwhile how far that is.
+
+    Raises:
+        FailoverError: the component has ended, or cannot be protected.
+    """
+    with progress.Progress(is_quiet=is_quiet) as shown:
+        while True:
+            status = agent.ask("status")
+            one = next((one for one in status["components"] if one["name"] == name), None)
+            if one is None or one["state"] in ENDED:
+                raise FailoverError(
+                    f"{name} is {one['state'] if one else 'gone'}: it will not be protected; see failover why {name}"
+                )
+            if one["protection"] == "protected":
+                return
+            if not status["peers"]:
+                raise FailoverError(f"{name} runs and stays unprotected: {status['robot']} is alone in its team")
+            shown.tell(f"{name}: {_how_far(one)}; Ctrl-C: it runs on")
+            time.sleep(LOOK_EVERY_S)
+
+
+def _how_far(one: dict[str, Any]) -> str:
+    """What of a component is on its way to its standby, or what it waits for."""
+    if going := one.get("arriving", ()):
+        (first, *_) = sorted(going, key=lambda each: each["what"])
+        what = {"checkpoint": "first checkpoint", "files": "program files"}[first["what"]]
+        return f"{what} to {first['to']}: {progress.share(first['arrived'], first['size'])}"
+    return str(one["reasons"][0]) if one["reasons"] else f"waits for the first checkpoint ({one['state']})"
+
+
 def reconnect(arguments: argparse.Namespace, name: str) -> Control:
     """Wait for an agent that went away in the middle of a component's output.
 
@@ -187,6 +228,8 @@ def protect(arguments: argparse.Namespace) -> int:
         rules = {"devices": dict(arguments.devices), "connections": arguments.connections, "shared": shared}
         rules["shared_memory"] = arguments.shared_memory
         answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, **rules)
+        if arguments.wait:
+            until_protected(agent, str(answer["name"]), is_quiet=arguments.json)
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 
 

@@ -56,7 +56,7 @@ from checkpoint.snapshot.canonical_state import State
 from checkpoint.snapshot.credentials import Owner
 from checkpoint.store.whole_file import written_aside
 from failover.cli.keeper_client import Keeper
-from failover.cli.output import render, team_tree
+from failover.cli.output import progress, render, team_tree
 from failover.cli.verbs.components import exit_like
 from failover.core.types import CARRY, DETACH, REFUSE, RESET
 from failover.errors import FailoverError
@@ -77,6 +77,9 @@ LEFT_RUNNING: Final = (
     "program keeps it; leave out --leave-running, or --connections carry"
 )
 SILENT: Final = "its peer hears nothing until the restore, for 15 minutes at most"
+
+LARGE: Final = 64 << 20
+"""Bytes of a snapshot from which on its restore may take a while. The modules that a keeper reads, too, are a tenth of that."""
 
 ROOT: Final = 0
 
@@ -338,13 +341,27 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
             follow=False,
             bound=owner,
         )
-        restored, _ = keeper.ask(order, Restored, (file,))
+        with _told_how_far(arguments, keeper.pid, os.fstat(file).st_size):
+            restored, _ = keeper.ask(order, Restored, (file,))
         resumed, _ = keeper.ask(Resume(), Resumed)
         if not arguments.wait:
             keeper.release()
     moved = (OWN_PIDS,) if born.isolated and not state.process.isolated else ()
     _tell_restore(arguments, restored.pid, reduced + born.notes + moved + restored.notes + resumed.notes)
     return _wait_for(born) if arguments.wait else 0
+
+
+@contextmanager
+def _told_how_far(arguments: argparse.Namespace, keeper: int, size: int) -> Iterator[None]:
+    """Show how much of a large snapshot has been read."""
+    if size < LARGE:
+        yield
+        return
+    with (
+        progress.Progress(is_quiet=arguments.json) as shown,
+        progress.of_reading(keeper, f"restoring {arguments.file}", size, shown),
+    ):
+        yield
 
 
 def _reduced(path: str, state: State, author: Author) -> tuple[str, ...]:

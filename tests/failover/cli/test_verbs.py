@@ -167,6 +167,61 @@ def test_an_ended_component_needs_no_standby(agent: Start) -> None:
     assert "ended (exit 3)" in ran.stdout
 
 
+WAITS = (
+    {"protection": "none", "arriving": [{"to": "robot2", "what": "files", "arrived": 1_000_000, "size": 4_000_000}]},
+    {"protection": "none", "arriving": [{"to": "robot2", "what": "checkpoint", "arrived": 1_500_000_000, "size": 2_000_000_000}]},
+)
+
+
+def waiting(*pictures: dict[str, Any], every: int = 8) -> Callable[[Request], Answer]:
+    """An agent that protects a program, and shows each of these some times in turn, the last one for good."""
+    asked = 0
+
+    def answer(request: Request) -> Answer:
+        nonlocal asked
+        if request.verb != "status":
+            return [Result({"name": COMPONENT["name"], "pid": 41, "notes": []})]
+        asked += 1
+        shown = pictures[min(asked // every, len(pictures) - 1)]
+        return [Result(STATUS | {"components": [COMPONENT | shown]})]
+
+    return answer
+
+
+@pytest.mark.parametrize("words", [("protect", "41"), ("run", "--detach", "--", "x")])
+def test_waiting_for_the_first_checkpoint_tells_how_much_of_what_has_arrived(agent: Start, words: tuple[str, ...]) -> None:
+    socket = agent(waiting(*WAITS, {"protection": "protected"})).path
+    ran = failover(words[0], "--wait", *words[1:], socket=socket)
+    assert ran.returncode == 0 and str(COMPONENT["name"]) in ran.stdout
+    (line,) = ran.stderr.splitlines()  # a plain one each five seconds
+    assert line.startswith("/lab/robot1/mapper: ") and (
+        "(75 %)" in line or "program files to robot2: 1.0 MB of 4.0 MB (25 %)" in line
+    )
+    assert failover(words[0], "--wait", "--json", *words[1:], socket=socket).stderr == ""
+
+
+def test_a_program_whose_output_is_shown_is_not_waited_for(agent: Start) -> None:
+    stand_in = agent(waiting({"protection": "protected"}))
+    ran = failover("run", "--wait", "--", "x", socket=stand_in.path)
+    assert ran.returncode == 1 and "--wait goes with --detach" in ran.stderr and not stand_in.asked
+
+
+@pytest.mark.parametrize(
+    ("shown", "told"),
+    [
+        ({"components": []}, "is gone: it will not be protected"),
+        ({"components": [COMPONENT | {"state": "failed", "protection": "none"}]}, "is failed: it will not be protected"),
+        ({"peers": [], "components": [COMPONENT | {"protection": "none"}]}, "robot1 is alone in its team"),
+    ],
+)
+def test_a_wait_for_what_will_not_come_ends(agent: Start, shown: dict[str, Any], told: str) -> None:
+    def answer(request: Request) -> Answer:
+        return [Result(STATUS | shown if request.verb == "status" else {"name": COMPONENT["name"], "pid": 41, "notes": []})]
+
+    ran = failover("protect", "--wait", "41", socket=agent(answer).path)
+    assert ran.returncode == 1 and told in ran.stderr
+
+
 def test_status_as_json_is_the_agents_own_answer(agent: Start) -> None:
     ran = failover("status", "--json", socket=agent(answering(STATUS)).path)
     assert json.loads(ran.stdout) == STATUS
@@ -446,7 +501,7 @@ def test_a_mistake_in_the_command_line_is_exit_status_2(words: list[str]) -> Non
         ),
         ("protect 1 --connections cary", "'cary' is none of reset, carry, refuse; did you mean 'carry'?"),
         ("stop x --signal TREM", "did you mean 'TERM'?"),
-        ("team shwo", "'shwo' is none of create, invite, join, list, remove, enrol, show; did you mean 'show'?"),
+        ("team shwo", "'shwo' is none of create, invite, join, list, remove, rotate, enrol, show; did you mean 'show'?"),
         ("team enrol x 192.0.2.1 --role servr", "'servr' is none of robot, server, witness; did you mean 'server'?"),
         ("completion zhs", "'zhs' is none of bash, zsh, tcsh; did you mean 'zsh'?"),
         ("logs x --stream 3", "3 is none of 1, 2"),

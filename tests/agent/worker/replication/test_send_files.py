@@ -340,7 +340,7 @@ def test_files_give_way_to_snapshots_and_arrive_all_the_same(
         monkeypatch.setattr(transfer.asyncio, "sleep", noted)
         await two.bring(need)
         assert not waits
-        two.shipper._outgoing[-1] = transfer._Outgoing("robot3", transfer.SNAPSHOT)
+        two.shipper._outgoing[-1] = transfer._Outgoing("robot3", transfer.SNAPSHOT, "/lab/b", 1 << 20)
         await two.bring(two.file(LARGE[::-1], ELSEWHERE + "2"))
         assert waits
 

@@ -128,6 +128,27 @@ def test_a_snapshot_arrives_whole(tmp_path: Path, content: Path) -> None:
     run(body())
 
 
+def test_how_much_of_it_the_receiver_has_by_its_own_word_is_known(tmp_path: Path) -> None:
+    size, path = 3 * transfer.WINDOW + 17, tmp_path / "large"
+    path.write_bytes(bytes(size))
+
+    async def body() -> None:
+        seen: list[int] = []
+
+        def look(message: Bulk) -> Bulk:
+            going = two.shipper.on_their_way("/lab/a")
+            seen.extend(one.arrived for one in going)
+            assert all((one.peer, one.size) == ("robot2", size) for one in going)
+            return message
+
+        two = Two(tmp_path, Desk(), look)
+        await ship(two, path, size)
+        assert seen == sorted(seen) and seen[0] == 0 and len(set(seen)) > 1 and transfer.WINDOW < max(seen) <= size
+        assert two.shipper.on_their_way("/lab/a") == () == two.shipper.on_their_way("/lab/b")
+
+    run(body())
+
+
 @pytest.fixture
 def small(tmp_path: Path) -> Path:
     path = tmp_path / "snapshot"
