@@ -513,6 +513,9 @@ class MainLoop:
         if robots == before or self._me not in robots:
             return
         settings = self._settings = self._settings.with_robots(robots)
+        for name in settings.peers:
+            if name in before and set(before[name].keys) - set(robots[name].keys):
+                self._frames.forget_older(name)
         if {name: robot.keyless for name, robot in robots.items()} == {name: robot.keyless for name, robot in before.items()}:
             return  # other keys of the connections, which are the worker's
         members = settings.team.roster()

@@ -564,8 +564,13 @@ class ReplicationLink:
         claimed = bytes(frames[0].bytes).decode(errors="replace")
         if claimed not in self._peers:
             return ""
-        if self._keys.present and self._owners.get(frames[1].get("User-Id")) != claimed:
+        if not self._keys.present:
+            return claimed
+        key = frames[1].get("User-Id")
+        if self._owners.get(key) != claimed:
             return ""
+        if key == self._keys.following.get(claimed):  # it uses the new one, and goes back to no old one
+            self._owners.pop(self._keys.peers[claimed], None)
         return claimed
 
     async def _admit(self, gate: zmq.asyncio.Socket) -> None:

@@ -435,6 +435,12 @@ class Receiver:
             known = self._senders[tag] = _Sender(sender, rank, range(place, place + 1), _Window())
         known.keys = (key, *[one for one in known.keys if one != key])[:KEYS_PER_SENDER]
 
+    def forget_older(self, sender: str) -> None:
+        """Believe ``sender`` by its newest key alone."""
+        known = self._senders.get(name_tag(sender))
+        if known is not None and known.name == sender:
+            known.keys = known.keys[:1]
+
     def changed(self, team: str, me: str, roster: Roster) -> Receiver:
         """The same for another roster: senders that stay keep their keys, and what was seen of them."""
         other = Receiver(me, team, roster)

@@ -151,6 +151,10 @@ class FrameLane:
         """
         self._receiver.accept(peer, key)
 
+    def forget_older(self, peer: str) -> None:
+        """The peer seals with its newest key alone: whoever told us the others may not speak for it any more."""
+        self._receiver.forget_older(peer)
+
     def seal(
         self,
         beat: Beat | None,

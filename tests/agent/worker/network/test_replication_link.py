@@ -244,6 +244,30 @@ def test_both_keys_of_a_peer_count_and_the_old_one_is_refused_at_once_on_a_conne
     run(keys1, keys2, body)
 
 
+def test_once_a_peer_has_used_its_new_key_the_old_one_is_refused_though_both_count_still() -> None:
+    """Who has a copy of the old one could else greet in its name until the last moment."""
+    keys1, keys2 = team_keys()
+    public, secret = new_keys()
+    both = Keys(keys1.public, keys1.secret, keys1.peers, {"robot2": public})
+
+    async def body(pair: Pair) -> None:
+        one, other = pair.links["robot1"], pair.links["robot2"]
+        await until(pair.connected)
+        other.say("robot1", Cancel(1))
+        await until(lambda: ("robot2", Cancel(1)) in pair.heard["robot1"])
+        address = {"robot1": f"127.0.0.1:{pair.ports['robot1']}"}
+        await other.change(address, Keys(public, secret, {**keys2.peers, "robot2": public}))
+        await until(pair.connected)
+        other.say("robot1", Cancel(2))
+        await until(lambda: ("robot2", Cancel(2)) in pair.heard["robot1"])
+        before = one.strangers
+        await other.change(address, keys2)
+        await until(lambda: one.strangers > before)
+        await until(lambda: pair.state("robot2") is LinkState.REFUSED)
+
+    run(both, keys2, body)
+
+
 @pytest.mark.parametrize("uses", ["the old one", "the new one"])
 def test_a_peer_with_two_keys_is_found_by_the_one_that_it_uses_and_no_refusal_is_told(uses: str) -> None:
     keys1, keys2 = team_keys()

@@ -144,6 +144,16 @@ def test_the_key_before_the_present_one_stays_valid_and_the_one_before_that_does
     assert verdicts[2] == Refused(Reason.UNKNOWN_KEY)
 
 
+def test_an_older_key_that_is_forgotten_is_refused_and_the_newest_one_stays_valid() -> None:
+    opened, newer = receiver(), bytes(32)
+    opened.accept("robot1", newer)
+    for sender in ("robot1", "nobody"):
+        opened.forget_older(sender)
+    by, (body,) = sealer(), bodies(None, BEAT, (), LEFT_US, body_size_max(3))[0]
+    old, new = (opened.open(by.seal([body], [key])[0]) for key in (KEYS["robot1", "robot2"], newer))
+    assert old == Refused(Reason.UNKNOWN_KEY) and isinstance(new, Part)
+
+
 # --- One speaker -----------------------------------------------------------------------------------------------------
 
 
