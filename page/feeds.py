@@ -247,10 +247,15 @@ class Feeds:
 
 
 def charted(key: str, fields: Mapping[str, Any]) -> list[float | None] | None:
-    """What a chart shows of a row: lag and freeze of a component, in ms, the value of an item; None: nothing."""
+    """What a chart shows of a row; None: nothing.
+
+    Lag and freeze of a component, in ms; the value of an item; of a link with slots the last round, in ms, and who shares it.
+    """
     if key.startswith("component:"):
         freeze_us = fields.get("freeze_us")
         return [fields.get("lag_ms"), None if freeze_us is None else freeze_us / 1000]
+    if key.startswith("medium:"):
+        return [fields["round_ms"], fields["count"]] if fields["own"] else None
     value = fields.get("value") if key.startswith("item:") else None
     return [float(value)] if isinstance(value, int | float) and not isinstance(value, bool) else None
 

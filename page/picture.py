@@ -1,7 +1,7 @@
 """What the page shows of the team, as a flat table: key → fields. Pure: answers of the agent in, values for JSON out.
 
-Keys are ``team``, and ``KIND:NAME`` for robots, components, tasks, drivers, items, people and orders. A client gets the whole
-table once, then `changes`: so each field stands still while nothing happens, or is a figure that people look at.
+Keys are ``team``, and ``KIND:NAME`` for robots, links, components, tasks, drivers, items, people and orders. A client gets
+the whole table once, then `changes`: so each field stands still while nothing happens, or is a figure that people look at.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, Final
 from msgspec import Struct
 
 from failover.client.health import OVER_STATES, is_lacking, is_unknown, is_unprotected, sight
+from page.radio import of_media
 
 Table = dict[str, dict[str, Any]]
 
@@ -69,12 +70,13 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 
 
 def of_status(status: Mapping[str, Any], may: Answers) -> Table:
-    """Team, robots and components, as one user may see them."""
+    """Team, robots, links and components, as one user may see them."""
     peers: Sequence[Mapping[str, Any]] = status["peers"]
     robots = [str(peer["name"]) for peer in peers if peer["state"] in LIVING and peer.get("role", "robot") == "robot"]
     robots = sorted([*robots, *([str(status["robot"])] if status.get("role") == "robot" else [])])
     table: Table = {"team": _team(status), f"robot:{status['robot']}": _here(status)}
     table |= {f"robot:{peer['name']}": _peer(peer) for peer in peers}
+    table |= of_media(status.get("media") or (), str(status["robot"]))
     for component in map(sight, status["components"]):
         if component.get("state") not in ("released", "absent"):
             table[f"component:{component['name']}"] = of_component(component, robots, may)

@@ -387,7 +387,7 @@ class MainLoop:
                 if self._board is not None:
                     self._board.take(opened, came_ns)  # first: programs wait for it
                 self._copies.heard(opened.part, link, cast=is_cast)
-                self._note_way(opened.part, link, place, came_ns)
+                self._note_way(opened.part, link, place, len(frame), came_ns)
                 counts_ns = self._counts_from_ns(now_ns, came_ns) if self._rests else 0
                 self._take_part(opened.part, link, now_ns, counts_ns)
             elif self._copies.admit(opened, link, now_ns, medium=medium_of(frame), cast=is_cast):
@@ -400,9 +400,9 @@ class MainLoop:
         if taken >= TURN_LIMIT and refused > taken // 2:
             self._deaf_until_ns = 2 * clock.now_ns() - self._read_ns
 
-    def _note_way(self, part: Part, link: str, place: int, came_ns: int) -> None:
+    def _note_way(self, part: Part, link: str, place: int, size: int, came_ns: int) -> None:
         """By which link a part came, and whether it was cast; what it says of slots."""
-        self._media.heard(part.sender, link, came_ns)
+        self._media.heard(part.sender, link, size, came_ns)
         if place != NOT_CAST:
             self._media.heard_cast(place, part.medium, part.rank, part.boot, part.counter)
         if part.slots is not None and part.medium:
@@ -410,7 +410,7 @@ class MainLoop:
 
     def _note_way_of_copy(self, copy: Refused, link: str, place: int, frame: bytes) -> None:
         """The same of a copy of a part that was believed."""
-        self._media.heard(copy.sender, link, self._read_ns)
+        self._media.heard(copy.sender, link, len(frame), self._read_ns)
         if place != NOT_CAST:
             self._media.heard_cast_copy(place, medium_of(frame), copy.sender, copy.counter)
 

@@ -60,7 +60,7 @@ class Link(Struct):
         reached: the members that could hear a cast.
         casting: None where nothing is cast; ``why``: why not.
         slots: None where frames leave at once; ``no_slots``: why they do, though it is a radio.
-        heard_ns: member → when a frame of it came over this link.
+        heard_ns: member → when a frame of it came over this link; ``bytes``: of its frames here, and of ours that left.
         by_unicast: the members that got the last frame by unicast besides.
         sent_ns: when the last frame without a slot left.
         turned: round of the board that the last frame in a slot told of.
@@ -77,6 +77,7 @@ class Link(Struct):
     no_slots: str = ""
     lane: FrameLane | None = None
     heard_ns: dict[str, int] = field(default_factory=dict)
+    bytes: dict[str, int] = field(default_factory=dict)
     by_unicast: tuple[str, ...] = ()
     sent_ns: int = 0
     turned: int = 0
@@ -184,10 +185,11 @@ class Media:
 
     # --- What is heard ---
 
-    def heard(self, sender: str, link: str, now_ns: int) -> None:
-        """A frame of that member came over an interface."""
-        if link in self._by_name:
-            self._by_name[link].heard_ns[sender] = now_ns
+    def heard(self, sender: str, link: str, size: int, now_ns: int) -> None:
+        """A datagram of that member came over an interface."""
+        if ours := self._by_name.get(link):
+            ours.heard_ns[sender] = now_ns
+            ours.bytes[sender] = ours.bytes.get(sender, 0) + size
 
     def heard_cast(self, place: int, medium: int, rank: int, boot: int, counter: int) -> None:
         """An authentic part came by cast over our link ``place``."""
@@ -311,27 +313,36 @@ class Media:
         self, link: Link, lane: FrameLane, made: Sequence[Sealed], now_ns: int, period_ns: int, patience_ns: int
     ) -> None:
         """By cast to all, and by unicast to each member that has not said lately that it hears casts."""
-        casts, casting, unicast, place = lane.casts, link.casting, self._beats.unicast, link.place
+        casts, casting, place = lane.casts, link.casting, link.place
         if casting is None or casts is None or casting.now is Cast.UNICAST:
             for sealed in made:
-                for peer in sealed.to:
-                    unicast(peer, place, sealed.datagrams)
+                self._unicast(link, sealed.to, sealed.datagrams)
             if casting is not None and casting.round_over(0, 0):
                 self._cast_otherwise(link)
             return
         since_ns = now_ns - round(RECENT_PERIODS * period_ns) - patience_ns
         for sealed in made if any(one.to for one in made) else []:
             refusal = self._beats.cast(place, casting.now, sealed.datagrams)
+            self._count_left(link, 1, sealed.datagrams)
             if refusal and casting.failed(refusal):
                 self._cast_otherwise(link)
             for counter in range(lane.counter - len(sealed.datagrams) + 1, lane.counter + 1):
                 casts.left(place, counter, now_ns)
             ranks, reached = self._roster.ranks, link.reached
             missing = [peer for peer in sealed.to if peer not in reached or not casts.hears(ranks[peer], place, since_ns)]
-            for peer in missing:
-                unicast(peer, place, sealed.datagrams)
+            self._unicast(link, missing, sealed.datagrams)
             link.by_unicast = tuple(missing)
             self._choose(link, sealed.to, now_ns)
+
+    def _unicast(self, link: Link, to: Sequence[str], datagrams: Sequence[bytes]) -> None:
+        unicast, place = self._beats.unicast, link.place
+        for peer in to:
+            unicast(peer, place, datagrams)
+        self._count_left(link, len(to), datagrams)
+
+    def _count_left(self, link: Link, times: int, datagrams: Sequence[bytes]) -> None:
+        name = self._settings.config.robot
+        link.bytes[name] = link.bytes.get(name, 0) + times * sum(map(len, datagrams))
 
     def _choose(self, link: Link, to: Sequence[str], now_ns: int) -> None:
         """Try another way to cast where those that we hear do not hear us."""
@@ -371,7 +382,8 @@ class Media:
         is_cast = link.casting is not None and now is not Cast.UNICAST
         slots = link.slots.view() if link.slots is not None else None
         period_ms = link.period_ns // MS
-        return MediumView(link.now.name, str(now), why, link.by_unicast if is_cast else (), period_ms, link.no_slots, slots)
+        by_unicast = link.by_unicast if is_cast else ()
+        return MediumView(link.now.name, str(now), why, by_unicast, period_ms, link.no_slots, slots, link.bytes)
 
     def troubles(self) -> tuple[str, ...]:
         """Sentences for the status: what a person should do something about."""

@@ -171,6 +171,7 @@ class MediumView(msgspec.Struct, frozen=True):
         period_ms: between two frames.
         no_slots: why it has none though it is a radio, or "".
         slots: None where frames leave at once.
+        bytes: of frames: member → that came from it, this robot → that left.
     """
 
     link: str
@@ -180,6 +181,7 @@ class MediumView(msgspec.Struct, frozen=True):
     period_ms: int
     no_slots: str = ""
     slots: SlotsView | None = None
+    bytes: dict[str, int] = {}
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):

@@ -82,13 +82,18 @@ beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps, items}: of 
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
     medium: wired | wireless | loopback; because: the fact that tells; carrier: its cable is in; snapshots: they may travel there
     bytes_in, bytes_out: all that the kernel counted on it
-media: [{link, cast, because, by_unicast, period_ms, no_slots, slots}]: how frames leave over each beat address
+media: [{link, cast, because, by_unicast, period_ms, no_slots, bytes, slots}]: how frames leave over each beat address
     cast: multicast | broadcast | unicast; because: why not multicast; by_unicast: members that get frames by unicast besides, for
         they did not say that they hear the cast; period_ms: between two frames; no_slots: why a radio has none
-    slots: {own, why, round, count, place, members, reference, least_gap_us, late_us, late_us_max, followed, outside, ignored,
-        deaf, peers: [{robot, seen, missed, delay_us, transit_us}]}: see `failover.core.frames.terms.SlotsView`; None: no slots
+    bytes: {robot: bytes} of frames that came from each member on that link; of this robot, that it has sent there
+    slots: {own, why, round, count, place, members, reference, round_us, offset_us, jitter_us, least_gap_us, late_us, late_us_max,
+        followed, outside, ignored, deaf,
+        peers: [{robot, seen, missed, lost, awaited, offset_us, jitter_us, transit_us, hears}]}:
+        see `failover.core.frames.terms.SlotsView`; None: no slots
         own: listening | running | silent, why; count: K, robots that share the round; place: this robot's among them, from 0
-        reference: the robot whose frames give the phase; deaf: [[listener, speaker], …]; seen: not | insert | run | remove
+        reference: the robot whose frames give the phase; round_us: the last round, longer than period_ms where it was stretched
+        offset_us: from a member's slot to its last frame; lost: of the awaited frames those that did not come
+        deaf: [[listener, speaker], …]; hears: whom a member hears; seen: not | insert | run | remove
 peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, doubted, drained, notes}]
     role: robot | server | witness; state: unknown | live | suspect | restarting | dead; links: ours, by which it was heard lately
     lane: connected | connecting | refused | down

@@ -8,8 +8,9 @@ const mine = new Set();    // IDs of orders that this window gave
 let session = null, view = null, socket = null, wait = 500, framed = false, lost = "";
 
 // --- Elements and words ----------------------------------------------------------------------------------------------
+const DRAWN = new Set(["svg", "polyline", "path", "line", "circle", "text"]);
 const el = (tag, props = {}, ...children) => {
-  const made = tag === "svg" || tag === "polyline" ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  const made = DRAWN.has(tag) ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   for (const [name, value] of Object.entries(props)) {
     if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
     else if (value !== false && value != null) made.setAttribute(name, value === true ? "" : value);
@@ -23,6 +24,7 @@ const rows = (kind) => [...table].filter(([key]) => key.startsWith(kind + ":")).
 const order = new Intl.Collator("en", { numeric: true });
 const compare = (a, b) => order.compare(a[0], b[0]);
 const ms = (value) => value == null ? "–" : value < 1000 ? `${+value.toFixed(value < 10 ? 2 : 0)} ms` : value < 120000 ? `${(value / 1000).toFixed(1)} s` : `${Math.round(value / 60000)} min`;
+const tenths = (value) => value == null ? "–" : `${value.toFixed(1)} ms`;
 const size = (value) => { for (const unit of ["B", "KB", "MB"]) { if (value < 1000) return `${+value.toFixed(1)} ${unit}`; value /= 1000; } return `${value.toFixed(1)} GB`; };
 const clock = (date) => date.toDateString() === new Date().toDateString() ? date.toLocaleTimeString("en-GB") : date.toLocaleString("en-GB");
 const short = (name) => name.split("/").pop();
@@ -30,7 +32,7 @@ const list = (values) => values.length ? values.join(", ") : "–";
 const link = (kind, name) => `#/${kind}/${encodeURIComponent(name)}`;
 
 const SIGNS = { protected: ["●", "good"], degraded: ["▲", "warn"], alone: ["◆", "warn"], failed: ["✕", "bad"], unknown: ["?", "bad"], dead: ["✕", "bad"],
-  live: ["●", "good"], suspect: ["▲", "warn"], ended: ["–", "quiet"], unreachable: ["?", "warn"], waiting: ["○", "quiet"], running: ["●", "good"], idle: ["–", "warn"], simulated: ["◌", "quiet"] };
+  live: ["●", "good"], suspect: ["▲", "warn"], ended: ["–", "quiet"], unreachable: ["?", "warn"], waiting: ["○", "quiet"], running: ["●", "good"], "at once": ["●", "good"], silent: ["✕", "bad"], listening: ["○", "quiet"], idle: ["–", "warn"], simulated: ["◌", "quiet"] };
 const sign = (word) => SIGNS[word] || ["○", "quiet"];
 
 // --- The table, and what is drawn of it ---------------------------------------------------------------------------------
@@ -51,7 +53,7 @@ const takeOutput = ({ name, text, left_out, says }) => {
 };
 const addPoint = (key, fields) => {
   const points = past.get(key) || [], now = performance.now() / 1000;
-  points.push([now, key.startsWith("item:") ? [fields.value] : [fields.lag_ms, fields.freeze_us == null ? null : fields.freeze_us / 1000]]);
+  points.push([now, key.startsWith("item:") ? [fields.value] : key.startsWith("medium:") ? [fields.round_ms, fields.count] : [fields.lag_ms, fields.freeze_us == null ? null : fields.freeze_us / 1000]]);
   past.set(key, points.slice(-600));
 };
 const draw = () => {
@@ -68,7 +70,7 @@ const draw = () => {
 };
 setInterval(() => {   // a point a second, also of a value that stands still
   const one = table.get(view?.key);
-  if (one && !lost && !table.get("team")?.away && /^(component|item):/.test(view.key)) { addPoint(view.key, one); draw(); }
+  if (one && !lost && !table.get("team")?.away && /^(component|item|medium):/.test(view.key)) { addPoint(view.key, one); draw(); }
 }, 1000);
 const away = (why) => { at("away").hidden = !why; set(at("away"), why && `What you see is old. ${why}`); };
 
@@ -294,6 +296,75 @@ const itemView = (name) => {
     curve.hidden = typeof one.value !== "number"; drawCurve();
   } };
 };
+
+// --- A radio: who speaks when in the round, as this robot hears it ---------------------------------------------------------
+const OFF_MS = 1;   // a frame that is farther from its slot is one that the reference follows, or a fault
+const radioView = (wanted) => {
+  const all = rows("medium"), name = wanted || (all.find(([, one]) => one.own) || all[0] || [""])[0], key = `medium:${name}`;
+  const media = tableOf(["Link", "Frames leave", "Every", "Robots", "Besides"]), members = tableOf(["Robot", "State", "Slot begins", "Came", "Jitter", "Lost", "Hears", "Traffic"]);
+  const [head, setHead] = heading(), [list_, setFacts] = facts(), [notes_, setNotes] = notes(), [ring, drawRing] = ringOf();
+  const [round, drawRound] = chart(key, 0, "Round", tenths), [count, drawCount] = chart(key, 1, "Robots in the round", String), charts = section("The last ten minutes", el("div", { class: "charts" }, round, count));
+  const share = trafficOf();
+  return { key, node: [el("h2", {}, "Links and radio"), media.node, section(name || "No link", head, el("div", { class: "radio" }, ring, list_), notes_, members.node), charts], update() {
+    if (!name && rows("medium").length) return show();
+    const one = table.get(key), slots = !!one?.own;
+    media.fill(rows("medium").sort(compare).map(([link_, m]) => [link_, [(cell) => { if (!cell.firstChild) cell.append(el("a", { href: link("medium", link_) }, link_)); }, `by ${m.cast}${m.because ? `: ${m.because}` : ""}`, ms(m.period_ms), m.own ? String(m.count) : "no slots", m.no_slots || (m.by_unicast.length ? `by unicast to ${list(m.by_unicast)}` : "")]]));
+    list_.hidden = ring.hidden = charts.hidden = !slots;
+    if (!one) return setHead("unknown", "There is no such link.");
+    const [word, why] = !slots ? ["at once", `frames wait for no slot here, they leave every ${ms(one.period_ms)}`] : [one.own, one.why || (one.own === "running" ? "this robot has a slot" : "this robot speaks without a slot")];
+    setHead(word, why);
+    const own = rows("member").filter(([, m]) => m.medium === name).map(([, m]) => m).sort((a, b) => (a.place ?? 99) - (b.place ?? 99) || order.compare(a.robot, b.robot)), [part, rate] = share(own);
+    members.fill(own.map((m) => [m.robot, memberCells(m, one, part(m))]));
+    setNotes((one.deaf || []).map(([listener, speaker]) => `${listener} does not hear ${speaker}`));
+    if (!slots) return;
+    drawRing(one, own.filter((m) => m.place != null)); drawRound(); drawCount();
+    setFacts([["Round", `${tenths(one.round_ms)}, planned ${ms(one.period_ms)}`], ["Robots in it", one.count], ["Reference", one.reference], ["Rounds of this robot", one.round], ["Rounds that it stretched", one.followed], ["Delays not followed", one.outside],
+      ["Least gap", tenths(one.least_gap_ms)], ["This robot was late by", `${ms(one.late_ms)}, at most ${ms(one.late_ms_max)}`], ["Frames of another round", one.ignored], ["Traffic of all", rate]]);
+  } };
+};
+const trafficOf = () => {   // bytes of the last ten seconds
+  const samples = [];
+  return (own) => {
+    const now = performance.now() / 1000, bytes = new Map(own.map((m) => [m.robot, m.bytes]));
+    if (!samples.length || now - samples.at(-1)[0] >= 1) samples.push([now, bytes]);
+    while (samples.length > 1 && now - samples[0][0] > 10) samples.shift();
+    const [began, before] = samples[0], more = (m) => Math.max(m.bytes - (before.get(m.robot) ?? m.bytes), 0), all = own.reduce((sum, m) => sum + more(m), 0);
+    const told = now - began >= 1 && all;
+    return [(m) => told ? `${Math.round(100 * more(m) / all)} %` : "–", told ? `${size(all / (now - began))}/s` : "–"];
+  };
+};
+const SEEN = { run: ["●", "in its slot", "good"], insert: ["○", "joins", "quiet"], remove: ["✕", "missed", "bad"], not: ["–", "no slot", "quiet"] };
+const off = (m) => `${m.offset_ms < 0 ? "−" : "+"}${ms(Math.abs(m.offset_ms))}`;
+const memberCells = (m, medium, part) => {
+  const [icon, word, kind] = SEEN[m.seen] || ["", "", "quiet"], placed = m.place != null, others = (medium.members || []).filter((robot) => robot !== m.robot), deaf = others.filter((robot) => !m.hears?.includes(robot));
+  const state = [m.robot === medium.reference && placed ? "reference" : "", m.here ? "this robot" : "", m.missed ? `missed ${m.missed} rounds` : word].filter(Boolean).join(", ");
+  return [m.robot, (cell) => { set(cell, `${icon} ${state}`.trim()); mark(cell, "class", kind); }, placed ? tenths(m.planned_ms) : "–", placed && m.seen !== "not" ? off(m) : "–", placed ? ms(m.jitter_ms) : "–", m.here || !m.awaited ? "–" : `${m.lost} of ${m.awaited}`,
+    !placed || m.seen === "not" ? "–" : !others.length ? "no other" : deaf.length ? `not ${list(deaf)}` : "all", part];
+};
+const ringOf = () => {
+  const drawing = el("svg", { class: "ring", viewBox: "0 20 480 360", role: "img" }), caption = el("figcaption");
+  let drawn = "";
+  return [el("figure", {}, drawing, caption), (medium, own) => {
+    const told = JSON.stringify([medium, own]);
+    if (told === drawn) return;
+    drawn = told;
+    const at_ = (turn, radius) => [240 + radius * Math.sin(2 * Math.PI * turn), 200 - radius * Math.cos(2 * Math.PI * turn)].map((one) => one.toFixed(1));
+    const line = (kind, from, to) => el("line", { class: kind, x1: from[0], y1: from[1], x2: to[0], y2: to[1] }), count = own.length, turns = new Map(own.map((m) => [m.robot, m.place / count]));
+    const text = (kind, [x, y], said, anchor = "middle") => el("text", { class: kind, x, y, "text-anchor": anchor, "dominant-baseline": "middle" }, said), parts = [el("circle", { class: "band", cx: 240, cy: 200, r: 130 })];
+    for (const [listener, speaker] of medium.deaf || []) if (turns.has(listener) && turns.has(speaker)) parts.push(line("deaf", at_(turns.get(listener), 112), at_(turns.get(speaker), 112)));
+    for (const m of own) {
+      const turn = m.place / count, came = turn + m.offset_ms / medium.period_ms, side = Math.sin(2 * Math.PI * turn), [x, y] = at_(came, 130), missed = m.seen === "remove" || m.seen === "not";
+      parts.push(line("planned", at_(turn, 112), at_(turn, 150)));
+      if (missed) parts.push(text("bad", at_(turn, 130), "✕"));
+      else parts.push(Math.abs(m.offset_ms) > OFF_MS ? el("path", { class: "warn", d: `M${x} ${+y - 8}l8 14h-16z` }) : el("circle", { class: m.here ? "came own" : "came", cx: x, cy: y, r: 7 }));
+      if (count <= 24 || m.here || m.robot === medium.reference) parts.push(text(m.here ? "here" : null, at_(turn, 164), m.robot.length > 14 ? `${m.robot.slice(0, 13)}…` : m.robot, side > 0.2 ? "start" : side < -0.2 ? "end" : "middle"));
+    }
+    parts.push(text("large", [240, 190], tenths(medium.round_ms)), text(null, [240, 214], `K = ${medium.count}`));
+    drawing.replaceChildren(...parts);
+    mark(drawing, "aria-label", `The round of ${medium.link}, ${tenths(medium.round_ms)}, begins at ${medium.reference}: ${own.map((m) => `${m.robot} at ${tenths(m.planned_ms)}, ${m.seen === "remove" || m.seen === "not" ? "missed" : `came ${off(m)}`}`).join("; ")}`);
+    set(caption, `One round, clockwise from the reference. A line: its slot begins; ● its frame, ▲ more than ${ms(OFF_MS)} beside the line, ✕ none. Dashed: one does not hear the other.`);
+  }];
+};
 const ordersView = () => {
   const all = tableOf(["Number", "At", "User", "Order", "State", "Result"]);
   return { key: "", node: [el("h2", {}, "Orders on this page"), all.node], update() {
@@ -369,12 +440,12 @@ const confirmOrder = async (name, verb) => {
 };
 
 // --- Where we are, and the connection ---------------------------------------------------------------------------------------------
-const VIEWS = { component: componentView, robot: robotView, task: taskView, driver: driverView, item: itemView };
+const VIEWS = { component: componentView, robot: robotView, task: taskView, driver: driverView, item: itemView, medium: radioView };
 const show = () => {
   const [, kind, name] = location.hash.split("/"), told = decodeURIComponent(name || "");
-  view = kind === "board" ? boardView() : kind === "orders" ? ordersView() : VIEWS[kind] && told ? VIEWS[kind](told) : teamView();
+  view = kind === "board" ? boardView() : kind === "radio" ? radioView("") : kind === "orders" ? ordersView() : VIEWS[kind] && told ? VIEWS[kind](told) : teamView();
   at("main").replaceChildren(...view.node);
-  const current = kind === "item" ? "board" : ["board", "orders"].includes(kind) ? kind : "";
+  const current = { item: "board", medium: "radio" }[kind] || (["board", "radio", "orders"].includes(kind) ? kind : "");
   for (const one of at("views").children) one.hash.slice(2) === current ? mark(one, "aria-current", "page") : one.removeAttribute("aria-current");
   look(); draw();
 };

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from failover.boards.board import Board
+from failover.cli.demo.robots import Pace
 from failover.config.page import hashed
-from tests.e2e import pages, robots
+from tests.e2e import bridged, pages, robots
 from tests.e2e import test_board as boards
 from tests.e2e.pages import COUNT, Served, served
 from tests.e2e.robots import RobotMachine, until
@@ -38,6 +39,7 @@ TEAM = "lab" if PICTURES else boards.TEAM
 NAME = f"/{TEAM}/robot1/count"
 LEDGER = "Lab/robot1/Ledger"
 ORDERS = 200
+T_TUP_MS = 50
 
 DRIVER = f"""
 import sys
@@ -264,6 +266,7 @@ VIEWS = (
     "#/robot/robot2",
     "#/board",
     "#/item/robot1%2Falarm",
+    "#/radio",
     "#/orders",
     f"#/driver/{LEDGER.replace('/', '%2F')}",
 )
@@ -340,6 +343,48 @@ def test_simulated_robots_stand_in_a_branch_of_their_own_which_a_person_opens(
         finally:
             simulation.terminate()
             simulation.wait(pages.PATIENCE_S)
+
+
+# --- A radio ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not robots.has_cable(), reason="needs network namespaces: run as root")
+def test_the_ring_of_slots_shows_who_speaks_when_and_closes_over_a_robot_that_is_gone(browser: Browser, tmp_path: Path) -> None:
+    count = 4 if PICTURES else 3
+    settings = f"[media.{bridged.CABLE}]\nslots = true\n"
+    with (
+        bridged.on_one_switch(tmp_path, count, settings, pace=Pace(20, 400)) as stage,
+        served(stage.robots[1], tmp_path / "page") as page,
+        context_of(browser) as context,
+    ):
+        window = context.new_page()
+        window.goto(f"{page.url}#/radio")
+        names = [robot.name for robot in stage.robots]
+        ring(window, names).wait_for()
+        row(window, "robot1", "reference").wait_for()
+        row(window, "robot2", "this robot").wait_for()
+        row(window, "robot3", "in its slot", "all", r"\d+ %").wait_for()
+        window.get_by_role("img", name=re.compile(f"^Robots in the round: now {count}")).wait_for()
+        window.evaluate(CHECKS)
+        assert window.evaluate("mistakes()") == []
+        window.set_viewport_size({"width": 1180, "height": 960})
+        picture(window, "radio")
+        stage.robots[-1].cut_power()
+        ring(window, names[:-1]).wait_for()
+        window.get_by_role("img", name=re.compile(f"^Robots in the round: now {count - 1}, at most {count}")).wait_for()
+        assert not row(window, names[-1], "in its slot").count()
+
+
+def ring(window: Page, names: list[str]) -> Any:
+    """The drawing of a round that just these share, each with its instant, as a screen reader tells it."""
+    begins = [f"{name} at {place * T_TUP_MS / len(names):.1f} ms" for place, name in enumerate(names)]
+    told = "; ".join(f"{re.escape(one)}, (missed|came [^;]*)" for one in begins)
+    return window.get_by_role("img", name=re.compile(f"^The round of {bridged.CABLE}, .* begins at robot1: {told}$"))
+
+
+def row(window: Page, *told: str) -> Any:
+    """A row of a table that says all this, in this order."""
+    return window.get_by_role("row", name=re.compile(".*".join(told)))
 
 
 # --- A takeover ---------------------------------------------------------------------------------------------------------------

@@ -149,12 +149,13 @@ def _medium(view: MediumView) -> dict[str, Any]:
         "by_unicast": list(view.by_unicast),
         "period_ms": view.period_ms,
         "no_slots": view.no_slots,
+        "bytes": dict(view.bytes),
         "slots": _slots(view.slots) if view.slots is not None else None,
     }
 
 
 def _slots(view: SlotsView) -> dict[str, Any]:
-    peers = [{**asdict(peer), "seen": peer.seen.name.lower()} for peer in view.peers]
+    peers = [{**asdict(peer), "seen": peer.seen.name.lower(), "hears": list(peer.hears)} for peer in view.peers]
     return {
         **asdict(view),
         "own": str(view.own),

@@ -45,6 +45,9 @@ WIDE = 2 / 3
 ECHO_ROUNDS = 2
 """Rounds for which a frame is echoed."""
 
+SMOOTHED = 16
+"""Frames over which jitter is smoothed. Source: RFC 3550, 6.4.1."""
+
 
 class Peer(Struct):
     """What is known of one member on this medium.
@@ -55,7 +58,8 @@ class Peer(Struct):
         missed: rounds in a row without a frame; ``waited``: rounds in INSERT.
         since: round in which it became RUN.
         views: what it said it sees, two bits a rank; ``set``: the set it said.
-        delay_ns: how much later than its slot its last frame left.
+        offset_ns: from its slot to its last frame; ``jitter_ns``: by how much that changes from frame to frame, smoothed.
+        awaited: whole rounds in which a frame of it was expected; ``lost``: of these, rounds without one.
     """
 
     rank: int
@@ -71,7 +75,10 @@ class Peer(Struct):
     views: int = 0
     set: int = 0
     set_round: int = 0
-    delay_ns: int = 0
+    offset_ns: int = 0
+    jitter_ns: int = 0
+    awaited: int = 0
+    lost: int = 0
 
     def sees(self, rank: int) -> int:
         """Its view of another one."""
@@ -123,6 +130,7 @@ TABLE: dict[Seen, tuple[tuple[Condition, Seen], ...]] = {
 
 _AWAY = frozenset({Seen.REMOVE, Seen.NOT})
 _COUNTED = frozenset({Seen.RUN, Seen.REMOVE})
+_HEARD = frozenset({Seen.INSERT, Seen.RUN})
 
 
 class Slots:
@@ -143,6 +151,7 @@ class Slots:
         self.round = 0
         self.followed = self.outside = self.ignored = 0
         self.late_ns = self.late_ns_max = 0
+        self._own_offset_ns = self._jitter_ns = 0
         self._t_ns = terms.t_tup_ns
         self._odd: dict[int, tuple[int, int]] = {}
         self._listen(now_ns)
@@ -186,13 +195,36 @@ class Slots:
             if rank == self.me:
                 self.transit.echoed(peer.rank, counter, hold_us, came_ns)
         peer.heard, peer.counter, peer.views, peer.set, peer.set_round = True, frame.counter, views, said.set, said.set_round
-        peer.came_ns, peer.left_ns = came_ns, came_ns - self.transit.likely_ns(peer.rank)
+        before_ns, peer.came_ns, peer.left_ns = peer.left_ns, came_ns, came_ns - self.transit.likely_ns(peer.rank)
+        self._measure(peer, before_ns)
         if self.own is Own.LISTENING:
             self._place_first()
         elif self._lead == self.me:
             self._adapt(peer)
         elif self._lead == peer.rank:
             self._follow(peer)
+
+    def _measure(self, peer: Peer, before_ns: int) -> None:
+        """How far from its slot its frame left: for people, no rule uses it."""
+        if self.own is not Own.LISTENING and self.set >> peer.rank & 1:
+            offset_ns = self._offset_ns(peer.rank, peer.left_ns, before_ns)
+            if peer.awaited:
+                peer.jitter_ns = _smoothed(peer.jitter_ns, offset_ns - peer.offset_ns)
+            peer.offset_ns = offset_ns
+
+    def _offset_ns(self, rank: int, left_ns: int, before_ns: int | None) -> int:
+        """From its planned instant to its frame, within half a round.
+
+        It is counted from the reference's newest frame; of the reference itself, a round after its frame before.
+        """
+        if self._lead == rank:
+            origin_ns = before_ns
+        else:
+            origin_ns = self._sent_ns if self._lead == self.me else self.peers[self._lead].left_ns
+        if not origin_ns or not self.set >> self._lead & 1:
+            return 0
+        half_ns = self._t_ns // 2
+        return (left_ns - origin_ns - self._apart(rank, self._lead) * self._slot_ns() + half_ns) % self._t_ns - half_ns
 
     def _reborn(self, peer: Peer, boot: int) -> None:
         """It began a new life: what it was is void."""
@@ -228,11 +260,11 @@ class Slots:
         sent_ns, slot_ns = self._sent_ns, self._slot_ns()
         if peer.left_ns < sent_ns and self._before_ns is not None:  # it left before our frame and came after it
             sent_ns = self._before_ns
-        peer.delay_ns = peer.left_ns - sent_ns - self._apart(peer.rank, self.me) * slot_ns
-        if self._is_worth(peer.delay_ns, slot_ns):
-            self._delay_ns = max(self._delay_ns, peer.delay_ns)
+        delay_ns = peer.left_ns - sent_ns - self._apart(peer.rank, self.me) * slot_ns
+        if self._is_worth(delay_ns, slot_ns):
+            self._delay_ns = max(self._delay_ns, delay_ns)
             self._next_ns = self._sent_ns + self._t_ns + self._delay_ns
-        elif abs(peer.delay_ns) >= self.terms.epsilon * slot_ns:
+        elif abs(delay_ns) >= self.terms.epsilon * slot_ns:
             self.outside += 1
 
     def _is_worth(self, delay_ns: int, slot_ns: int) -> bool:
@@ -290,6 +322,10 @@ class Slots:
     def sent(self, left_ns: int, counter: int = 0) -> None:
         """Our frame of this number leaves now; to be read right before the send."""
         self.transit.left(counter, left_ns)
+        offset_ns = self._offset_ns(self.me, left_ns, self._sent_ns)
+        if self._sent_ns is not None:
+            self._jitter_ns = _smoothed(self._jitter_ns, offset_ns - self._own_offset_ns)
+        self._own_offset_ns = offset_ns
         self._before_ns, self._sent_ns = self._sent_ns, left_ns
         self._delay_ns = 0
         self._next_ns = left_ns + self._t_ns
@@ -312,12 +348,20 @@ class Slots:
         self._closed_ns = now_ns
         self.round += 1
         running = tuple(peer for peer in self.peers.values() if peer.seen is Seen.RUN)
+        if is_whole:
+            self._count_lost()
         for peer, seen in [(peer, self._moved(peer, running)) for peer in self.peers.values() if peer.heard or is_whole]:
             if seen is not peer.seen:
                 peer.waited, peer.since = 0, self.round
             peer.seen, peer.heard = seen, False
         self._lead = self._leader()
         self._choose_set()
+
+    def _count_lost(self) -> None:
+        for peer in self.peers.values():
+            if peer.seen in _COUNTED:
+                peer.awaited += 1
+                peer.lost += not peer.heard
 
     def _moved(self, peer: Peer, running: tuple[Peer, ...]) -> Seen:
         """The arrow that it takes."""
@@ -396,6 +440,9 @@ class Slots:
             place_in(self.set, self.me) if is_member else None,
             tuple(names[rank] for rank in ranks_in(self.set)),
             names[self._lead],
+            self._round_ns() // US,
+            self._own_offset_ns // US,
+            self._jitter_ns // US,
             self._least_gap_ns() // US,
             self.late_ns // US,
             self.late_ns_max // US,
@@ -407,14 +454,22 @@ class Slots:
         )
 
     def _peer_slot(self, peer: Peer) -> PeerSlot:
-        rank = peer.rank
+        hears = [rank for rank in range(len(self.roster)) if rank != peer.rank and peer.sees(rank) in _HEARD]
         return PeerSlot(
-            self.roster.names[rank],
+            self.roster.names[peer.rank],
             peer.seen,
             peer.missed,
-            peer.delay_ns // US,
-            self.transit.likely_ns(rank) // US,
+            peer.lost,
+            peer.awaited,
+            peer.offset_ns // US,
+            peer.jitter_ns // US,
+            self.transit.likely_ns(peer.rank) // US,
+            tuple(self.roster.names[rank] for rank in hears) if peer.seen is not Seen.NOT else (),
         )
+
+    def _round_ns(self) -> int:
+        """Between our last two frames."""
+        return 0 if self._sent_ns is None or self._before_ns is None else self._sent_ns - self._before_ns
 
     def _least_gap_ns(self) -> int:
         """Between two sends of the last round."""
@@ -436,6 +491,10 @@ class Slots:
             for other in settled
             if one is not other and one.sees(other.rank) == Seen.NOT
         ]
+
+
+def _smoothed(jitter_ns: int, change_ns: int) -> int:
+    return jitter_ns + (abs(change_ns) - jitter_ns) // SMOOTHED
 
 
 def _rank(peer: Peer) -> int:

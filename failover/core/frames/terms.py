@@ -93,15 +93,22 @@ class PeerSlot(Struct, frozen=True):
 
     Attributes:
         missed: rounds in a row in which it was not heard.
-        delay_us: how much later than its slot its last frame left; as the reference measures it.
+        lost: of the ``awaited`` rounds in which a frame of it was expected those in which none came, since the slots began.
+        offset_us: how much later than its slot its last frame left, counted from the reference's newest frame; of the reference,
+            how much longer than T_tup its last round was. ``jitter_us``: the change of that from frame to frame, smoothed.
         transit_us: how long its frames are taken to travel.
+        hears: whom it heard in its last round, as it says.
     """
 
     robot: str
     seen: Seen
     missed: int
-    delay_us: int
+    lost: int
+    awaited: int
+    offset_us: int
+    jitter_us: int
     transit_us: int
+    hears: tuple[str, ...]
 
 
 class SlotsView(Struct, frozen=True):
@@ -111,6 +118,8 @@ class SlotsView(Struct, frozen=True):
         why: what keeps it silent, "" otherwise.
         count: K, the robots that share the round; ``place``: among them, from 0, None outside.
         reference: whose frames give the phase; this robot's own name if it gives it.
+        round_us: between this robot's last two frames, 0 before the second.
+        offset_us, jitter_us: of this robot's own frames, as of a peer's.
         least_gap_us: between two sends of the last round, 0 if fewer than two robots are heard.
         late_us: how much later than due the last frame left, by this robot's own fault; ``late_us_max``: the most ever.
         followed: rounds that this robot as the reference stretched; ``outside``: delays that it did not follow.
@@ -125,6 +134,9 @@ class SlotsView(Struct, frozen=True):
     place: int | None
     members: tuple[str, ...]
     reference: str
+    round_us: int
+    offset_us: int
+    jitter_us: int
     least_gap_us: int
     late_us: int
     late_us_max: int

@@ -137,12 +137,25 @@ def test_the_round_of_a_member_is_that_of_the_fastest_link_over_which_it_is_hear
     now_ns = 10 * HEARD_NS
     longest_ns = effective_round_ns(ROUND_NS, 3)
     assert longest_ns > ROUND_NS
-    both.heard("robot2", "radio0", now_ns)
-    both.heard("robot3", "radio0", now_ns)
-    both.heard("robot3", "cable0", now_ns - HEARD_NS // 2)
+    both.heard("robot2", "radio0", 100, now_ns)
+    both.heard("robot3", "radio0", 100, now_ns)
+    both.heard("robot3", "cable0", 100, now_ns - HEARD_NS // 2)
     assert [both.round_of(peer, now_ns) for peer in ("robot2", "robot3")] == [longest_ns, 20_000_000]
     assert both.round_of("robot3", now_ns + HEARD_NS // 2) == longest_ns
     assert both.round_of("robot3", now_ns + 2 * HEARD_NS) == both.round_ns == 20_000_000
+
+
+def test_the_bytes_of_each_member_and_of_this_robot_are_counted_by_link(media: Make) -> None:
+    both = media("radio0", "cable0", slots=())
+    now_ns = clock.now_ns()
+    for size in (300, 200):
+        both.heard("robot2", "radio0", size, now_ns)
+    both.heard("robot3", "cable0", 70, now_ns)
+    both.heard("robot3", "gone0", 70, now_ns)
+    both.send(None, (), now_ns, 1)
+    radio, cable = (view.bytes for view in both.views())
+    sent = sum(len(datagram) for sealed in both._lanes.lane(0).seal(None, (), now_ns)[0] for datagram in sealed.datagrams)
+    assert sent and radio == {"robot2": 500, "robot1": 2 * sent} and cable == {"robot3": 70, "robot1": 2 * sent}
 
 
 def test_what_the_kernel_refused_is_tried_again_after_a_minute(media: Make, monkeypatch: pytest.MonkeyPatch) -> None:

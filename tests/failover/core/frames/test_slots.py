@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from failover.core.frames.roster import pack_seen, roster, word
-from failover.core.frames.slots import Slots
-from failover.core.frames.terms import Own, Said, Seen, SlotView, Terms
+from failover.core.frames.slots import SMOOTHED, Slots
+from failover.core.frames.terms import US, Own, Said, Seen, SlotView, Terms
 from failover.core.types import MS
 
 TEAM = roster(f"robot{number}" for number in range(1, 7))
@@ -105,7 +105,7 @@ def test_the_reference_follows_delays_between_delta_min_and_two_thirds_of_a_slot
     bench.hears(2, sent_ns + T_NS // 2 + delay_us * 1_000)
     assert bench.slots.next_ns() == sent_ns + T_NS + followed_us * 1_000
     assert bench.slots.view().outside == (delay_us == 8_334)
-    assert bench.slots.view().peers[1].delay_us == delay_us
+    assert bench.slots.view().peers[1].offset_us == delay_us
 
 
 def test_the_reference_follows_the_longest_delay_of_a_round() -> None:
@@ -123,7 +123,7 @@ def test_a_frame_that_left_before_ours_and_came_after_it_counts_from_the_round_b
     bench = Bench(0, {0, 1, 2, 3})
     sent_ns = bench.settled()
     bench.hears(3, sent_ns - 1 * MS)
-    assert bench.slots.view().peers[2].delay_us == pytest.approx(50_000 - 1_000 - 37_500)
+    assert bench.slots.view().peers[2].offset_us == pytest.approx(50_000 - 1_000 - 37_500)
 
 
 def test_the_reference_follows_nobody_outside_its_set() -> None:
@@ -182,6 +182,65 @@ def test_all_change_the_count_at_one_frame_of_the_reference() -> None:
     bench.hears(0, phase_ns + T_NS, set=word({0, 2, 3}), set_round=9)
     assert bench.slots.next_ns() == phase_ns + T_NS + 2 * (T_NS // 3)
     assert (bench.slots.set_round, bench.slots.view().place) == (9, 2)
+
+
+# --- What people see ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("me", "rank"), [(0, 2), (1, 3), (3, 1)])
+def test_a_frame_is_measured_against_its_slot_by_the_reference_and_by_followers(me: int, rank: int) -> None:
+    bench = Bench(me, {0, 1, 2, 3})
+    phase_ns = bench.settled()
+    peer = bench.slots.peers[rank]
+    assert abs(peer.offset_ns) < US and abs(peer.jitter_ns) < US
+    if me != 0:
+        phase_ns += T_NS
+        bench.hears(0, phase_ns)
+    bench.hears(rank, phase_ns + rank * T_NS // 4 + 3 * MS)
+    (seen,) = (one for one in bench.slots.view().peers if one.robot == TEAM.names[rank])
+    assert seen.offset_us in (2_999, 3_000) and seen.jitter_us == 3_000 // SMOOTHED
+
+
+def test_of_the_reference_the_offset_is_how_much_its_round_was_stretched_and_others_count_from_it() -> None:
+    bench = Bench(2, {0, 1, 2, 3})
+    phase_ns = bench.settled()
+    bench.hears(0, phase_ns + T_NS + 4 * MS)
+    bench.hears(1, phase_ns + T_NS + 4 * MS + T_NS // 4)
+    first, second = bench.slots.view().peers[:2]
+    assert (first.offset_us, second.offset_us) == (4_000, 0)
+    bench.until(phase_ns + 2 * T_NS)
+    view = bench.slots.view()
+    assert (view.round_us, view.offset_us) == (54_000, 0), "it follows, and so is in its slot"
+
+
+def test_the_reference_tells_how_long_its_round_was() -> None:
+    bench = Bench(0, {0, 1, 2, 3})
+    sent_ns = bench.settled()
+    bench.hears(1, sent_ns + T_NS // 4 + 5 * MS)
+    bench.until(sent_ns + T_NS + 6 * MS)
+    view = bench.slots.view()
+    assert (view.round_us, view.offset_us, view.reference) == (55_000, 5_000, "robot1")
+
+
+def test_frames_that_do_not_come_are_counted_of_those_that_were_awaited() -> None:
+    bench = Bench(0, {0, 1, 2})
+    sent_ns = bench.settled(rounds=8)
+    before = {rank: (peer.awaited, peer.lost) for rank, peer in bench.slots.peers.items()}
+    assert all(lost == 0 and awaited > 3 for awaited, lost in (before[1], before[2])) and before[4] == (0, 0)
+    for number in range(2):
+        bench.hears(1, sent_ns + number * T_NS + T_NS // 3)
+    bench.until(sent_ns + 2 * T_NS + 1)
+    peers = bench.slots.view().peers
+    assert [(one.awaited - before[rank][0], one.lost) for rank, one in enumerate(peers[:2], 1)] == [(2, 0), (2, 2)]
+
+
+def test_whom_a_member_hears_is_what_it_says() -> None:
+    bench = Bench(0, {0, 1, 2, 3})
+    sent_ns = bench.settled()
+    views = pack_seen([Seen.RUN, Seen.RUN, Seen.REMOVE, Seen.INSERT, Seen.NOT, Seen.NOT])
+    bench.hears(1, sent_ns + T_NS // 4, views=views)
+    peers = bench.slots.view().peers
+    assert peers[0].hears == ("robot1", "robot4") and peers[4].hears == ()
 
 
 # --- Odd frames ------------------------------------------------------------------------------------------------------
