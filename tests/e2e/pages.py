@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import importlib.resources
 import importlib.util
 import json
 import os
@@ -13,12 +14,18 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from failover.cli.demo.robots import RobotMachine
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
 PATIENCE_S = 60.0
 COUNT = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.05)\n"
+
+AXE = "axe_playwright_python"
+"""The package that brings axe-core, which finds what hinders people who cannot see, hear or point."""
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -30,10 +37,19 @@ def why_not() -> str:
 
 
 def browser() -> str:
-    """The browser of this machine; "" if there is none that can be driven."""
-    if importlib.util.find_spec("playwright") is None:
+    """The browser of this machine; "" if there is none that can be driven, or what is tried with it is missing."""
+    if any(importlib.util.find_spec(name) is None for name in ("playwright", AXE)):
         return ""
     return next((path for name in BROWSERS if (path := shutil.which(name))), "")
+
+
+def mistakes(window: Page, *rules: str) -> list[str]:
+    """What axe-core finds wrong with a window as it is now; by these rules only, or by all."""
+    if window.evaluate("typeof axe") == "undefined":
+        window.evaluate((importlib.resources.files(AXE) / "axe.min.js").read_text())
+    options = {"resultTypes": ["violations"]} | ({"runOnly": list(rules)} if rules else {})
+    found = window.evaluate("(options) => axe.run(document, options)", options)["violations"]
+    return [f"{one['id']}: {one['help']}: {node['html'][:120]}" for one in found for node in one["nodes"]]
 
 
 class Served:
