@@ -52,8 +52,8 @@ CALL_S: Final = 10.0
 RESULT_SHOWN: Final = 2_000
 """Characters of what a driver returned."""
 
-WITHOUT_EPOCH: Final = ("start",)
-"""A new beginning has no epoch yet."""
+WITHOUT_EPOCH: Final = ("start", "reserve", "unreserve")
+"""A new beginning has no epoch yet; a reservation is about all of them."""
 
 
 class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -68,7 +68,7 @@ class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     id: Annotated[str, msgspec.Meta(min_length=8, max_length=64, pattern=ONE_LINE)]
-    verb: Literal["handover", "failback", "prefer", "promote", "stop", "start", "release", "call"]
+    verb: Literal["handover", "failback", "prefer", "promote", "stop", "start", "release", "reserve", "unreserve", "call"]
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=300, pattern=ONE_LINE)]
     boot: Annotated[str, msgspec.Meta(max_length=64)]
     to: Annotated[str, msgspec.Meta(max_length=64, pattern=ONE_LINE)] = ""
@@ -221,6 +221,9 @@ class Orders:
             arguments["robot"] = wish.to
         if wish.verb == "promote":
             arguments["sure"] = True
+        if wish.verb == "reserve":
+            asked = wish.body if isinstance(wish.body, dict) else {}
+            arguments |= {"span_ms": asked.get("span_ms"), "why": asked.get("why")}
         return _sentence(wish, await ask_once(self._socket, wish.verb, order.uid, within_s=ORDER_S, **arguments))
 
     async def _call(self, order: Order) -> str:

@@ -114,7 +114,9 @@ def of_component(component: Mapping[str, Any], robots: Sequence[str], may: Answe
     """One component, as its primary tells it where that one answers."""
     word, why = standing(component)
     denied = may.operate.get(str(component["name"]), UNASKED)
-    moving = {name: None if (value := component.get(name)) is None else round(value) for name in MOVING}
+    moving: dict[str, Any] = {name: None if (value := component.get(name)) is None else round(value) for name in MOVING}
+    reserved = component.get("reserved")
+    moving["reserved"] = {part: reserved[part] for part in ("user", "why", "until")} if reserved else None
     orders = {} if component.get("state") is None else _orders(component, robots, denied)
     return {name: component.get(name) for name in SHOWN} | moving | {"word": word, "why": why, "orders": orders}
 
@@ -177,6 +179,15 @@ def _orders(component: Mapping[str, Any], robots: Sequence[str], denied: str) ->
         "start": {
             "says": f"{name} starts from its beginning, if agent.toml of its robot declares it.",
             "why_not": "" if over else f"it has not ended: it is {state}",
+        },
+        "reserve": {
+            "says": f"For so long only you give orders about {name}. A takeover asks nothing.",
+            "asks": ["minutes", "why"],
+            "why_not": "",
+        },
+        "unreserve": {
+            "says": f"Other users may give orders about {name} again.",
+            "why_not": "" if component.get("reserved") else "it is not reserved",
         },
         "release": {
             "says": f"{_fate(runs)} All robots forget the checkpoints of {name}: if {primary or 'its robot'} dies, it is lost.",

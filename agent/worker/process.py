@@ -102,7 +102,9 @@ class Worker(Switchboard):
             sockets, state / "logs", self._process_pool, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
         self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
-        self.connect(Verbs(self, self.gate))
+        verbs = Verbs(self, self.gate)
+        self._reservations = verbs.reservations
+        self.connect(verbs)
         self._alerts: Alerts | None = None
 
     async def prepare(self) -> Inventory:
@@ -134,6 +136,7 @@ class Worker(Switchboard):
         self._task(self._tidy_contents())
         self._task(self._give_back())
         self._task(self._give_signs())
+        self._task(self._reservations.tell_again())
         if self._board_place is not None:
             from agent.worker.kept_items import Keeper  # here: a team without a board does not load it
 

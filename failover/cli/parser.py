@@ -329,6 +329,33 @@ VERBS: Final = (
         "failover.cli.verbs.components:prefer",
     ),
     Verb(
+        "reserve",
+        "for a time, let no other user give orders about a component, or about all below a path",
+        """
+        Orders of other users are refused with one sentence, which says who has reserved it, until when and why: handover,
+        failback, prefer, promote, release, start, stop; run and protect under such a name; drain of a robot that runs it. A
+        takeover is no order, and asks nothing. A reservation ends by itself. To prolong it, reserve again. A user who may give
+        orders about it may reserve it. Give this order at any robot.
+
+          failover reserve mapper --for 10min --why calibration
+          failover reserve /lab/robot1 --for 2h --why "new wheels"
+        """,
+        "failover.cli.arguments.components:reserve",
+        "failover.cli.verbs.components:reserve",
+    ),
+    Verb(
+        "unreserve",
+        "end a reservation before its time",
+        """
+        The user who has reserved it may. With --break root may, too, and each user to whom rights.toml gives grant there.
+
+          failover unreserve mapper
+          failover unreserve /lab/robot1 --break
+        """,
+        "failover.cli.arguments.components:unreserve",
+        "failover.cli.verbs.components:unreserve",
+    ),
+    Verb(
         "drain",
         "before maintenance: move everything away from a robot, and let nothing new run there",
         """

@@ -35,6 +35,9 @@ verb           arguments                                                result, 
 ``failback``   ``name`` *must*, ``to`` "": the target expected          as ``handover``
 ``prefer``     ``name`` *must*, ``robot`` *must*                        ``{name, robot}``
 ``drain``      ``robot`` *must*, ``on`` true                            ``{robot, drained, sentence}``; for root
+``reserve``    ``name`` *must*: a component, or a path above,           ``{path, left_ms, sentence, untold}``: robots that did not
+               ``span_ms`` *must*: 4 h at most, ``why`` ""              answer, and hear it later
+``unreserve``  ``name`` *must*, ``breaks`` false: also another user's   ``{path, user, sentence, untold}``
 ``team``       ``act`` *must*: add, remove or rotate, ``robot``         ``{team, robots, change, waiting}``: members that take it
                *must* ("": this one), ``member``: {beats, bulk, role,   when they are back; of rotate also ``robot public_key``;
                public_key}                                              for root
@@ -77,6 +80,7 @@ descriptors: {main_loop, worker}: open descriptors of the agent's processes
 healthy: nothing is degraded, nothing has failed, no robot is silent, as far as this robot knows; with ``team`` as far as any
     robot that answered knows, which is what the exit status of ``failover status`` says, too (`failover.client.health`)
 notes: [sentence, …]: what is missing or degraded on this robot
+reservations: [{path, user, why, left_ms, until}]: what users have reserved; until: seconds since 1970 by this robot's calendar
 beats: {sent, heard, unsent, refused, late_us_max, gap_us_max, gaps, items}: of this life; refused: {reason: count}
     items: {reason: count} of the board's values that other robots did not get, or got a round later
 links: [{name, medium, because, carrier, addresses, snapshots, bytes_in, bytes_out}]: interfaces with an address of this robot
@@ -104,8 +108,8 @@ peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others s
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
-    restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, arriving, reasons,
-    output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
+    restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reserved, arriving,
+    reasons, output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
         tasks of the schedule: its captures, and those of them that delayed an activation; of the newest: the longest time between
@@ -120,6 +124,7 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     ready_copy: {ready, wanted, size, position: {generation, sequence}, why}: of that process, at this robot, where it stands by:
         bytes of memory that it takes, or why there is none; wanted: ready_copy of agent.toml; None elsewhere
     owner: uid of the user who may give orders about it and read its output, besides root
+    reserved: {path, user, why, left_ms, until}: the reservation in which it is, as above; None: no user has reserved it
     promise: what holds for it; promise_differs: from the team's, by what was chosen for it, or because a server stands by
     kept: {checkpoints, older, size, newest_age_s, oldest_age_s} of this robot's store: positions to which the team may go back,
         further whole ones that are kept for people, bytes of all; None where it has nothing
@@ -168,6 +173,7 @@ REQUEST_LIMIT: Final = 4 << 20
 
 ON_BEHALF: Final = frozenset(
     ("ping", "status", "why", "may", "logs", "start", "stop", "release", "handover", "failback", "prefer", "promote")
+    + ("reserve", "unreserve")
 )
 """What one user's process may ask for another user: nothing that starts a program or takes a process in."""
 

@@ -192,7 +192,7 @@ const chart = (key, which, label, unit) => {
 const section = (title, ...children) => el("section", {}, el("h3", {}, title), ...children);
 const notes = () => { const node = el("ul"); return [node, (values) => { const told = values.filter(Boolean); if (node.dataset.told !== told.join("\n")) { node.dataset.told = told.join("\n"); node.replaceChildren(...told.map((one) => el("li", {}, one))); } node.hidden = !told.length; }]; };
 
-const LABELS = { handover: "Hand over…", failback: "Fail back…", prefer: "Prefer a robot…", promote: "Promote…", stop: "Stop…", start: "Start…", release: "Release…" };
+const LABELS = { handover: "Hand over…", failback: "Fail back…", prefer: "Prefer a robot…", promote: "Promote…", stop: "Stop…", start: "Start…", reserve: "Reserve…", unreserve: "End reservation…", release: "Release…" };
 const componentView = (name) => {
   const key = `component:${name}`, [head, setHead] = heading(), [list_, setFacts] = facts(), [notes_, setNotes] = notes(), promise = el("p");
   const [lag, drawLag] = chart(key, 0, "Age of the checkpoint at the standby", ms), [freeze, drawFreeze] = chart(key, 1, "Freeze for a snapshot", ms);
@@ -211,7 +211,7 @@ const componentView = (name) => {
     setFacts([["Runs at", one.primary], ["Stands by", one.standby ? `${one.standby}${one.ready || one.warm ? ", ready" : ""}` : "no robot"], ["State", one.state], ["Epoch", one.epoch],
       ["Newest checkpoint", one.generation == null ? null : `${one.generation}.${one.sequence}, ${ms(one.lag_ms)} old`], ["Freeze", one.engine === "cooperative" ? "never" : one.freeze_us == null ? null : `${ms(one.freeze_us / 1000)}, at most ${ms(one.freeze_us_max / 1000)}`],
       ["Snapshot", one.snapshot_size == null ? null : `${size(one.snapshot_size)} every ${one.period_ms} ms`], ["Started at; prefers", [one.home, one.prefer].filter(Boolean).join("; ")],
-      ["Last takeover", one.outage_ms == null ? null : `stood still for ${ms(one.outage_ms)}`], ["Kept here", one.kept ? `${one.kept.checkpoints} checkpoints, ${size(one.kept.size)}` : null], ["Exit status", one.exit_status]]);
+      ["Last takeover", one.outage_ms == null ? null : `stood still for ${ms(one.outage_ms)}`], ["Kept here", one.kept ? `${one.kept.checkpoints} checkpoints, ${size(one.kept.size)}` : null], ["Reserved", one.reserved && `by ${one.reserved.user} until ${clock(new Date(one.reserved.until * 1000))}${one.reserved.why ? `: ${one.reserved.why}` : ""}`], ["Exit status", one.exit_status]]);
     setNotes([...(one.lacks || []), ...(one.notes || [])]);
     for (const [verb, button] of Object.entries(made)) { const order = one.orders?.[verb]; mark(button, "aria-disabled", String(!order || !!order.why_not)); mark(button, "title", order?.why_not || order?.says || ""); button.hidden = !order; }
     drawLag(); drawFreeze();
@@ -422,6 +422,8 @@ const confirmOrder = async (name, verb) => {
   const key = `component:${name}`, seen = table.get(key), order = seen.orders[verb], box = at("dialog");
   const to = order.to ? el("select", {}, ...order.to.map((robot) => el("option", { value: robot }, robot || "the one with the newest checkpoint"))) : null;
   let robot = order.target || "";
+  const minutes = order.asks && el("input", { type: "number", min: 1, max: 240, value: 10, required: true }), why = order.asks && el("input", { type: "text", maxlength: 120, required: true });
+  const body = () => minutes ? { body: { span_ms: 60000 * minutes.value, why: why.value } } : {};
   const [risks_, setRisks] = notes(), changed = el("p", { class: "warn", role: "status" }), act = el("button", { type: "submit", class: "main" }, LABELS[verb].replace("…", ""));
   const ask = async () => {   // what is at risk depends on the robot, so the order names the one of which it was told
     if (verb !== "promote") return;
@@ -433,9 +435,9 @@ const confirmOrder = async (name, verb) => {
     setRisks([said.error || said.sentence, ...(said.risks || [])]);
   };
   to?.addEventListener("change", ask);
-  box.replaceChildren(el("form", { onsubmit: (event) => { event.preventDefault(); box.close(); give({ verb, name, to: verb === "promote" ? robot : to ? to.value : robot, epoch: seen.epoch || 0 }); } },
-    el("h2", { id: "asked" }, `${LABELS[verb].replace("…", "")}: ${name}`), el("p", {}, order.says), risks_, to && el("label", {}, "Robot", to), changed, el("div", { class: "buttons" }, act, el("button", { type: "button", onclick: () => box.close() }, "Cancel"))));
-  setRisks([]); box.showModal(); (to || act).focus(); ask();
+  box.replaceChildren(el("form", { onsubmit: (event) => { event.preventDefault(); box.close(); give({ verb, name, to: verb === "promote" ? robot : to ? to.value : robot, epoch: seen.epoch || 0, ...body() }); } },
+    el("h2", { id: "asked" }, `${LABELS[verb].replace("…", "")}: ${name}`), el("p", {}, order.says), risks_, to && el("label", {}, "Robot", to), minutes && el("label", {}, "Minutes", minutes), why && el("label", {}, "Why", why), changed, el("div", { class: "buttons" }, act, el("button", { type: "button", onclick: () => box.close() }, "Cancel"))));
+  setRisks([]); box.showModal(); (to || minutes || act).focus(); ask();
   const watch = setInterval(() => { const now = table.get(key); if (!box.open) clearInterval(watch); else if (now?.epoch !== seen.epoch) set(changed, `It has changed meanwhile: epoch ${seen.epoch} → ${now?.epoch}, it runs at ${now?.primary}. This order will be refused; cancel, and look again.`); }, 200);
 };
 

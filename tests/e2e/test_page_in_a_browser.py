@@ -72,6 +72,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
     with pytest.MonkeyPatch.context() as patched, two_with_boards(tmp_path_factory.mktemp("pair"), patched, name=TEAM) as both:
+        patched.undo()  # other teams have no such board
         robots.run(both[0], "count", "/usr/bin/env", "python3", "-c", COUNT)
         robots.until_protected(both[0])
         yield both
@@ -200,6 +201,23 @@ def test_an_order_on_what_another_user_has_moved_meanwhile_is_refused_with_what_
         ben.get_by_role("log").get_by_text("has changed since this order was decided").wait_for()
         assert robots.component(pair[1], "count")["role"] == "primary"
         anna.get_by_role("definition").filter(has_text=re.compile("^robot2$")).first.wait_for()
+
+
+def test_a_user_reserves_a_component_and_ends_that(browser: Browser, page_of_two: Served) -> None:
+    """What it refuses to others is for `test_reservations`: here both users are one for the agent."""
+    with context_of(browser) as context:
+        window = logged_in(context, page_of_two, "anna")
+        item(window, r"^count, protected").click()
+        window.get_by_role("button", name="Reserve…").click()
+        window.get_by_label("Minutes").fill("20")
+        window.get_by_label("Why").fill("new wheels")
+        assert mistakes(window) == []
+        window.keyboard.press("Enter")
+        window.get_by_role("log").get_by_text("is reserved by").wait_for()
+        window.get_by_role("definition").filter(has_text=re.compile("^by .* until .*: new wheels$")).wait_for()
+        window.get_by_role("button", name="End reservation…").click()
+        window.get_by_role("dialog").get_by_role("button", name="End reservation").click()
+        window.get_by_role("log").get_by_text("is free again").wait_for()
 
 
 # --- One user, by the keyboard, with nothing from elsewhere ------------------------------------------------------------------

@@ -72,6 +72,17 @@ def test_orders_that_make_no_sense_now_say_why() -> None:
     assert alone["handover"]["why_not"] == "no other robot is heard"
 
 
+def test_who_has_reserved_a_component_is_told_and_ends_it() -> None:
+    free = of_component(component(), ROBOTS, ALL)
+    assert free["reserved"] is None and free["orders"]["unreserve"]["why_not"] == "it is not reserved"
+    reserved = {"path": NAME, "user": "anna", "why": "new wheels", "until": 1_800_000_000, "left_ms": 77}
+    held = of_component(component(reserved=reserved), ROBOTS, ALL)
+    assert held["reserved"] == {"user": "anna", "why": "new wheels", "until": 1_800_000_000}, (
+        "no figure that changes at each look"
+    )
+    assert held["orders"]["unreserve"]["why_not"] == "" and held["orders"]["reserve"]["asks"] == ["minutes", "why"]
+
+
 def test_a_confirmation_names_how_long_it_stands_still_and_what_is_lost() -> None:
     says = of_component(component(), ROBOTS, ALL)["orders"]["handover"]["says"]
     assert "2 ms" in says and "no work is lost" in says and "connections" in says

@@ -91,6 +91,21 @@ class RunArguments(msgspec.Struct, forbid_unknown_fields=True):
     shared_memory: SharedMemory = ""
 
 
+class ReserveArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``reserve``."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=PATH_SIZE_MAX)]
+    span_ms: Annotated[int, msgspec.Meta(ge=1)]
+    why: str = ""
+
+
+class UnreserveArguments(msgspec.Struct, forbid_unknown_fields=True):
+    """Of ``unreserve``; ``breaks``: also another user's."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=PATH_SIZE_MAX)]
+    breaks: bool = False
+
+
 class RightsArguments(msgspec.Struct, forbid_unknown_fields=True):
     """Of ``rights``."""
 

@@ -26,6 +26,7 @@ from agent.worker.control.arguments import (
     WhyArguments,
     arguments_of,
 )
+from agent.worker.control.reservations import Reservations
 from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.control.status_view import version
@@ -43,7 +44,10 @@ SIGHT_PATIENCE_S: Final = 2.0
 LIVING: Final = ("live", "suspect")
 """States of peers that are asked: on a busy machine three beats may be late at any time."""
 
-WORK: Final = ("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "start", "stop", "drain")
+WORK: Final = (
+    *("run", "protect", "logs", "handover", "failback", "prefer", "promote", "release", "start", "stop", "drain"),
+    *("reserve", "unreserve"),
+)
 """What takes a program, its output, or a word that others obey."""
 
 DECISIONS_AT_ONCE: Final = 50
@@ -89,6 +93,7 @@ class Questions:
         self._lines = lines
         self._gate = gate
         self.telling = Telling(lines)
+        self.reservations: Reservations | None = None
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -164,7 +169,7 @@ class Questions:
 
     async def joined(self, robots: Collection[str] | None) -> dict[str, Any]:
         """This robot's picture, with what others say: of these robots those that live and answer; None: of all."""
-        mine = self._lines.picture(await self._lines.ask("status"))
+        mine = await self._picture()
         for component in mine["components"]:
             component["elsewhere"] = {}
         if robots is not None and not robots:
@@ -243,21 +248,30 @@ class Questions:
                     found[path] = "" if answer else answer.because
                 else:
                     found[path] = refusal_without_rules(uid, right, path, owners)
+                if right == "operate" and not found[path] and self.reservations is not None:
+                    found[path] = self.reservations.refusal(uid, path)
         return {"robot": self._lines.settings.config.robot, "team": self._lines.settings.team.team, "answers": answers}
 
     async def standing(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """How one component stands on this robot; empty where it is unknown."""
         return await self._view(arguments_of(NameArguments, "standing", arguments).name)
 
+    async def _picture(self) -> dict[str, Any]:
+        """What this robot itself sees."""
+        found = self._lines.picture(await self._lines.ask("status"))
+        if self.reservations is not None:
+            self.reservations.show(found)
+        return found
+
     async def picture(self, _arguments: dict[str, Any], _by: int) -> dict[str, Any]:
         """All of this robot's own sight, for another robot's status."""
-        return self._lines.picture(await self._lines.ask("status"))
+        return await self._picture()
 
     # --- what verbs share ---
 
     async def _view(self, name: str) -> dict[str, Any]:
         """The component's part of the picture; empty when it is unknown."""
-        picture = self._lines.picture(await self._lines.ask("status"))
+        picture = await self._picture()
         return next((one for one in picture["components"] if one["name"] == name), {})
 
     async def _names(self) -> dict[str, State]:

@@ -41,6 +41,8 @@ RIGHT_OF: Final = {
     "release": "operate",
     "start": "operate",
     "stop": "operate",
+    "reserve": "operate",
+    "unreserve": "see",
 }
 """Verb of the control socket → right that it needs."""
 

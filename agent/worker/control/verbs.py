@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -27,13 +28,16 @@ from agent.worker.control.arguments import (
     PreferArguments,
     PromoteArguments,
     ProtectArguments,
+    ReserveArguments,
     RunArguments,
     StopArguments,
+    UnreserveArguments,
     arguments_of,
 )
 from agent.worker.control.output_relay import OutputRelay, Passage
 from agent.worker.control.queries import Lines, Questions, named_after
 from agent.worker.control.quotas import check_components
+from agent.worker.control.reservations import Reservations, checked_reason
 from agent.worker.control.rights_gate import RIGHT_OF, RightsGate
 from agent.worker.control.server import Conversation, Verb
 from agent.worker.network.remote_orders import Order
@@ -42,6 +46,7 @@ from checkpoint.engine import contradiction
 from checkpoint.program import cpu_baseline
 from checkpoint.snapshot.carried_files import is_carriable
 from failover.core import acts, events
+from failover.core.reservations import SPAN_MS_MAX
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
 from failover.core.wire.names import check_component, weight
 from failover.errors import NameFormatError
@@ -70,6 +75,8 @@ class Verbs(Questions):
         super().__init__(worker, gate)
         self._worker = worker
         self._output_relay = OutputRelay(worker, gate)
+        state = Path(worker.settings.config.state_directory)
+        self.reservations: Reservations = Reservations(state, lambda: worker.errands, self._reachable)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -80,6 +87,8 @@ class Verbs(Questions):
             "logs": self.logs,
             "promote": self.promote,
             "drain": self.drain,
+            "reserve": self.reserve,
+            "unreserve": self.unreserve,
             **{name: functools.partial(self._order, name) for name in self.orders()},
         }
 
@@ -93,6 +102,7 @@ class Verbs(Questions):
             "promoted": promoted,
             "drained": self._drained,
             "lacks": self.lacks,
+            "reservations": self.reservations.hear,
         }
 
     def orders(self) -> dict[str, Order]:
@@ -356,10 +366,43 @@ class Verbs(Questions):
             raise RefusedError(
                 f"cannot drain {settings.config.robot}: only root may, or whom rights.toml lets", "PermissionError"
             )
+        if wanted.on:
+            running = [one["name"] for one in (await self._picture())["components"] if one["role"] == "primary"]
+            self.reservations.check(by, (f"/{settings.team.team}/{settings.config.robot}", *running))
         answer = await self._worker.command(lambda number: events.Drain(number, wanted.on))
         if not answer.ok:
             raise RefusedError(answer.sentence)
         return {"robot": settings.config.robot, "drained": wanted.on, "sentence": answer.sentence}
+
+    async def reserve(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Let no other user give orders about a component, or about all below a path, for a time."""
+        wanted, uid = arguments_of(ReserveArguments, "reserve", arguments), say.caller.uid
+        if wanted.span_ms > SPAN_MS_MAX:
+            raise RefusedError(f"a reservation lasts at most {SPAN_MS_MAX // 60_000} min; reserve again before it ends")
+        why, path = checked_reason(wanted.why), await self._reserved_path(wanted.name)
+        if self._rules() is None:  # else the rules have been asked
+            owner = (await self._view(path)).get("owner")
+            if not may(uid, owner):
+                raise RefusedError(f"cannot reserve {path}: without rights.toml only its owner and root may", "PermissionError")
+        return await self.reservations.begin(path, uid, wanted.span_ms, why)
+
+    async def unreserve(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
+        """End a reservation: one's own, or as whoever may also another user's."""
+        wanted, uid = arguments_of(UnreserveArguments, "unreserve", arguments), say.caller.uid
+
+        async def may_break(path: str) -> str:
+            if may(uid, None):
+                return ""
+            if (gate := self._rules()) is None:
+                return "only its user and root may end it before"
+            answer = gate.decision(await gate.subject(uid, "grant"), "grant", path, None)
+            return "" if answer else answer.because
+
+        return await self.reservations.end(await self._reserved_path(wanted.name), uid, wanted.breaks, may_break)
+
+    async def _reserved_path(self, name: str) -> str:
+        """The component that a person means; of a whole path the path itself, whatever is there."""
+        return name if name.startswith("/") else await self._known(name)
 
     async def _newest_at(self, name: str) -> str:
         """The living robot with the newest checkpoint; this one, or the lesser name, of several."""
@@ -485,12 +528,14 @@ class Verbs(Questions):
         return answer
 
     async def _check_right(self, uid: int, name: str, right: str) -> None:
-        """Raises RefusedError: the rules say no; or, without rules, the component is another user's."""
+        """Raises RefusedError: the rules say no, or another user has reserved it; without rules, it is another user's."""
         owner = (await self._view(name)).get("owner")
         if (gate := self._rules()) is None:
             check_right(uid, name, owner)
         else:
             await gate.check(uid, right, name, owner)
+        if right == "operate":
+            self.reservations.check(uid, [name])
 
     async def _fresh_name(self, wanted: str, command: str, uid: int) -> str:
         """A name for something new: as given, under this robot's own path, or made from the command.
@@ -507,6 +552,7 @@ class Verbs(Questions):
             free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
             wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
         name = wanted if wanted.startswith("/") else own + wanted
+        self.reservations.check(uid, [name])
         check_components(uid, name, known.values(), self._worker.settings.config.components_per_user)
         if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
             check_right(uid, name, known[name].owner)

@@ -1,4 +1,7 @@
-"""run, protect, release, stop, logs, handover, failback, drill, promote, prefer: one component; drain, undrain: a robot's."""
+"""run, protect, release, stop, logs, handover, failback, drill, promote, prefer, reserve, unreserve: one component.
+
+drain, undrain: a robot's.
+"""
 
 from __future__ import annotations
 
@@ -151,6 +154,25 @@ def prefer(room: argparse.ArgumentParser) -> None:
     add_name(room)
     room.add_argument("robot", metavar="ROBOT", help="the robot that should run it whenever it can")
     add_agent(room)
+
+
+def reserve(room: argparse.ArgumentParser) -> None:
+    """Of ``failover reserve``."""
+    _add_reserved(room)
+    room.add_argument("--for", dest="span_ms", metavar="SPAN", type=ago, required=True, help="90s, 10min, 2h; at most 4h")
+    room.add_argument("--why", metavar="TEXT", required=True, help="what others are told, one line")
+    add_agent(room)
+
+
+def unreserve(room: argparse.ArgumentParser) -> None:
+    """Of ``failover unreserve``."""
+    _add_reserved(room)
+    room.add_argument("--break", dest="breaks", action="store_true", help="also where it is another user's")
+    add_agent(room)
+
+
+def _add_reserved(room: argparse.ArgumentParser) -> None:
+    room.add_argument("name", metavar="NAME", help="a component, or a path, /TEAM or /TEAM/ROBOT, for all below it")
 
 
 def drain(room: argparse.ArgumentParser) -> None:

@@ -309,6 +309,24 @@ def prefer(arguments: argparse.Namespace) -> int:
     return _tell(arguments, answer, f"{answer['name']} prefers {answer['robot']}")
 
 
+def reserve(arguments: argparse.Namespace) -> int:
+    """Let no other user give orders about it for a time."""
+    with connect(arguments) as agent:
+        answer = agent.ask("reserve", name=arguments.name, span_ms=arguments.span_ms, why=arguments.why)
+    return _tell(arguments, answer, answer["sentence"] + _untold(answer))
+
+
+def unreserve(arguments: argparse.Namespace) -> int:
+    """End a reservation."""
+    with connect(arguments) as agent:
+        answer = agent.ask("unreserve", name=arguments.name, breaks=arguments.breaks)
+    return _tell(arguments, answer, answer["sentence"] + _untold(answer))
+
+
+def _untold(answer: dict[str, Any]) -> str:
+    return f"; {', '.join(answer['untold'])} will hear of it later" if answer["untold"] else ""
+
+
 def _tell(arguments: argparse.Namespace, answer: dict[str, Any], sentence: str) -> int:
     if arguments.json:
         render.as_json(answer)

@@ -26,6 +26,8 @@ UNDER_AN_AGENT = {
     "drill": ["x"],
     "drain": ["x"],
     "undrain": ["x"],
+    "reserve": ["x", "--for", "10min", "--why", "y"],
+    "unreserve": ["x"],
 }
 FILES = ("missing", "directory", "empty", "junk", "sparse", "/dev/null", "/dev/zero", "/proc/self/mem", "x" * 300, "locked")
 NO_PIDS = ("0", "-1", "me", "99999999999999999999")

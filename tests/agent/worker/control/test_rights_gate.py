@@ -49,7 +49,10 @@ class Robot:
     """What the questions need of the rest: one robot with three components."""
 
     errands = None
-    settings = SimpleNamespace(team=SimpleNamespace(team="lab"), config=SimpleNamespace(robot="robot1", insecure=False))
+    settings = SimpleNamespace(
+        team=SimpleNamespace(team="lab"),
+        config=SimpleNamespace(robot="robot1", state_directory="nowhere", insecure=False),
+    )
 
     async def ask(self, _what: str) -> Any:
         components = [SimpleNamespace(name=one["name"], state=State.PRIMARY, owner=one["owner"]) for one in COMPONENTS]
