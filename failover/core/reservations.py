@@ -115,7 +115,7 @@ class Table:
         own = [one for one in standing if one.uid == wanted.uid and one.path != wanted.path]
         if len(own) >= OF_USER_MAX:
             return f"{wanted.user} has {OF_USER_MAX} reservations already; end one with failover unreserve NAME"
-        if len(self._all) >= RESERVATIONS_MAX:
+        if len(standing) >= RESERVATIONS_MAX:
             return f"this robot knows {RESERVATIONS_MAX} reservations already; wait until one has ended"
         return ""
 
@@ -123,8 +123,19 @@ class Table:
         """Let it stand, in the place of one of the same user at the same path; what has changed. `why_not` was asked."""
         replaced = [one for one in self.standing(now_ns) if (one.uid, one.path) == (wanted.uid, wanted.path)]
         changed = (*(self.end(one) for one in replaced), wanted)
-        self._all[wanted.id] = wanted
+        self._add(wanted, now_ns)
         return changed
+
+    def _add(self, one: Reservation, now_ns: int) -> bool:
+        """Take it in, in a full table in the place of the oldest that is over; whether there was room."""
+        known = self.all(now_ns)
+        if len(known) >= RESERVATIONS_MAX:
+            past = next((each for each in known if each.over), None)
+            if past is None:
+                return False
+            del self._all[past.id]
+        self._all[one.id] = one
+        return True
 
     def end(self, one: Reservation) -> Reservation:
         """It is over; the same, over."""
@@ -139,11 +150,11 @@ class Table:
                 self.end(known)
                 return True
             return False
-        if not told.left_ms or not _is_path(told.path) or len(self.all(now_ns)) >= RESERVATIONS_MAX:
+        if not told.left_ms or not _is_path(told.path):
             return False
         begun_ns, until_ns = now_ns - told.stood_ms * MS, now_ns + told.left_ms * MS
-        self._all[told.id] = Reservation(told.id, told.path, told.uid, told.user, told.why, begun_ns, until_ns, told.over)
-        return True
+        heard = Reservation(told.id, told.path, told.uid, told.user, told.why, begun_ns, until_ns, told.over)
+        return self._add(heard, now_ns)
 
 
 def telling(one: Reservation, now_ns: int) -> Told:

@@ -52,9 +52,11 @@ def refused(asked: RobotMachine, verb: str, /, **arguments: Any) -> str:
     return str(told.value)
 
 
-def test_a_reservation_refuses_the_orders_of_others_at_all_robots_and_no_takeover(pair: Pair) -> None:
+def test_a_reservation_refuses_orders_of_others_at_all_robots_also_at_one_that_was_away_and_no_takeover(pair: Pair) -> None:
     first, second = pair
-    robots.until(lambda: as_alice(first, RUN, first.socket).returncode == 0, "the socket to be the group's, too")
+    robots.until(lambda: alice(first, "ping").get("robot"), "the socket to be the group's, too")
+    begun = as_alice(first, RUN, first.socket)
+    assert begun.returncode == 0, begun.stderr
     robots.until_protected(first, "hers")
     assert "at most 240 min" in alice(first, "reserve", name="hers", span_ms=10**9)["refused"]
     assert "without rights.toml only its owner and root" in alice(first, "reserve", name="/demo/robot2", span_ms=9)["refused"]
@@ -75,10 +77,19 @@ def test_a_reservation_refuses_the_orders_of_others_at_all_robots_and_no_takeove
     assert alice(first, "handover", name="hers")["to"] == "robot2"
     robots.until_protected(second, "hers")
 
+    robots.keep_on(first)
     robots.stop_agent(first)
+    said = robots.failover(second, "reserve", "/demo/robot2", "--for", "1h", "--why", "calibration")
+    assert said.returncode == 0 and "/demo/robot2 is reserved by root until" in said.stdout, said.stderr
+    assert "is reserved by root" in str(alice(second, "run", name="/demo/robot2/x", argv=["/bin/true"], wait=False))
     robots.start_agent(first)
-    robots.until(lambda: robots.answers(first), "the agent to be back")
-    assert first.status()["reservations"], "it outlives an agent"
+    robots.until(lambda: robots.answers(first) and len(first.status()["reservations"]) == 2, "robot1 to hear what it missed")
+    said = robots.failover(second, "unreserve", "/demo/robot2")
+    assert said.returncode == 0 and "free again" in said.stdout
+    assert len(first.status()["reservations"]) == 1, "robot1 has heard of the end"
+    assert "is not reserved" in robots.failover(first, "unreserve", "/demo/robot2").stderr
+    assert "one line of at most 120 characters" in refused(first, "reserve", name="/demo", span_ms=9, why="x" * 121)
+    assert "hers is reserved by uid 7001 until" in robots.failover(first, "status").stdout
 
     second.cut_power()
     robots.until_taken_over(first, "hers")
@@ -88,19 +99,3 @@ def test_a_reservation_refuses_the_orders_of_others_at_all_robots_and_no_takeove
     assert said.returncode == 0 and "root has broken the reservation of uid 7001" in said.stdout
     with Control.open(first.socket) as link:
         link.ask("release", name="hers")
-
-
-def test_a_robot_that_was_away_learns_of_a_reservation(pair: Pair) -> None:
-    first, second = pair
-    robots.keep_on(second)
-    robots.stop_agent(second)
-    said = robots.failover(first, "reserve", "/demo/robot1", "--for", "1h", "--why", "calibration")
-    assert said.returncode == 0 and "/demo/robot1 is reserved by root until" in said.stdout, said.stderr
-    robots.start_agent(second)
-    robots.until(lambda: robots.answers(second) and second.status()["reservations"], "robot2 to hear of it")
-    assert "is reserved by root" in str(alice(second, "run", name="/demo/robot1/x", argv=["/bin/true"], wait=False))
-    said = robots.failover(first, "unreserve", "/demo/robot1")
-    assert said.returncode == 0 and "free again" in said.stdout
-    assert not second.status()["reservations"], "robot2 has heard of its end"
-    assert "is not reserved" in robots.failover(first, "unreserve", "/demo/robot1").stderr
-    assert "one line of at most 120 characters" in refused(first, "reserve", name="/demo", span_ms=9, why="x" * 121)

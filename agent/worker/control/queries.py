@@ -164,6 +164,9 @@ class Questions:
         if team:
             mine["healthy"] = is_healthy(mine)
         mine["components"] = await self._shown(uid, mine["components"])
+        if mine.get("reservations") and (gate := self._rules()) is not None:
+            asker = await gate.subject(uid, "see")
+            mine["reservations"] = [one for one in mine["reservations"] if gate.decision(asker, "see", one["path"], None)]
         mine["rights"] = self._gate.standing() if self._gate is not None else ""
         return mine
 

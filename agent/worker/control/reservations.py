@@ -98,7 +98,6 @@ class Reservations:
             with contextlib.suppress(RightsError):
                 if found := covering(standing, component["name"]):
                     component["reserved"] = _shown(found, now_ns)
-                    component["notes"] = [*component["notes"], _told(found)]
 
     # --- Beginning and end ---------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ Pure: the agent's answer in (see `failover.client.control.STATUS`), rows of text
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
@@ -203,10 +204,17 @@ def details(component: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("resumed from", f"checkpoint {resumed['sequence']} of {resumed['robot']}" if resumed else ""),
         ("last outage", milliseconds(seen["outage_ms"]) if seen.get("outage_ms") is not None else ""),
         ("engine, pid", ", ".join(str(value) for value in (seen.get("engine"), seen.get("pid")) if value)),
+        ("reserved", reserved(component["reserved"]) if component.get("reserved") else ""),
         ("promise", str(seen.get("promise") or "")),
     )
     notes = [("note", line) for line in _remarks_on(component)]
     return [(name, value) for name, value in (*told, *notes) if value]
+
+
+def reserved(one: Mapping[str, Any]) -> str:
+    """By whom, until when by the calendar of the robot that was asked, and why."""
+    until = time.strftime("%H:%M:%S", time.localtime(one["until"]))
+    return f"by {one['user']} until {until}" + (f" ({one['why']})" if one["why"] else "")
 
 
 def ending(wait_status: int) -> str:
@@ -301,6 +309,7 @@ def remarks(status: Mapping[str, Any]) -> tuple[str, ...]:
         found.append("beats were refused: " + ", ".join(f"{reason} ({count})" for reason, count in sorted(forged.items())))
     if status.get("insecure"):
         found.append("links are neither authenticated nor encrypted (insecure = true)")
+    found += [f"{one['path']} is reserved {reserved(one)}" for one in status.get("reservations") or ()]
     return tuple(found) + tuple(status.get("notes") or ())
 
 

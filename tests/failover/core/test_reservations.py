@@ -68,6 +68,17 @@ def test_no_user_reserves_without_end_and_no_table_grows_without_end() -> None:
     full = Table([wanted(f"/lab/x{number}", uid=number) for number in range(RESERVATIONS_MAX)])
     assert "64 reservations" in str(full.why_not(wanted(), NOW_NS))
     assert not full.hear(telling(wanted(), NOW_NS), NOW_NS)
+    full.end(full.standing(NOW_NS)[5])
+    assert full.hear(telling(wanted(), NOW_NS), NOW_NS) and len(full.all(NOW_NS)) == RESERVATIONS_MAX
+
+
+def test_a_user_who_begins_and_ends_again_and_again_shuts_no_other_user_out() -> None:
+    table = Table()
+    for number in range(2 * RESERVATIONS_MAX):
+        table.end(table.begin(wanted(begun_ns=NOW_NS + number), NOW_NS)[-1])
+    assert len(table.all(NOW_NS)) == RESERVATIONS_MAX and table.why_not(wanted("/lab/r2", BEN), NOW_NS) == ""
+    table.begin(wanted("/lab/r2", BEN), NOW_NS)
+    assert table.hinders(ANNA, "/lab/r2", NOW_NS) is not None
 
 
 def test_another_robot_learns_it_with_its_own_clock_and_learns_its_end() -> None:
