@@ -76,6 +76,12 @@ class FrameLanes:
         before = [one for one in self._heard.get(peer, ()) if one != key]
         self._heard[peer] = (*before, key)[-KEYS_PER_SENDER:]
 
+    def forget_older(self, peer: str) -> None:
+        """See `FrameLane.forget_older`."""
+        self._heard[peer] = self._heard.get(peer, ())[-1:]
+        for lane in self._lanes.values():
+            lane.forget_older(peer)
+
     def open(self, datagram: bytes, came_ns: int) -> Heard | Refused:
         """The part inside, or why it is not believed. Never raises for any bytes."""
         medium = int.from_bytes(datagram[_MEDIUM], "little")

@@ -53,6 +53,18 @@ def test_a_frame_under_the_number_of_another_medium_is_no_authentic_one() -> Non
     assert isinstance(moved, Refused) and moved.reason is Reason.FORGED
 
 
+def test_a_peer_whose_older_keys_are_forgotten_is_believed_by_the_newest_on_each_medium() -> None:
+    second = lanes("robot2", "robot1")
+    older, newest = (FrameLanes(lambda medium: FrameLane("robot1", "team", TEAM, 1, 20_000, medium)) for _ in range(2))
+    older.speak("robot2", b"key 2 of robot1 to robot2")
+    newest.speak("robot2", b"key 3 of robot1 to robot2")
+    assert isinstance(second.open(datagram(older, 1), 2_000), Heard)
+    second.forget_older("robot1")
+    assert isinstance(second.open(datagram(older, 1), 2_000), Refused)
+    assert isinstance(second.open(datagram(older, 2), 2_000), Refused), "a lane that is made later"
+    assert isinstance(second.open(datagram(newest, 2), 2_000), Heard)
+
+
 @pytest.mark.parametrize("medium", [b"\0\0", b"\1\0", b"\x09\0", b"\xa5\xff"])
 @pytest.mark.parametrize("begin", [MAGIC_BEFORE + b"\4\0", MAGIC + bytes([VERSION + 1, 0])])
 def test_a_heartbeat_of_another_release_is_told_from_what_is_no_frame_whatever_bytes_it_has(begin: bytes, medium: bytes) -> None:
