@@ -77,10 +77,6 @@ class WriterTakenError(BoardError):
     """Another process writes this item; the message names its pid."""
 
 
-class NotItsWriterError(BoardError):
-    """The item's declaration names the component that writes it, and this program is none of it."""
-
-
 class RecordingError(FailoverError):
     """A recording of the board cannot be made, read or replayed; the message names the file, and what was kept."""
 

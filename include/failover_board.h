@@ -121,7 +121,7 @@ static inline int64_t fb_get(fb_item *item, const char *robot, void *value, int6
 /* The same; 0, and more about the value. */
 static inline int fb_get_reading(fb_item *item, const char *robot, void *value, fb_reading *reading);
 
-/* Put a value of this robot: 0. -EBUSY: another process writes this item. -EPERM: its declaration names another component as its writer. */
+/* Put a value of this robot: 0. -EBUSY: another process writes this item. */
 static inline int fb_put(fb_item *item, const void *value);
 
 /* The same of a value that was measured at an instant: ns of CLOCK_BOOTTIME, as this process reads that clock. */
@@ -198,8 +198,6 @@ enum {
     FB_PEER_ = 4,
     FB_ALONE_ = 8,
     FB_ADDED_ = 8,
-    FB_WRITTEN_BY_ = 32,        /* its writer's component follows the text of its type */
-    FB_COMPONENT_MAX_ = 200,
     FB_ITEMS_MAX_ = 1024,
     FB_SIZE_MAX_ = 65536,
     FB_SHARED_SIZE_MAX_ = 4096, /* of what travels to other robots */
@@ -1512,48 +1510,15 @@ static inline void fb_unbind_(fb_item *item, fb_place_ *place)
     item->board->given_up = place;
 }
 
-/* The component that writes an item, as its declaration says; "" where it says none. 0 or -EBADMSG. */
-static inline int fb_writer_(const fb_place_ *place, char writer[FB_COMPONENT_MAX_ + 1])
-{
-    const uint64_t reach = fb_reach_(place->area);
-    uint64_t at = place->declared.name;
-    uint16_t size = 0;
-    writer[0] = '\0';
-    if ((place->declared.flags & FB_WRITTEN_BY_) == 0)
-        return 0;
-    for (int text = 0; text < 3; text++) { /* its name, its type, its writer */
-        at += text == 0 ? 0 : 2 + (uint64_t)size;
-        if (at > reach || reach - at < 2)
-            return fb_fail_(EBADMSG, "board: %s is damaged: the writer of record %u", place->area->name, place->index);
-        memcpy(&size, place->area->map + at, 2);
-        if (size > reach - at - 2)
-            return fb_fail_(EBADMSG, "board: %s is damaged: the writer of record %u", place->area->name, place->index);
-    }
-    if (size > FB_COMPONENT_MAX_)
-        return fb_fail_(EBADMSG, "board: %s is damaged: the writer of record %u", place->area->name, place->index);
-    memcpy(writer, place->area->map + at + 2, size);
-    writer[size] = '\0';
-    return 0;
-}
-
-/* Become the only writer of an item: 0, -EBUSY, or -EPERM where it is another component's. */
+/* Become the only writer of an item: 0 or -EBUSY. */
 static inline int fb_take_item_(fb_item *item, fb_place_ *place)
 {
     uint64_t newest, begin = fb_epoch_() << FB_EPOCH_BITS_;
     uint32_t pid = (uint32_t)getpid();
-    const char *component = getenv("FAILOVER_COMPONENT");
-    char writer[FB_COMPONENT_MAX_ + 1];
-    int failed;
     if (!place->is_own)
         return fb_fail_(EPERM, "item %s of %s is another robot's: it can only be read here", item->name, place->robot);
     if (!place->area->is_writable)
         return fb_fail_(EACCES, "item %s may only be read by uid %u", item->name, (unsigned)geteuid());
-    failed = fb_writer_(place, writer);
-    if (failed != 0)
-        return failed;
-    if (writer[0] != '\0' && (component == NULL || strcmp(component, writer) != 0))
-        return fb_fail_(EPERM, "item %s is written by %s alone, and this program is of %.200s; put it from there, or take writer out of its declaration",
-                        item->name, writer, component == NULL || *component == '\0' ? "no component" : component);
     if (!fb_take_(place->area->file, FB_WRITER_LOCKS_ + place->index))
         return fb_fail_(EBUSY, "item %s is written by pid %u: an item has one writer", item->name, fb_half_(place->record + FB_PID_));
     memcpy(place->record + FB_PID_, &pid, 4);

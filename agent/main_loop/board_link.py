@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from msgspec import Struct, field
+from msgspec import Struct
 
 from agent.main_loop.announcements import Announcements
 from agent.main_loop.own_items import OwnItems
@@ -33,7 +33,6 @@ from failover.errors import BoardError, OvertakenError
 
 UNREADABLE: Final = "own items that could not be read"
 WAITED: Final = "items that waited a round for room in a frame"
-NOT_WRITER: Final = "items of a robot on which their writer does not run"
 
 REMOVE_ROUNDS: Final = 3
 """Missed rounds after which a robot may have left."""
@@ -51,7 +50,6 @@ class _Peer(Struct):
     Attributes:
         worst_ns: the longest way lately; falls slowly.
         round_ns: the longest round of its frames, as they come here; 0 until that is told.
-        writers: item's number → the component that writes it, of those for which team.toml names one.
     """
 
     items: ReceivedItems
@@ -61,7 +59,6 @@ class _Peer(Struct):
     worst_ns: int = 0
     told_ns: int = 0
     round_ns: int = 0
-    writers: dict[int, str] = field(default_factory=dict)
 
 
 class BoardLink:
@@ -70,26 +67,24 @@ class BoardLink:
     Attributes:
         dropped: by reason.
         wakes: readable when a program told that it put an urgent item.
-        primaries: component → the robot that runs it, and the epoch, as this robot knows now.
     """
 
     def __init__(
-        self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int, agents: Primaries | None = None
+        self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int, primaries: Primaries | None = None
     ) -> None:
         self._file = own
         self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
         self._turns: dict[int, Turns] = {}
         self.dropped: Counter[str] = Counter()
-        self._own, self._me = OwnItems(own), own.header.robot
+        self._own = OwnItems(own)
         self._gone: dict[tuple[int, int], int] = {}
         self._looked: dict[int, int] = {}
         self._buckets: dict[tuple[int, int], Bucket] = {}
         self.wakes = UrgentItems(own, self._own)
         self._urgent_ns = 0
-        self._peers = {name: _Peer(items, writers=items.writers()) for name, items in peers.items()}
+        self._peers = {name: _Peer(items) for name, items in peers.items()}
         self._announcements = Announcements(own.header.rank, peers)
-        self._agents = agents
-        self.primaries: Callable[[], Mapping[str, tuple[str, int]]] = dict
+        self._primaries = primaries
 
     @classmethod
     def open(cls, place: Path, round_ns: int) -> BoardLink:
@@ -123,8 +118,6 @@ class BoardLink:
             if not due:
                 return told
             numbers, records = self._own.newest(), self._own.records
-            if self._own.writers:
-                due = self._written_at(self._me, self._own.writers, due)
             newest = [(record, numbers[record.index]) for record in map(records.__getitem__, due)]
             return told + self._portions(newest, now_ns)
         except (BoardError, OSError):
@@ -162,8 +155,6 @@ class BoardLink:
         if medium == 0:
             self._looked = numbers
         for record in own.urgent:
-            if record.writer and not self._written_at(self._me, own.writers, [record.id]):
-                continue
             lane, number = (medium, record.id), numbers[record.id]
             if number > gone.get(lane, 0) and self._bucket(lane).take(now_ns):
                 may.append((record, number))
@@ -244,21 +235,11 @@ class BoardLink:
         items = heard.items
         if items and items[0].number >= RESERVED:
             items = self._announcements.take(part.sender, items)
-        if items and peer.writers:
-            may = self._written_at(part.sender, peer.writers, [item.number for item in items])
-            if len(may) < len(items):
-                self.dropped[NOT_WRITER] += len(items) - len(may)
-                items = [item for item in items if item.number in may]
         if items:
             way_ns = heard.way_ns  # values are older than told by this at most, and by what it and their ages were rounded
             error_us = NO_ERROR_BOUND if way_ns is None else min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)
             peer.items.take(items, came_ns, error_us, part.round, heard.missing)
         self._note_frame(peer, heard.way_ns, came_ns)
-
-    def _written_at(self, robot: str, writers: Mapping[int, str], numbers: Iterable[int]) -> list[int]:
-        """Which of these items a robot writes: those without a writer of their own, and those whose writer no other one runs."""
-        primaries = self.primaries()
-        return [number for number in numbers if primaries.get(writers.get(number, ""), (robot,))[0] == robot]
 
     def _note_frame(self, peer: _Peer, way_ns: int | None, came_ns: int) -> None:
         """Tell when it came; from time to time the bounds that follow from the longest ways."""
@@ -288,22 +269,22 @@ class BoardLink:
                 peer.state = state
                 peer.items.tell_state(state)
 
-    def tell_primaries(self, now_ns: int) -> None:
-        """Tell programs which robot runs which component."""
-        if self._agents is not None:
-            self._agents.tell(self.primaries(), now_ns - self._skew_ns)
+    def tell_primaries(self, primaries: Mapping[str, tuple[str, int]], now_ns: int) -> None:
+        """Tell programs which robot runs which component: component → robot, epoch."""
+        if self._primaries is not None:
+            self._primaries.tell(primaries, now_ns - self._skew_ns)
 
     def close(self) -> None:
         """Give the locks back; the files stay for the agent that comes after."""
         self.wakes.close()
-        if self._agents is not None:
-            self._agents.close()
+        if self._primaries is not None:
+            self._primaries.close()
         for file in (self._file, *[peer.items.file for peer in self._peers.values()]):
             file.close()
 
     def left_out(self) -> Counter[str]:
         """Values that were not taken, by reason, and those that waited."""
         counts = sum((peer.items.dropped for peer in self._peers.values()), self.dropped) + self._announcements.refused()
-        left_out = self._agents.left_out if self._agents is not None else 0
+        left_out = self._primaries.left_out if self._primaries is not None else 0
         waited = sum(sum(turns.waited.values()) for turns in self._turns.values())
         return counts + Counter({WAITED: waited, LEFT_OUT: left_out})

@@ -267,7 +267,6 @@ class MainLoop:
         except (FailoverError, OSError) as error:
             log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
-        self._board.primaries = self._primaries
         if self._board.wakes.fileno() >= 0:
             self._attend(self._board.wakes.fileno(), self._note_urgent)
 
@@ -597,10 +596,7 @@ class MainLoop:
         self._round, self._round_ns = self._round + 1, now_ns
         lease_ns = self._settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000
         board.tell_states(now_ns, lease_ns, lambda peer: self._media.round_of(peer, now_ns))
-        board.tell_primaries(now_ns)
-
-    def _primaries(self) -> dict[str, tuple[str, int]]:
-        return self._node.primaries() if self._node is not None else {}
+        board.tell_primaries(self._node.primaries() if self._node is not None else {}, now_ns)
 
     def _send_urgent(self, board: BoardLink, now_ns: int) -> None:
         """Items that cannot wait for their round, without a beat. Where robots take turns they wait for this robot's slot.

@@ -38,8 +38,7 @@ class OwnItems:
     """The items that this robot sends.
 
     Attributes:
-        records: by number, as the table was when it was last read; ``urgent``: those of them that are.
-        writers: item's number → the component that writes it, of those whose declaration names one.
+        records: by number, as the table was when it was last read.
     """
 
     def __init__(self, file: MappedFile) -> None:
@@ -47,7 +46,6 @@ class OwnItems:
         self._descriptor = file.descriptor
         self.records: dict[int, Record] = {}
         self.urgent: tuple[Record, ...] = ()
-        self.writers: dict[int, str] = {}
         self._urgent_at: tuple[tuple[int, int], ...] = ()
         self._known: dict[int, Found] = {}
         self._generation = -1
@@ -73,7 +71,6 @@ class OwnItems:
         self._known = {}
         self.urgent = tuple(record for record in found if record.flags & URGENT)
         self._urgent_at = tuple((record.id, record.at + layout.NEWEST_FIELD) for record in self.urgent)
-        self.writers = {record.id: record.writer for record in found if record.writer}
         return True
 
     def urgent_numbers(self) -> dict[int, int]:

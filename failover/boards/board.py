@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 
 from msgspec import Struct
 
@@ -19,7 +19,7 @@ from checkpoint.sentences import near
 from failover.boards import boottime, directory
 from failover.boards.component_item import Primary, decode
 from failover.boards.fence import FENCE
-from failover.boards.item import COMPONENT_VARIABLE, Item, ItemWriter, Source, values_for
+from failover.boards.item import Item, ItemWriter, Source, values_for
 from failover.boards.mapping import MappedFile
 from failover.boards.watch import Watch
 from failover.core.board import ages, layout
@@ -29,6 +29,8 @@ from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
 from failover.core.naming import worlds
 from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
+
+COMPONENT_VARIABLE: Final = "FAILOVER_COMPONENT"
 
 
 class RobotState(Struct, frozen=True):

@@ -35,15 +35,11 @@ from failover.errors import (
     BoardGoneError,
     ItemError,
     NeverWrittenError,
-    NotItsWriterError,
     OvertakenError,
     ValueMisfitError,
     WriterTakenError,
 )
 from failover.fencing.epoch import epoch
-
-COMPONENT_VARIABLE: Final = "FAILOVER_COMPONENT"
-"""In the environment of a protected program: the component that it is of."""
 
 SLICE_S: Final = 0.1
 """The longest sleep without a look: a wake-up may be lost (BOARD.md), and a board may be made anew."""
@@ -179,7 +175,6 @@ class ItemWriter:
 
         Raises:
             WriterTakenError: another process writes the item.
-            NotItsWriterError: it is declared as another component's.
             BoardError: it may only be read here.
         """
         with self._board.guard:
@@ -197,8 +192,6 @@ class ItemWriter:
         file, record, place = source.file, source.record, source.place
         if not file.is_writable:
             raise BoardError(f"item {self.name!r} of {file.path} may only be read by uid {os.geteuid()}")
-        if record.writer not in ("", os.environ.get(COMPONENT_VARIABLE)):
-            raise NotItsWriterError(_not_its_writer(record))
         if not file.take_writer(record, os.getpid()):
             raise WriterTakenError(self._board.whose(file, record))
         number = first_of_epoch(place.words[place.newest], epoch(), record.banks) - 1
@@ -221,14 +214,6 @@ class ItemWriter:
         """Count a put that was refused."""
         if source.file.is_writable:
             source.place.words[(source.record.at + layout.REFUSED_FIELD) // 8] += 1
-
-
-def _not_its_writer(record: Record) -> str:
-    component = os.environ.get(COMPONENT_VARIABLE)
-    return (
-        f"item {record.name!r} is written by {record.writer} alone, and this program is "
-        f"{f'of {component}' if component else 'of no component'}; put it from there, or take `writer` out of its declaration"
-    )
 
 
 def _is_inside(writer: Writer) -> bool:
@@ -270,7 +255,7 @@ class Item:
 
     Attributes:
         put: ``put(value, at=None)``. ``at``: ns of CLOCK_BOOTTIME at which the value was measured; None: now.
-            Raises ValueMisfitError, WriterTakenError, NotItsWriterError, BoardError; then nothing was put.
+            Raises ValueMisfitError, WriterTakenError, BoardError; then nothing was put.
         get: ``get(robot=None)`` → `Reading`; None: this robot's.
             Raises NeverWrittenError, OvertakenError, BoardError.
     """

@@ -63,10 +63,6 @@ class ReceivedItems:
         file.mend()  # an agent was killed while it changed the table
         return cls(file)
 
-    def writers(self) -> dict[int, str]:
-        """Item's number → the component that writes it, of those whose declaration names one: no robot adds such at run time."""
-        return {record.id: record.writer for record in self.file.records() if record.writer}
-
     def begin_life(self) -> None:
         """The robot's agent began anew, and perhaps its board with it: its puts are counted from any number."""
         self._generation = -1

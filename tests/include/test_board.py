@@ -187,19 +187,6 @@ def test_a_program_that_reads_all_robots_stays_the_writer_of_its_items(place: Pa
         assert python.item("ball").get().value == b"mine"
 
 
-def test_an_item_that_names_its_writer_is_put_by_no_other_program_in_c(place: Path) -> None:
-    with board(place) as python:
-        python.add(Declaration("plan", size=8, writer="/lab/r/mapper"))
-        for variables, said in (({}, "no component"), ({"FAILOVER_COMPONENT": "/lab/r/other"}, "/lab/r/other")):
-            with tool(place, **variables) as c:
-                c.ok("find", "plan", 8)
-                assert f"written by /lab/r/mapper alone, and this program is of {said};" in c.say("put", "plan", "x")
-        with tool(place, FAILOVER_COMPONENT="/lab/r/mapper") as c:
-            c.ok("find", "plan", 8)
-            c.ok("put", "plan", "x")
-            assert python.item("plan").get().value == b"x"
-
-
 def test_a_program_that_opens_the_same_board_anew_stays_the_writer_of_its_items(place: Path) -> None:
     """What it has mapped stays mapped, and must not hold the locks of the opening before."""
     with board(place) as python, tool(place) as c:

@@ -125,7 +125,6 @@ def item_of(declared: Declared | Record, *, shared: bool = True) -> Item:
         urgent=bool(flags & URGENT),
         finite=bool(flags & FINITE),
         keep=bool(flags & KEPT),
-        writer=declared.writer if isinstance(declared, Record) else "",
     )
 
 

@@ -67,7 +67,7 @@ class Item(Struct, frozen=True, dict=True):
         robots: which robots have it: names, or patterns with ``*``.
         bound_ms: past this age a reading is stale; 0: the bound follows from period and round.
         banks: copies, 2 to 8.
-        writer: the component whose program alone may put it; "": the first process that puts it writes it.
+        writer: the component that is meant to write it. Nothing enforces that: the first process that puts it does.
         transmit: False: it is received from others and never sent, for a robot that only listens.
         urgent: it is sent at once where no slots are, not with the next round.
         finite: refuse NaN and infinities.

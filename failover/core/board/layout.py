@@ -56,7 +56,6 @@ NOT_SENT: Final = 2
 KEPT: Final = 4
 ADDED: Final = 8
 FINITE: Final = 16
-WRITTEN_BY: Final = 32
 """Flags of a record."""
 
 USER_LOCKS: Final = 1 << 40
@@ -130,7 +129,6 @@ class Wanted(Struct, frozen=True):
         text: the declaration's canonical text; `digest` is its XXH3-64.
         period, phase: in rounds.
         bound_ns: past it a reading is stale; 0: not declared.
-        writer: the component whose programs alone put it; "": any program's.
     """
 
     id: int
@@ -144,17 +142,16 @@ class Wanted(Struct, frozen=True):
     bound_ns: int = 0
     flags: int = 0
     text: str = ""
-    writer: str = ""
 
 
 def wanted_of(item: Item, id_: int, flags: int = 0) -> Wanted:
     """A declaration as a table has it; ``flags``: besides those that it says itself."""
     kind = KINDS.index(item.type.kind) if isinstance(item.type, Opaque) else STRUCT
-    said = {URGENT: item.urgent, NOT_SENT: not item.transmit, KEPT: item.keep, FINITE: item.finite, WRITTEN_BY: bool(item.writer)}
+    said = {URGENT: item.urgent, NOT_SENT: not item.transmit, KEPT: item.keep, FINITE: item.finite}
     flags |= sum(flag for flag, is_said in said.items() if is_said)
     bound_ns = round(item.bound_ms * 1_000_000)
     numbers = (item.size, kind, item.banks, item.period, item.phase, item.type_digest, bound_ns, flags)
-    return Wanted(id_, item.name, *numbers, canonical(item.type), item.writer)
+    return Wanted(id_, item.name, *numbers, canonical(item.type))
 
 
 class Record(Wanted, frozen=True):
@@ -267,12 +264,11 @@ def read_record(view: Buffer, header: Header, index: int) -> Record | None:
     if period == 0 or phase >= period:
         raise BoardError(f"{where}: phase {phase} of a period of {period} rounds")
     name, after = _counted(view, name_offset, low, where)
-    text, after = _counted(view, after, low, where)
-    writer = _counted(view, after, low, where)[0] if flags & WRITTEN_BY else ""
+    text, _ = _counted(view, after, low, where)
     if not 1 <= len(name.encode()) <= NAME_SIZE_MAX:
         raise BoardError(f"{where} has a name of {len(name.encode())} bytes; 1 to {NAME_SIZE_MAX} are possible")
     return Record(
-        *(id_, name, size, kind, banks, period, phase, digest, bound, flags, text, writer),
+        *(id_, name, size, kind, banks, period, phase, digest, bound, flags, text),
         *(index, offset, stride),
     )
 
@@ -349,8 +345,7 @@ def addition(header: Header, wanted: Wanted) -> Addition:
     if not 1 <= len(name) <= NAME_SIZE_MAX or len(text) > TEXT_SIZE_MAX:
         raise BoardError(f"{what}: a name has 1 to {NAME_SIZE_MAX} bytes and its declaration at most {TEXT_SIZE_MAX}")
     name_offset = header.file_size
-    texts = (name, text, wanted.writer.encode()) if wanted.flags & WRITTEN_BY else (name, text)
-    named = b"".join(LENGTH.pack(len(one)) + one for one in texts)
+    named = LENGTH.pack(len(name)) + name + LENGTH.pack(len(text)) + text
     offset, stride = aligned(name_offset + len(named)), aligned(BANK_HEAD + wanted.size)
     size = offset + wanted.banks * stride
     if size > BLOCK_SIZE_MAX:

@@ -127,7 +127,6 @@ def topic_of(robot: str, item: str) -> str:
 def channel_of(robot: str, record: Record, private: bool) -> Channel:
     """The channel of an item; one of bytes where the declaration says no type, or one that does not fit (`misfit_of`)."""
     fields = {name: getattr(record, name) for name in Wanted.__struct_fields__}
-    fields |= {"flags": record.flags & ~layout.WRITTEN_BY, "writer": ""}  # whoever replays it is not that program
     if not record.text or misfit_of(record):
         octets = Opaque("bytes", record.size)
         fields |= {"text": canonical(octets), "kind": layout.BYTES, "digest": type_digest(octets)}
@@ -186,7 +185,7 @@ def read_channel(metadata: Mapping[str, str]) -> Channel | None:
         raise RecordingError(f"damaged: the declaration of {metadata.get('item', 'an item')[:80]!r}: {said}") from None
     code = layout.KINDS.index(kind.kind) if isinstance(kind, Opaque) else layout.STRUCT
     wanted = Wanted(
-        name=metadata["item"], size=size_of(kind), kind=code, digest=type_digest(kind), text=canonical(kind), writer="", **numbers
+        name=metadata["item"], size=size_of(kind), kind=code, digest=type_digest(kind), text=canonical(kind), **numbers
     )
     return Channel(robot, wanted, metadata.get("private") == "1")
 

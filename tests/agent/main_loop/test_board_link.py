@@ -16,7 +16,7 @@ import msgspec
 import pytest
 
 from agent.main_loop import board_link, urgent_items
-from agent.main_loop.board_link import NOT_WRITER, UNREADABLE, BoardLink
+from agent.main_loop.board_link import UNREADABLE, BoardLink
 from agent.main_loop.own_items import LOOK_NS
 from agent.system import clock
 from failover.boards import directory
@@ -44,7 +44,6 @@ BOARD = Declared(
         Item("mine", size=8, shared=False),
         Item("slow", size=8, period=3, phase=1),
         Item("alarm", size=8, period=1000, phase=999, urgent=True),
-        Item("plan", size=8, writer="/lab/r/mapper"),
     )
 )
 TEAM = roster(["robot1", "robot2"], BOARD.terms)
@@ -349,32 +348,6 @@ def test_a_robot_that_is_heard_by_radio_only_is_judged_by_the_rounds_of_the_radi
     for round_ns, state in ((ROUND_NS, "remove"), (5 * ROUND_NS, "run")):
         second.link.tell_states(now_ns, 20 * ROUND_NS, lambda _, ns=round_ns: ns)  # type: ignore[misc]
         assert second.program.robots()["robot1"].state == state
-
-
-def test_an_item_with_a_writer_is_taken_from_the_robot_that_runs_it_only(
-    pair: tuple[Robot, Robot], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, second = pair
-    monkeypatch.setenv("FAILOVER_COMPONENT", "/lab/r/mapper")
-    plan, ball = (first.program.item(name) for name in ("plan", "ball"))
-
-    def seen(value: bytes) -> bytes:
-        """What robot2 has of the plan, after a frame with this one and a new ball."""
-        plan.put(value)
-        ball.put({"x": 1.0, "y": 2.0})
-        second.hears(first.says())
-        assert second.program.item("ball").get("robot1").number == ball.get().number
-        return bytes(second.program.item("plan").get("robot1").value)
-
-    assert seen(b"one") == b"one", "no robot is known to run the writer"
-    second.link.primaries = lambda: {"/lab/r/mapper": ("robot2", 2)}
-    assert seen(b"two") == b"one"
-    assert second.link.left_out()[NOT_WRITER] == 1
-    second.link.primaries = lambda: {"/lab/r/mapper": ("robot1", 3)}
-    assert seen(b"three") == b"three"
-    first.link.primaries = second.link.primaries = lambda: {"/lab/r/mapper": ("robot2", 4)}
-    assert seen(b"four") == b"three"
-    assert second.link.left_out()[NOT_WRITER] == 1, "a robot that knows better does not send it"
 
 
 def test_an_urgent_item_wakes_the_loop_and_goes_once_for_each_put_and_not_too_often(pair: tuple[Robot, Robot]) -> None:

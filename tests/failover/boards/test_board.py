@@ -27,7 +27,6 @@ from failover.errors import (
     BoardError,
     ItemError,
     NeverWrittenError,
-    NotItsWriterError,
     OvertakenError,
     ValueMisfitError,
     WriterTakenError,
@@ -234,21 +233,6 @@ def test_a_second_writer_is_refused_and_told_who_writes(board: Board) -> None:
             other.kill()
         item.put(b"mine")
         assert (item.get().value, item.get().number) == (b"mine", 2)
-
-
-def test_an_item_that_names_its_writer_is_put_by_no_other_program(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
-    with board:
-        item = board.add(Item("plan", size=8, writer="/lab/r/mapper"))
-        for component, said in ((None, "no component"), ("/lab/r/other", "/lab/r/other")):
-            if component:
-                monkeypatch.setenv("FAILOVER_COMPONENT", component)
-            with pytest.raises(NotItsWriterError, match=f"written by /lab/r/mapper alone, and this program is of {said};"):
-                item.put(b"x")
-            with pytest.raises(NeverWrittenError):
-                item.get()
-        monkeypatch.setenv("FAILOVER_COMPONENT", "/lab/r/mapper")
-        item.put(b"x")
-        assert item.get().value == b"x"
 
 
 def test_two_openings_in_one_process_are_two_writers(board: Board) -> None:
