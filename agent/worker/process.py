@@ -452,7 +452,7 @@ class Worker(Switchboard):
             found = await prerequisites.asked_of(self.errands, act.to, act.component)
         finally:
             self._inquiries.discard(act.component)
-        self.tell(events.Inquired(act.component, act.epoch, act.to, found))
+        self.tell(events.Inquired(act.component, act.epoch, act.to, found or (), has_said=found is not None))
 
     async def _silence_ns(self, component: str) -> int:
         """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""

@@ -142,7 +142,7 @@ class Component(Struct):
         generation, sequence: of the next snapshot; ``parent``: newest position that the keeper may count from.
         born: epoch under which the present process was started or restored.
         stood: this copy stood still, or began without a word of the robots that ran it before, since all peers last agreed to it.
-        rival_ns: when this copy, which never stopped acting, first heard of the present rival.
+        rival_ns: when this copy, which never stopped acting, first heard the present rival; ``told_of_ns``: of it, by others.
         inherited_ns: this life of the agent found it running under a lease: it acts until then, and no longer before this life
             has one of its own; 0: it did not, or it has. borrowed_ns: until when its guard may let it act on such a lease; 0: the
             guard has a shorter one.
@@ -177,7 +177,9 @@ class Component(Struct):
         waiting: on a standby: the program that was ordered to wait, under ``waiting_epoch``; it is ready (``warm``) or, after
             something went wrong, ``cold`` says what.
         drain_ns: on the primary of a drained robot: when its standby is asked next whether it could go on there.
-        return_ns: on a primary: when the preferred robot is asked whether it could go on there; ``unfit``: what it lacks.
+        return_ns: on a primary: when the robot where it would move back to is asked whether it could go on there; ``unfit``:
+            what it lacks; ``back_ns``: since when that robot is heard without a break; ``replaced``: the standby before it, which
+            takes its place again unless it takes a snapshot.
     """
 
     name: str
@@ -206,6 +208,7 @@ class Component(Struct):
     born: int = 0
     stood: bool = False
     rival_ns: int = 0
+    told_of_ns: int = 0
     generation: int = 0
     sequence: int = 0
     parent: Position | None = None
@@ -233,6 +236,8 @@ class Component(Struct):
     warm: bool = False
     cold: str = ""
     return_ns: int = 0
+    back_ns: int = 0
+    replaced: str = ""
     drain_ns: int = 0
     unfit: tuple[str, ...] = ()
     stored_ns: int = -1

@@ -232,12 +232,17 @@ class Warmed(Struct, frozen=True):
 
 
 class Inquired(Struct, frozen=True):
-    """What robot ``to`` said that it lacks of what the component needs to go on there: nothing, or a sentence for each."""
+    """What robot ``to`` said that it lacks of what the component needs to go on there: nothing, or a sentence for each.
+
+    Attributes:
+        has_said: whether it has answered at all.
+    """
 
     component: str
     epoch: int
     to: str
     lacks: tuple[str, ...] = ()
+    has_said: bool = True
 
 
 class Exited(Struct, frozen=True):

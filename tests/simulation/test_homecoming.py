@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
-from failover.core.events import Handover, Prefer
+from failover.core.events import Handover, Inquired, Prefer, TeamChanged
 from failover.core.types import MS, ComponentSpec, Launch, Rules
 from tests.simulation.deeds import LACK
 from tests.simulation.invariants import seen_at
@@ -115,3 +116,72 @@ def test_of_three_robots_the_lost_one_stands_by_once_it_is_back_and_is_returned_
     (at,) = later(world, 2 * LONG_MS)
     assert at == (prefer or "robot2")
     assert prefer or seen_at(world, "robot2", PART).standby == "robot1"
+
+
+def three(prefer: str = "") -> World:
+    """Of a pair's rule: it was started at robot1, which was lost, and runs at robot2, protected by robot3. Robot1 is off."""
+    specs = (ComponentSpec(PART, home="robot1", launch=Launch(("part",)), rules=Rules(prefer=prefer)),)
+    world = World(1, pair(specs, ("robot1", "robot2", "robot3")))
+    for name in world.robots:
+        world.power_on(name)
+    assert later(world, 1_000) == ["robot1"]
+    world.power_off("robot1")
+    assert later(world, 1_500) == ["robot2"] and seen_at(world, "robot2", PART).standby == "robot3"
+    return world
+
+
+def cut_off(world: World, *others: str) -> None:
+    """Robot1, from these."""
+    world.network.cuts |= {way for other in others for way in (("robot1", other), (other, "robot1"))}
+
+
+def test_a_robot_that_takes_no_snapshot_gives_its_place_back_to_the_standby_before_it() -> None:
+    world = three()
+    world.robots["robot1"].broken_store = True
+    world.power_on("robot1")
+    assert later(world, LONG_MS) == ["robot2"]
+    seen = seen_at(world, "robot2", PART)
+    assert (seen.standby, str(seen.protection)) == ("robot3", "protected")
+    told = [one.sentence for one in world.robots["robot2"].told]
+    assert sum("robot1 is its standby" in sentence for sentence in told) == 1, "it is not tried again and again"
+
+
+def test_a_robot_that_was_cut_off_stands_by_only_when_it_has_been_back_for_some_time() -> None:
+    world = three()
+    world.power_on("robot1")
+    later(world, 1_000)
+    cut_off(world, "robot2", "robot3")
+    later(world, 2_100)
+    world.network.cuts.clear()
+    later(world, 1_000)
+    assert seen_at(world, "robot2", PART).standby == "robot3"
+    later(world, 3_000)
+    assert seen_at(world, "robot2", PART).standby == "robot1"
+
+
+def test_a_late_answer_of_a_robot_that_was_taken_out_of_the_team_changes_nothing() -> None:
+    world = three()
+    core = world.robots["robot2"].node
+    assert core is not None
+    world.power_on("robot1")
+    later(world, 3_000)
+    epoch = seen_at(world, "robot2", PART).epoch
+    config = world.robots["robot2"].config
+    now_ns = world.local(world.robots["robot2"])
+    core.step(TeamChanged(replace(config, peers=("robot3",))), now_ns)
+    core.step(Inquired(PART, epoch, "robot1"), now_ns)
+
+
+def test_of_three_robots_the_copy_that_never_stopped_stays_though_another_one_has_heard_the_other_copy_first() -> None:
+    world = three()
+    world.power_on("robot1")
+    later(world, 4_000)
+    assert seen_at(world, "robot2", PART).standby == "robot1"
+    cut_off(world, "robot2", "robot3")
+    assert later(world, 2_100) == ["robot1", "robot2"]
+    world.network.cuts.clear()
+    cut_off(world, "robot2")
+    later(world, 200)
+    world.network.cuts.clear()
+    assert later(world, 2_000) == ["robot2"]
+    assert "never stopped acting" in " ".join(one.sentence for one in world.robots["robot2"].told)

@@ -36,15 +36,15 @@ CLEARING_S: Final = 5.0
 log = logging.getLogger("failover.lacks")
 
 
-async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...]:
-    """Needs of a component that another robot does not meet, so it could not go on there; none where it cannot be asked."""
+async def asked_of(errands: Errands, robot: str, name: str) -> tuple[str, ...] | None:
+    """Needs of a component that another robot does not meet, so it could not go on there; None where it cannot be asked."""
     try:
         found = await errands.send(robot, "lacks", {"name": name}, patience_s=PATIENCE_S)
     except RefusedError as untold:
         log.warning("%s: cannot tell whether it could resume at %s: %s", name, robot, untold)
-        return ()
+        return None
     reasons = found.get("lacks")
-    return tuple(map(str, reasons)) if isinstance(reasons, list) else ()
+    return tuple(map(str, reasons)) if isinstance(reasons, list) else None
 
 
 async def look(around: Surroundings, supervisors: Iterable[Supervisor]) -> Mapping[str, tuple[str, ...]]:

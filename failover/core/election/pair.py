@@ -529,6 +529,16 @@ def _go_on_above_the_end(component: Component, turn: Turn, sender: str, entry: E
         renew(component, turn, entry.epoch)
 
 
+def _awaits_its_word(component: Component, turn: Turn, rival: str) -> bool:
+    """Whether ours may be the copy that stays: then the other one's own robot is heard first, if its word may be on its way."""
+    may_stay = component.state is State.PRIMARY and (component.ordered or not component.stood)
+    if not may_stay or turn.config.by_majority or component.freezes or rival not in turn.team.peers:
+        return False
+    if turn.now_ns >= component.told_of_ns + 2 * turn.config.grace_ns:
+        component.told_of_ns = turn.now_ns
+    return turn.now_ns < component.told_of_ns + turn.config.grace_ns
+
+
 def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     """A member that does not run it knows a later epoch than ours."""
     elsewhere = entry.primary not in ("", turn.me, sender)
@@ -538,7 +548,8 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
         component.until_ns = turn.now_ns + turn.config.loyalty_ns
         open_line(component, turn)
     elif component.holding and elsewhere:
-        lose(component, turn, entry.primary, entry)
+        if not _awaits_its_word(component, turn, entry.primary):
+            lose(component, turn, entry.primary, entry)
     elif component.is_settled:
         renew(component, turn, entry.epoch)
     elif not component.holding:

@@ -34,6 +34,9 @@ NS_PER_US = 1_000
 _SHOWS = frozenset({State.ABSENT, State.STANDBY, *ENDED})
 """States in which no guard of this robot writes the component's output."""
 
+UNTAKEN_PAUSE = 300
+"""Of ``retry_ms``: before a robot that did not take a snapshot may replace a standby once more."""
+
 STILL_SHARE = 10
 """A program stands still for at most one part in so many of its time for its snapshots: where no kernel tells which pages were
 written, all of its memory is read meanwhile."""
@@ -83,9 +86,18 @@ def replace(component: Component, turn: Turn, robot: str) -> None:
     if flight is not None and flight.position is not None:
         turn.order(acts.CancelShip(component.name, component.epoch, flight.position, flight.to))
         component.flight = None
-    component.standby = robot
+    component.replaced, component.standby = component.standby, robot
     component.due_ns = turn.now_ns
     turn.say(component, f"{robot} is its standby, where it would move back to")
+
+
+def _go_back(component: Component, turn: Turn) -> None:
+    """The robot that replaced a standby has not taken the first snapshot: that one stands by again, if it lives."""
+    former, component.replaced = component.replaced, ""
+    if turn.alive(former):
+        turn.say(component, f"{former} is its standby again: {component.standby} did not take a snapshot")
+        component.standby, component.due_ns = former, turn.now_ns
+        component.return_ns = turn.now_ns + UNTAKEN_PAUSE * turn.config.retry_ms * MS
 
 
 def _stays(component: Component, turn: Turn) -> bool:
@@ -272,7 +284,7 @@ def _checkpoint(component: Component, turn: Turn, position: Position, *, is_safe
     flight = component.flight
     assert flight is not None
     turn.order(acts.Acknowledge(component.name, component.epoch, position, is_safe))
-    component.undelivered, component.tries = "", 0
+    component.undelivered, component.tries, component.replaced = "", 0, ""
     component.parent = component.acked = position
     if is_safe:
         component.safe = position
@@ -313,6 +325,8 @@ def _give_up(component: Component, turn: Turn, why: str = "") -> None:
     if why:
         component.undelivered = why
         turn.say(component, f"a snapshot did not arrive: {why}")
+        if component.replaced:
+            _go_back(component, turn)
 
 
 def _standby_entry(component: Component, turn: Turn) -> Entry | None:

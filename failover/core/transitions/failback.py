@@ -28,12 +28,16 @@ def review(component: Component, turn: Turn) -> None:
     Where another robot stands by, the first answer makes that one the standby. Only to a preferred robot it returns by itself.
     """
     home, pause_ns = component.home, PAUSE * turn.config.retry_ms * MS
-    if home in ("", turn.me) or turn.now_ns < component.return_ns or turn.is_drained(home) or not turn.alive(home):
+    if home in ("", turn.me) or turn.is_drained(home) or not turn.alive(home):
+        component.back_ns = 0
+        return
+    component.back_ns = component.back_ns or turn.now_ns
+    if turn.now_ns < component.return_ns:
         return
     if home == component.standby:
         is_due = bool(component.rules.prefer)
     else:
-        is_due = turn.now_ns >= turn.team.peers[home].since_ns + pause_ns and standby.may_replace(component, turn, home)
+        is_due = turn.now_ns >= component.back_ns + pause_ns and standby.may_replace(component, turn, home)
     if component.acked is not None and is_due:
         component.return_ns = turn.now_ns + pause_ns
         turn.order(acts.Inquire(component.name, component.epoch, home))
@@ -53,7 +57,7 @@ def inquired(component: Component, turn: Turn, event: Inquired) -> None:
     if event.lacks:
         return
     if event.to != component.standby:
-        if standby.may_replace(component, turn, event.to):
+        if event.has_said and turn.alive(event.to) and standby.may_replace(component, turn, event.to):
             standby.replace(component, turn, event.to)
     elif turn.drained or component.rules.prefer:
         handover.begin(component, turn, event.to, 0)
