@@ -229,7 +229,7 @@ class BeatLane:
         Which one the kernel chose is not known by the address: where one link is gone, its packets may come over another. The
         instant is by this machine's calendar, in nanoseconds since 1970; 0: not told.
         """
-        taken, told = 0, self._told
+        taken, told, guess = 0, self._told, 1
         ready = [(self._likely, select.EPOLLIN)]  # this is asked where one waits, and one knows nearly always where
         while ready and taken < TURN_LIMIT:
             for fileno, _ in ready[: TURN_LIMIT - taken]:
@@ -237,6 +237,7 @@ class BeatLane:
                 try:
                     frame, ancillary, _, sender = self._sockets[fileno].recvmsg(FRAME_LIMIT + 1, ANCILLARY_SIZE)
                 except OSError:
+                    taken, guess = taken - guess, 0  # a wrong guess is no datagram
                     continue  # none, or an ICMP error of an earlier datagram; the next call has the next datagram
                 self._likely = fileno
                 link, wall_ns = "", 0

@@ -62,6 +62,11 @@ class KeyRotation:
         own = self._lines.settings.me
         if self._lines.settings.config.insecure:
             raise RefusedError("this robot runs without keys (insecure = true): there is none to replace")
+        if own.role == "witness":
+            raise RefusedError(
+                f"{self._me} is a witness, whose word changes no team: at a robot, failover team remove {self._me}, then invite "
+                f"{self._me} again"
+            )
         self._changes.check_that_it_can_be_written()
         in_use = await self._in_use()
         secret = await asyncio.to_thread(team_file.read_next_key, self._directory, self._me)

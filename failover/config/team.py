@@ -333,7 +333,7 @@ def use_next_key(directory: Path, robot: str) -> None:
     following, present = next_key_path(directory, robot), secret_key_path(directory, robot)
     owner = present.stat()
     if (owner.st_uid, owner.st_gid) != (os.geteuid(), os.getegid()):
-        os.chown(following, owner.st_uid, owner.st_gid)
+        os.chown(following, owner.st_uid, owner.st_gid, follow_symlinks=False)
     following.replace(present)
     sync_directory(present.parent)
 

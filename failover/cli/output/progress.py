@@ -38,8 +38,9 @@ class Progress:
     def __init__(
         self, *, is_quiet: bool = False, stream: TextIO | None = None, now: Callable[[], float] = time.monotonic
     ) -> None:
-        self._stream = stream if stream is not None else sys.stderr
-        self._is_quiet, self._moves, self._now = is_quiet, self._stream.isatty(), now
+        self._stream = stream if stream is not None else sys.stderr  # None where the shell has closed it
+        self._is_quiet, self._now = is_quiet or self._stream is None, now
+        self._moves = not self._is_quiet and self._stream.isatty()
         self._due_s = now() + PATIENCE_S
         self._is_shown, self._last = False, ""
 
@@ -50,9 +51,13 @@ class Progress:
             return
         self._due_s, self._last = now_s + (MOVES_S if self._moves else PLAIN_S), sentence
         told = render.spoken(sentence)
-        self._stream.write(f"\r{told[: self._columns() - 1]}\x1b[K" if self._moves else f"{told}\n")
-        self._stream.flush()
+        self._write(f"\r{told[: self._columns() - 1]}\x1b[K" if self._moves else f"{told}\n")
         self._is_shown = True
+
+    def _write(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # the reader has gone: the wait goes on
+            self._stream.write(text)
+            self._stream.flush()
 
     def _columns(self) -> int:
         """Of the terminal: a line that went on below could not be taken back."""
@@ -65,8 +70,7 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         if self._is_shown and self._moves:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
+            self._write("\r\x1b[K")
 
 
 def share(done: int, size: int) -> str:
@@ -82,7 +86,8 @@ def of_reading(pid: int, what: str, size: int, progress: Progress) -> Iterator[N
 
     def look() -> None:
         while not over.wait(LOOK_S):
-            progress.tell(f"{what}: {share(_read_by(pid) - first, size)}")
+            if (read := _read_by(pid)) >= first > 0:  # it may have ended, or not be ours to look at
+                progress.tell(f"{what}: {share(read - first, size)}")
 
     looking = threading.Thread(target=look, daemon=True)
     looking.start()

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final
 
+from checkpoint.sentences import visible
 from failover.cli.arguments.components import HOOKS
 from failover.cli.connection import connect
 from failover.cli.output import progress, render, team_tree
@@ -103,7 +104,7 @@ class _Follower:
                 self._begin(reply.value.get("started", {}))
             else:
                 if reply.value.get("reason"):
-                    print(f"failover: {self._name}: {reply.value['reason']}", file=sys.stderr)
+                    print(visible(f"failover: {self._name}: {reply.value['reason']}"), file=sys.stderr)
                 status: int | None = reply.value.get("exit_status")
                 return status
         return None
@@ -136,7 +137,7 @@ class _Follower:
             with connect(self._arguments) as agent:
                 agent.ask("stop", name=self._name, signal=number)
         except FailoverError as error:
-            print(f"failover: {error}", file=sys.stderr)
+            print(visible(f"failover: {error}"), file=sys.stderr)
 
 
 def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> None:
@@ -155,8 +156,11 @@ def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> Non
                 )
             if one["protection"] == "protected":
                 return
-            if not status["peers"]:
-                raise FailoverError(f"{name} runs and stays unprotected: {status['robot']} is alone in its team")
+            if one["protection"] == "stopped":
+                why = "; ".join(one["reasons"]) or "on_unsupported = stop_protecting"
+                raise FailoverError(f"{name} runs and stays unprotected: {why}")
+            if all(peer["role"] == "witness" for peer in status["peers"]):
+                raise FailoverError(f"{name} runs and stays unprotected: no other member of the team keeps checkpoints")
             shown.tell(f"{name}: {_how_far(one)}; Ctrl-C: it runs on")
             time.sleep(LOOK_EVERY_S)
 
@@ -213,7 +217,7 @@ def _umask() -> int:
 
 def _notes(answer: dict[str, Any]) -> None:
     for note in answer.get("notes") or ():
-        print(f"failover: note: {note}", file=sys.stderr)
+        print(visible(f"failover: note: {note}"), file=sys.stderr)
 
 
 # --- The others: ask, and say what came of it ------------------------------------------------------------------------
@@ -285,7 +289,7 @@ def promote(arguments: argparse.Namespace) -> int:
         would = agent.ask("promote", **wanted)
         wanted["robot"] = would["to"]
         if not arguments.json:
-            print(f"failover: {would['sentence']}", *would["risks"], sep="\n  - ", file=sys.stderr)
+            print(*map(visible, (f"failover: {would['sentence']}", *would["risks"])), sep="\n  - ", file=sys.stderr)
         if would["risks"] and not (arguments.yes or agreed(f"promote {would['to']} all the same?")):
             told = tuple(would["risks"]) if arguments.json else ()
             raise AgentRefusedError(f"{would['name']} is left as it is; --yes promotes {would['to']} all the same", "Risk", told)
@@ -331,6 +335,6 @@ def _tell(arguments: argparse.Namespace, answer: dict[str, Any], sentence: str) 
     if arguments.json:
         render.as_json(answer)
     else:
-        print(sentence)
+        print(visible(sentence))
         _notes(answer)
     return 0

@@ -183,7 +183,7 @@ def waiting(*pictures: dict[str, Any], every: int = 8) -> Callable[[Request], An
             return [Result({"name": COMPONENT["name"], "pid": 41, "notes": []})]
         asked += 1
         shown = pictures[min(asked // every, len(pictures) - 1)]
-        return [Result(STATUS | {"components": [COMPONENT | shown]})]
+        return [Result(STATUS | {"peers": [PEER | {"role": "robot"}], "components": [COMPONENT | shown]})]
 
     return answer
 
@@ -211,7 +211,7 @@ def test_a_program_whose_output_is_shown_is_not_waited_for(agent: Start) -> None
     [
         ({"components": []}, "is gone: it will not be protected"),
         ({"components": [COMPONENT | {"state": "failed", "protection": "none"}]}, "is failed: it will not be protected"),
-        ({"peers": [], "components": [COMPONENT | {"protection": "none"}]}, "robot1 is alone in its team"),
+        ({"peers": [], "components": [COMPONENT | {"protection": "none"}]}, "no other member of the team keeps checkpoints"),
     ],
 )
 def test_a_wait_for_what_will_not_come_ends(agent: Start, shown: dict[str, Any], told: str) -> None:
