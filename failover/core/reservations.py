@@ -83,7 +83,7 @@ class Table:
     """What one robot knows."""
 
     def __init__(self, known: Iterable[Reservation] = ()) -> None:
-        self._all = {one.id: one for one in known}
+        self._all = {one.id: one for one in known if _is_path(one.path)}
 
     def all(self, now_ns: int) -> tuple[Reservation, ...]:
         """Those whose time has not come, also those that are over; the oldest first."""
@@ -155,6 +155,19 @@ class Table:
         begun_ns, until_ns = now_ns - told.stood_ms * MS, now_ns + told.left_ms * MS
         heard = Reservation(told.id, told.path, told.uid, told.user, told.why, begun_ns, until_ns, told.over)
         return self._add(heard, now_ns)
+
+
+def reserved_path(path: str) -> str:
+    """A path in the form in which it is kept.
+
+    Raises:
+        RightsError: it is no path, or its normal form (NFKC) is none, or is another path.
+    """
+    steps = steps_of(path)
+    normal = "/" + "/".join(steps)
+    if steps_of(normal) != steps:
+        raise RightsError(f"{path!r} is no path: its characters stand for others (NFKC), among them a '/' or '→'; use those")
+    return normal
 
 
 def telling(one: Reservation, now_ns: int) -> Told:

@@ -17,13 +17,12 @@ from typing import Any, Final
 
 import msgspec
 
-from agent.errors import RefusedError
+from agent.errors import TROUBLE, RefusedError
 from agent.system import clock
 from agent.worker.network.remote_orders import Errands
 from checkpoint.store.whole_file import write_whole
 from failover.config import accounts
-from failover.core.reservations import RESERVATIONS_MAX, WHY_SIZE_MAX, Reservation, Table, Told, covering, telling
-from failover.core.rights.paths import steps_of
+from failover.core.reservations import RESERVATIONS_MAX, WHY_SIZE_MAX, Reservation, Table, Told, covering, reserved_path, telling
 from failover.core.types import MS
 from failover.errors import RightsError
 
@@ -108,7 +107,7 @@ class Reservations:
             RefusedError: another user has reserved it, or part of it; it is no path; there are too many.
         """
         try:
-            path = "/" + "/".join(steps_of(path))
+            path = reserved_path(path)
         except RightsError as error:
             raise RefusedError(str(error), "RightsError") from error
         now_ns = clock.now_ns()
@@ -183,8 +182,11 @@ class Reservations:
         while True:
             await asyncio.sleep(TELL_AGAIN_S)
             known = self._table.all(clock.now_ns())
-            if known:
-                await asyncio.gather(*(self._tell(peer, known) for peer in await self._reachable()))
+            try:
+                if known:
+                    await asyncio.gather(*(self._tell(peer, known) for peer in await self._reachable()))
+            except TROUBLE as trouble:
+                log.warning("the other robots were not told of reservations; this robot tries again: %s", trouble)
 
     async def _tell(self, peer: str, some: tuple[Reservation, ...]) -> bool:
         """Whether it has heard it."""

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failover.core.reservations import OF_USER_MAX, RESERVATIONS_MAX, Reservation, Table, Told, covering, telling
+from failover.core.reservations import OF_USER_MAX, RESERVATIONS_MAX, Reservation, Table, Told, covering, reserved_path, telling
+from failover.core.rights.paths import steps_of
 from failover.core.types import MS
+from failover.errors import RightsError
 
 ANNA, BEN = 1001, 1002
 NOW_NS = 10**18
@@ -98,6 +100,19 @@ def test_another_robot_learns_it_with_its_own_clock_and_learns_its_end() -> None
 def test_a_path_that_is_none_is_not_taken() -> None:
     table = Table()
     assert not table.hear(telling(wanted("/lab/../x"), NOW_NS), NOW_NS) and table.hinders(BEN, MAPPER, NOW_NS) is None
+
+
+@pytest.mark.parametrize("path", ["/demo/robot1/" + 60 * "\ufdfa", "/demo/robot1/a\uffebb"])
+def test_a_path_that_is_none_or_another_one_in_its_normal_form_is_refused(path: str) -> None:
+    assert steps_of(path), "as it is written it is one"
+    with pytest.raises(RightsError, match="is no path"):
+        reserved_path(path)
+
+
+@pytest.mark.parametrize("path", ["/a" * 17, "/demo/" + 300 * "x"])
+def test_what_is_no_path_in_an_older_file_is_left_out(path: str) -> None:
+    table = Table([wanted(path), wanted()])
+    assert [one.path for one in table.standing(NOW_NS)] == [MAPPER]
 
 
 def test_of_two_that_robots_granted_that_did_not_hear_each_other_the_older_one_counts_until_it_is_over() -> None:

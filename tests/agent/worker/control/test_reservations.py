@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agent.errors import RefusedError
+from agent.errors import AgentError, RefusedError
 from agent.system import clock
 from agent.worker.control.reservations import FILE, Kept, Reservations
 from agent.worker.network.remote_orders import Errands
@@ -76,7 +76,22 @@ def test_who_may_end_it(reserved: Path) -> None:
         asyncio.run(at(reserved).end(MAPPER, BEN, True, may))
 
 
-@pytest.mark.parametrize("path", ["/lab/../x", "", "/", "/lab//x", "x" * 300])
+@pytest.mark.parametrize("path", ["/lab/../x", "", "/", "/lab//x", "x" * 300, "/lab/r1/" + 60 * "\ufdfa"])
 def test_what_is_no_path_cannot_be_reserved(tmp_path: Path, path: str) -> None:
     with pytest.raises(RefusedError, match="is no path"):
         asyncio.run(at(tmp_path).begin(path, ANNA, 1_000, ""))
+
+
+def test_a_main_loop_that_does_not_answer_in_time_is_asked_again(reserved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agent.worker.control.reservations.TELL_AGAIN_S", 0)
+    asked: list[int] = []
+
+    async def late() -> list[str]:
+        asked.append(len(asked))
+        if len(asked) == 3:
+            raise EOFError("seen often enough")
+        raise AgentError("the main loop did not answer")
+
+    with pytest.raises(EOFError):
+        asyncio.run(Reservations(reserved, no_errands, late).tell_again())
+    assert asked == [0, 1, 2]
