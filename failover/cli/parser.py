@@ -335,7 +335,8 @@ VERBS: Final = (
         Orders of other users are refused with one sentence, which says who has reserved it, until when and why: handover,
         failback, prefer, promote, release, start, stop; run and protect under such a name; drain of a robot that runs it. A
         takeover is no order, and asks nothing. A reservation ends by itself. To prolong it, reserve again. A user who may give
-        orders about it may reserve it. Give this order at any robot.
+        orders about it, and about each component below it, may reserve it; without rights.toml its owner may, and only root
+        all below a path. Give this order at any robot.
 
           failover reserve mapper --for 10min --why calibration
           failover reserve /lab/robot1 --for 2h --why "new wheels"

@@ -186,6 +186,16 @@ def covering(standing: Iterable[Reservation], path: str) -> Reservation | None:
     return next((one for one in standing if _is_below(steps, one.steps)), None)
 
 
+def at_or_below(path: str, names: Iterable[str]) -> list[str]:
+    """Of these names those about which a reservation of a path refuses orders.
+
+    Raises:
+        RightsError: it is no path. A name that is none is at no path.
+    """
+    above = steps_of(path)
+    return [name for name in names if _is_path(name) and _is_below(steps_of(name), above)]
+
+
 def _is_below(steps: tuple[str, ...], above: tuple[str, ...]) -> bool:
     return steps[: len(above)] == above
 

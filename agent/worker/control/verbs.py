@@ -46,13 +46,17 @@ from checkpoint.engine import contradiction
 from checkpoint.program import cpu_baseline
 from checkpoint.snapshot.carried_files import is_carriable
 from failover.core import acts, events
-from failover.core.reservations import SPAN_MS_MAX
+from failover.core.reservations import SPAN_MS_MAX, at_or_below
+from failover.core.rights.paths import steps_of
 from failover.core.types import COMMITTED, ComponentSpec, Launch, State
 from failover.core.wire.names import check_component, weight
-from failover.errors import NameFormatError
+from failover.errors import NameFormatError, RightsError
 
 STANDING_POLL_S: Final = 0.01
 """Between two questions to the robot that a component moves to: what an operator reads as the move's time."""
+
+ROBOT_DEPTH: Final = 2
+"""Steps of a robot's path, ``/TEAM/ROBOT``."""
 
 START_PATIENCE_S: Final = 30.0
 """How long ``run`` waits for the program to begin; it goes on beginning if the client gives up."""
@@ -76,7 +80,7 @@ class Verbs(Questions):
         self._worker = worker
         self._output_relay = OutputRelay(worker, gate)
         state = Path(worker.settings.config.state_directory)
-        self.reservations: Reservations = Reservations(state, lambda: worker.errands, self._reachable)
+        self.reservations: Reservations = Reservations(state, lambda: worker.errands, self._reachable_robots)
 
     def table(self) -> dict[str, Verb]:
         """By name, as the client says them."""
@@ -380,11 +384,31 @@ class Verbs(Questions):
         if wanted.span_ms > SPAN_MS_MAX:
             raise RefusedError(f"a reservation lasts at most {SPAN_MS_MAX // 60_000} min; reserve again before it ends")
         why, path = checked_reason(wanted.why), await self._reserved_path(wanted.name)
-        if self._rules() is None:  # else the rules have been asked
-            owner = (await self._view(path)).get("owner")
-            if not may(uid, owner):
-                raise RefusedError(f"cannot reserve {path}: without rights.toml only its owner and root may", "PermissionError")
+        await self._check_all_below(uid, path)
         return await self.reservations.begin(path, uid, wanted.span_ms, why)
+
+    async def _check_all_below(self, uid: int, path: str) -> None:
+        """Let a user reserve a path, who may give orders about each component that is there.
+
+        Raises:
+            RefusedError: it is no path, or there is a component about which the user may give none.
+        """
+        told = await self._worker.ask("status")
+        owners = {one.name: one.owner for one in told.status.components} if told.status else {}
+        try:
+            below = at_or_below(path, owners)
+            is_one = path in owners and len(steps_of(path)) > ROBOT_DEPTH
+        except RightsError as error:
+            raise RefusedError(str(error), "RightsError") from error
+        if (gate := self._rules()) is None:
+            if not may(uid, None) and not (is_one and all(may(uid, owners[name]) for name in below)):
+                sentence = "without rights.toml only its owner and root may, and all below a path only root"
+                raise RefusedError(f"cannot reserve {path}: {sentence}", "PermissionError")
+            return
+        asker = await gate.subject(uid, RIGHT_OF["reserve"])
+        if not all(gate.decision(asker, RIGHT_OF["reserve"], name, owners[name]) for name in below):
+            sentence = "the rules do not let you operate each component below it; reserve those one by one that they do"
+            raise RefusedError(f"cannot reserve {path}: {sentence}", "PermissionError")
 
     async def unreserve(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """End a reservation: one's own, or as whoever may also another user's."""
@@ -399,6 +423,11 @@ class Verbs(Questions):
             return "" if answer else answer.because
 
         return await self.reservations.end(await self._reserved_path(wanted.name), uid, wanted.breaks, may_break)
+
+    async def _reachable_robots(self) -> list[str]:
+        """Those that take orders: a witness takes none."""
+        team = self._worker.settings.team.robots
+        return [peer for peer in await self._reachable() if peer in team and team[peer].role != "witness"]
 
     async def _reserved_path(self, name: str) -> str:
         """The component that a person means; of a whole path the path itself, whatever is there."""
@@ -552,14 +581,15 @@ class Verbs(Questions):
             free = (State.RELEASED, uid)  # by the same user: what it wrote is another user's to read
             wanted = next(name for name in numbered if name not in known or (known[name].state, known[name].owner) == free)
         name = wanted if wanted.startswith("/") else own + wanted
+        try:
+            steps_of(check_component(name))
+        except (NameFormatError, RightsError) as error:
+            raise RefusedError(str(error), type(error).__name__) from error
         self.reservations.check(uid, [name])
         check_components(uid, name, known.values(), self._worker.settings.config.components_per_user)
         if name in known and known[name].state not in (State.RELEASED, State.ABSENT):
             check_right(uid, name, known[name].owner)
-        try:
-            return check_component(name)
-        except NameFormatError as error:
-            raise RefusedError(str(error), "NameFormatError") from error
+        return name
 
 
 def _age_of(view: dict[str, Any]) -> tuple[int, int]:

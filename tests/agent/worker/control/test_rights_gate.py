@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,7 +51,7 @@ class Robot:
 
     errands = None
     settings = SimpleNamespace(
-        team=SimpleNamespace(team="lab"),
+        team=SimpleNamespace(team="lab", robots={}),
         config=SimpleNamespace(robot="robot1", state_directory="nowhere", insecure=False),
     )
 
@@ -212,3 +213,59 @@ def test_root_is_never_shut_out_of_the_robots_own_console(asked: Asked, tmp_path
         assert len(asked("status", uid=os.geteuid())["components"]) == 3
         with pytest.raises(RefusedError):
             asked("status")
+
+
+OPERATE_ABOVE = """
+[[rights.rules]]
+groups = ["uid:65534"]
+verbs = ["operate"]
+paths = ["lab/robot1", "lab/robot1/mine"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("rules", "path", "because"),
+    [
+        ("", "/lab/robot1/mine", ""),
+        ("", "/lab/robot1/open", "only its owner and root may"),
+        ("", "/lab/robot1", "all below a path only root"),
+        ("", "/lab", "all below a path only root"),
+        ("", "/lab/robot2/none", "only its owner and root may"),
+        (RULES, "/lab/robot1/mine", ""),
+        (RULES, "/lab/robot1", "no rule allows it"),
+        (RULES + OPERATE_ABOVE, "/lab/robot1", "do not let you operate each component below it"),
+    ],
+)
+def test_a_user_reserves_what_he_may_give_orders_about(tmp_path: Path, rules: str, path: str, because: str) -> None:
+    if rules:
+        (tmp_path / RIGHTS_FILE).write_text(rules)
+    said = reserved(tmp_path, path, NOBODY)
+    assert because in said and bool(because) == (not said.startswith(f"{path} is reserved by nobody")), said
+    assert reserved(tmp_path, "/lab", os.geteuid()).startswith(
+        "/lab is reserved by" if because else "cannot reserve /lab: /lab/r"
+    )
+
+
+def test_no_component_named_like_a_robot_lets_a_user_reserve_all_below_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, others in (("/lab", []), ("/lab/robot1", []), ("/lab/robot1/part", [{"name": "/lab/robot1/part/x", "owner": 7}])):
+        monkeypatch.setattr(sys.modules[__name__], "COMPONENTS", [{"name": name, "owner": NOBODY}, *others])
+        assert "all below a path only root" in reserved(tmp_path, name, NOBODY)
+
+
+def reserved(place: Path, path: str, uid: int) -> str:
+    """What a user is told who reserves a path."""
+    robot = cast(Any, Robot())
+    robot.settings = SimpleNamespace(
+        team=Robot.settings.team, config=SimpleNamespace(robot="robot1", state_directory=str(place), insecure=False)
+    )
+    gate = RightsGate(place, place)
+    say = SimpleNamespace(caller=SimpleNamespace(uid=uid))
+    try:
+        order = Verbs(robot, gate).gated()["reserve"](cast(Any, say), {"name": path, "span_ms": 60_000})
+        return str(asyncio.run(cast(Any, order))["sentence"])
+    except RefusedError as refusal:
+        return str(refusal)
+    finally:
+        gate.close()
