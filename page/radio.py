@@ -59,7 +59,7 @@ def _members(medium: Mapping[str, Any], robot: str) -> Rows:
     if slots is None:
         return found
     for peer in slots["peers"]:
-        if peer["seen"] != "not" or peer["robot"] in found:
+        if peer["seen"] != "not" or peer["robot"] in found or peer["robot"] in slots["members"]:
             fields = {field: peer[field] for field in OF_A_PEER} | _spans(peer, "offset_us", "jitter_us", "transit_us")
             found[peer["robot"]] = found.get(peer["robot"], {"bytes": 0}) | fields
     heard = [str(peer["robot"]) for peer in slots["peers"] if peer["seen"] in SPEAKING]

@@ -336,7 +336,7 @@ const trafficOf = () => {   // bytes of the last ten seconds
 const SEEN = { run: ["●", "in its slot", "good"], insert: ["○", "joins", "quiet"], remove: ["✕", "missed", "bad"], not: ["–", "no slot", "quiet"] };
 const off = (m) => `${m.offset_ms < 0 ? "−" : "+"}${ms(Math.abs(m.offset_ms))}`;
 const memberCells = (m, medium, part) => {
-  const [icon, word, kind] = SEEN[m.seen] || ["", "", "quiet"], placed = m.place != null, others = (medium.members || []).filter((robot) => robot !== m.robot), deaf = others.filter((robot) => !m.hears?.includes(robot));
+  const [icon, word, kind] = SEEN[m.place != null && m.seen === "not" ? "remove" : m.seen] || ["", "", "quiet"], placed = m.place != null, others = (medium.members || []).filter((robot) => robot !== m.robot), deaf = others.filter((robot) => !m.hears?.includes(robot));
   const state = [m.robot === medium.reference && placed ? "reference" : "", m.here ? "this robot" : "", m.missed ? `missed ${m.missed} rounds` : word].filter(Boolean).join(", ");
   return [m.robot, (cell) => { set(cell, `${icon} ${state}`.trim()); mark(cell, "class", kind); }, placed ? tenths(m.planned_ms) : "–", placed && m.seen !== "not" ? off(m) : "–", placed ? ms(m.jitter_ms) : "–", m.here || !m.awaited ? "–" : `${m.lost} of ${m.awaited}`,
     !placed || m.seen === "not" ? "–" : !others.length ? "no other" : deaf.length ? `not ${list(deaf)}` : "all", part];
@@ -349,7 +349,7 @@ const ringOf = () => {
     if (told === drawn) return;
     drawn = told;
     const at_ = (turn, radius) => [240 + radius * Math.sin(2 * Math.PI * turn), 200 - radius * Math.cos(2 * Math.PI * turn)].map((one) => one.toFixed(1));
-    const line = (kind, from, to) => el("line", { class: kind, x1: from[0], y1: from[1], x2: to[0], y2: to[1] }), count = own.length, turns = new Map(own.map((m) => [m.robot, m.place / count]));
+    const line = (kind, from, to) => el("line", { class: kind, x1: from[0], y1: from[1], x2: to[0], y2: to[1] }), count = medium.count, turns = new Map(own.map((m) => [m.robot, m.place / count]));
     const text = (kind, [x, y], said, anchor = "middle") => el("text", { class: kind, x, y, "text-anchor": anchor, "dominant-baseline": "middle" }, said), parts = [el("circle", { class: "band", cx: 240, cy: 200, r: 130 })];
     for (const [listener, speaker] of medium.deaf || []) if (turns.has(listener) && turns.has(speaker)) parts.push(line("deaf", at_(turns.get(listener), 112), at_(turns.get(speaker), 112)));
     for (const m of own) {

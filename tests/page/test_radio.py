@@ -48,14 +48,17 @@ def cable(**fields: Any) -> dict[str, Any]:
 
 
 def test_each_member_has_its_planned_instant_and_what_came_of_it() -> None:
-    rows = of_media([medium(peer("robot1"), peer("robot3", offset_us=-1_249), peer("robot4", seen="not"))], "robot2")
+    peers = peer("robot1"), peer("robot3", offset_us=-1_249), peer("robot4", seen="not"), peer("robot6", seen="not")
+    rows = of_media([medium(*peers, members=["robot1", "robot2", "robot3", "robot4"])], "robot2")
     assert rows["medium:wlan0"]["round_ms"] == 51.23 and rows["medium:wlan0"]["deaf"] == [["robot3", "robot1"]]
     first, own, third = (rows[f"member:wlan0/robot{number}"] for number in (1, 2, 3))
     assert [one["planned_ms"] for one in (first, own, third)] == [0, 12.5, 25]
     assert (third["offset_ms"], own["offset_ms"], own["here"]) == (-1.25, 0.15, True)
     assert own["hears"] == ["robot1", "robot3"] and third["hears"] == ["robot1"]
     assert (first["bytes"], own["bytes"], third["bytes"]) == (900, 300, 0)
-    assert "member:wlan0/robot4" not in rows, "it was never heard"
+    unheard = rows["member:wlan0/robot4"]
+    assert (unheard["place"], unheard["planned_ms"], unheard["seen"]) == (3, 37.5, "not"), "the others hear it: it has a slot"
+    assert "member:wlan0/robot6" not in rows, "it was never heard, and has no slot"
     assert rows["member:wlan0/robot5"]["place"] is None, "it speaks without a slot"
 
 
