@@ -348,7 +348,8 @@ VERBS: Final = (
         "unreserve",
         "end a reservation before its time",
         """
-        The user who has reserved it may. With --break root may, too, and each user to whom rights.toml gives grant there.
+        The user who has reserved it may. With --break root may, too, and each user to whom rights.toml gives grant there; that
+        ends all at and below the path.
 
           failover unreserve mapper
           failover unreserve /lab/robot1 --break

@@ -5,12 +5,13 @@ Each robot has a table; what one learns it tells the others, with spans in the p
 of a reservation is told like its beginning, so no robot that was away brings it back.
 
 Invariants: a reservation stands until its instant at the latest; one that is over never stands again; of two that overlap, which
-only robots that did not hear each other can have granted, the older one counts.
+only robots that had not heard each other yet can have granted, the one with the lesser id counts, at all robots alike.
 """
 
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Iterable
 from typing import Annotated, Final
 
@@ -28,7 +29,13 @@ OF_USER_MAX: Final = 8
 """Reservations of one user that stand at once."""
 
 RESERVATIONS_MAX: Final = 64
-"""At one robot, with those that are over and would still last: each order and each status compares them with each other."""
+"""At one robot, of those that are not over: each order and each status compares them with each other. As many more of root's."""
+
+OVER_MAX: Final = 64
+"""Of those that are over and would still last."""
+
+KNOWN_MAX: Final = 2 * RESERVATIONS_MAX + OVER_MAX
+"""All of them together."""
 
 WHY_SIZE_MAX: Final = 120
 """Characters of a reason: it stands within one sentence."""
@@ -46,7 +53,7 @@ class Reservation(Struct, frozen=True, dict=True):
     """One of them, by this robot's clock.
 
     Attributes:
-        id: of its own, the same at every robot.
+        id: of its own, the same at every robot. It begins with the instant by the calendar, see `id_of`: the lesser one is older.
         uid, user: whose it is, by number and by name.
         over: it has ended before its time.
     """
@@ -56,7 +63,6 @@ class Reservation(Struct, frozen=True, dict=True):
     uid: int
     user: str
     why: str
-    begun_ns: int
     until_ns: int
     over: bool = False
 
@@ -67,14 +73,13 @@ class Reservation(Struct, frozen=True, dict=True):
 
 
 class Told(Struct, frozen=True, forbid_unknown_fields=True):
-    """The same as it travels: how long it has stood, and how long it is to stand, in ms."""
+    """The same as it travels: how long it is to stand, in ms."""
 
     id: Annotated[str, Meta(min_length=1, max_length=ID_SIZE_MAX, pattern=ONE_LINE)]
     path: Annotated[str, Meta(min_length=1, max_length=SIZE_MAX, pattern=ONE_LINE)]
     uid: Annotated[int, Meta(ge=0)]
     user: Annotated[str, Meta(max_length=USER_SIZE_MAX, pattern=ONE_LINE)]
     why: Annotated[str, Meta(max_length=WHY_SIZE_MAX, pattern=ONE_LINE)]
-    stood_ms: Span
     left_ms: Span
     over: bool
 
@@ -82,13 +87,18 @@ class Told(Struct, frozen=True, forbid_unknown_fields=True):
 class Table:
     """What one robot knows."""
 
-    def __init__(self, known: Iterable[Reservation] = ()) -> None:
+    def __init__(self, known: Iterable[Reservation] = (), above: frozenset[int] = frozenset()) -> None:
+        """
+        Args:
+            above: users who have places of their own: root, and the user of the agent.
+        """
         self._all = {one.id: one for one in known if _is_path(one.path)}
+        self._above = above
 
     def all(self, now_ns: int) -> tuple[Reservation, ...]:
         """Those whose time has not come, also those that are over; the oldest first."""
         self._all = {one.id: one for one in self._all.values() if one.until_ns > now_ns}
-        return tuple(sorted(self._all.values(), key=_age))
+        return tuple(sorted(self._all.values(), key=lambda one: one.id))
 
     def standing(self, now_ns: int) -> tuple[Reservation, ...]:
         """Those that count; the oldest first."""
@@ -99,7 +109,7 @@ class Table:
         return tuple(found)
 
     def over_path(self, path: str, now_ns: int) -> Reservation | None:
-        """The one in which a path is. Raises RightsError: it is no path."""
+        """The one in which a path is, see `covering`. Raises RightsError: it is no path."""
         return covering(self.standing(now_ns), path)
 
     def hinders(self, uid: int, path: str, now_ns: int) -> Reservation | None:
@@ -109,13 +119,12 @@ class Table:
 
     def why_not(self, wanted: Reservation, now_ns: int) -> Reservation | str:
         """What keeps it from beginning: another user's, or a sentence; "" for nothing."""
-        standing = self.standing(now_ns)
-        if other := next((one for one in standing if _contradict(one, wanted)), None):
+        if other := next((one for one in self.standing(now_ns) if _contradict(one, wanted)), None):
             return other
-        own = [one for one in standing if one.uid == wanted.uid and one.path != wanted.path]
-        if len(own) >= OF_USER_MAX:
+        others = [one for one in self._lasting(now_ns) if (one.uid, one.path) != (wanted.uid, wanted.path)]
+        if sum(one.uid == wanted.uid for one in others) >= OF_USER_MAX:
             return f"{wanted.user} has {OF_USER_MAX} reservations already; end one with failover unreserve NAME"
-        if len(standing) >= RESERVATIONS_MAX:
+        if self._fill(wanted, others):
             return f"this robot knows {RESERVATIONS_MAX} reservations already; wait until one has ended"
         return ""
 
@@ -127,34 +136,57 @@ class Table:
         return changed
 
     def _add(self, one: Reservation, now_ns: int) -> bool:
-        """Take it in, in a full table in the place of the oldest that is over; whether there was room."""
-        known = self.all(now_ns)
-        if len(known) >= RESERVATIONS_MAX:
-            past = next((each for each in known if each.over), None)
-            if past is None:
-                return False
-            del self._all[past.id]
+        """Take it in; whether there was room."""
+        if not one.over and self._fill(one, self._lasting(now_ns)):
+            return False
         self._all[one.id] = one
+        self._forget_some()
         return True
+
+    def _lasting(self, now_ns: int) -> list[Reservation]:
+        return [one for one in self.all(now_ns) if not one.over]
+
+    def _fill(self, one: Reservation, others: list[Reservation]) -> bool:
+        """Whether these leave no place for one."""
+        return sum((other.uid in self._above) is (one.uid in self._above) for other in others) >= RESERVATIONS_MAX
+
+    def _forget_some(self) -> None:
+        """Of too many that are over, forget those of the user who has most of them: none makes room by another user's."""
+        over = [one for one in self._all.values() if one.over]
+        while len(over) > OVER_MAX:
+            many = Counter(one.uid for one in over)
+            least = max(over, key=lambda one: (many[one.uid], -one.until_ns))
+            over.remove(least)
+            del self._all[least.id]
 
     def end(self, one: Reservation) -> Reservation:
         """It is over; the same, over."""
-        self._all[one.id] = replace(one, over=True)
-        return self._all[one.id]
+        ended = self._all[one.id] = replace(self._all.get(one.id, one), over=True)
+        self._forget_some()
+        return ended
 
     def hear(self, told: Told, now_ns: int) -> bool:
-        """Take what another robot knows; whether it was news."""
-        known = self._all.get(told.id)
+        """Take what another robot knows; whether it was news. A telling that comes late makes none longer."""
+        known, until_ns = self._all.get(told.id), now_ns + told.left_ms * MS
         if known is not None:
+            if until_ns < known.until_ns:
+                self._all[told.id] = replace(known, until_ns=until_ns)
             if told.over and not known.over:
                 self.end(known)
                 return True
             return False
         if not told.left_ms or not _is_path(told.path):
             return False
-        begun_ns, until_ns = now_ns - told.stood_ms * MS, now_ns + told.left_ms * MS
-        heard = Reservation(told.id, told.path, told.uid, told.user, told.why, begun_ns, until_ns, told.over)
-        return self._add(heard, now_ns)
+        return self._add(Reservation(told.id, told.path, told.uid, told.user, told.why, until_ns, told.over), now_ns)
+
+
+def id_of(now_ns: int, dice: str) -> str:
+    """Of one that begins now.
+
+    Args:
+        now_ns: since 1970, by the calendar of the robot where it begins. dice: so that no two are the same.
+    """
+    return f"{now_ns:016x}{dice}"
 
 
 def reserved_path(path: str) -> str:
@@ -172,18 +204,18 @@ def reserved_path(path: str) -> str:
 
 def telling(one: Reservation, now_ns: int) -> Told:
     """As it travels."""
-    stood_ms, left_ms = (min(max(span_ns // MS, 0), SPAN_MS_MAX) for span_ns in (now_ns - one.begun_ns, one.until_ns - now_ns))
-    return Told(one.id, one.path, one.uid, one.user, one.why, stood_ms, left_ms, one.over)
+    left_ms = min(max(-((now_ns - one.until_ns) // MS), 0), SPAN_MS_MAX)  # rounded up: no telling shortens it
+    return Told(one.id, one.path, one.uid, one.user, one.why, left_ms, one.over)
 
 
 def covering(standing: Iterable[Reservation], path: str) -> Reservation | None:
-    """Of these the one in which a path is.
+    """Of these the one in which a path is; of one user's several the deepest.
 
     Raises:
         RightsError: it is no path.
     """
     steps = steps_of(path)
-    return next((one for one in standing if _is_below(steps, one.steps)), None)
+    return max((one for one in standing if _is_below(steps, one.steps)), key=lambda one: len(one.steps), default=None)
 
 
 def at_or_below(path: str, names: Iterable[str]) -> list[str]:
@@ -210,7 +242,3 @@ def _is_path(path: str) -> bool:
 def _contradict(one: Reservation, other: Reservation) -> bool:
     """Whether two users have reserved the same thing."""
     return one.uid != other.uid and (_is_below(one.steps, other.steps) or _is_below(other.steps, one.steps))
-
-
-def _age(one: Reservation) -> tuple[int, str]:
-    return one.begun_ns, one.id

@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import secrets
+import shlex
 import time
 from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
@@ -19,10 +21,22 @@ import msgspec
 
 from agent.errors import TROUBLE, RefusedError
 from agent.system import clock
+from agent.system.permissions import ROOT, may
 from agent.worker.network.remote_orders import Errands
 from checkpoint.store.whole_file import write_whole
 from failover.config import accounts
-from failover.core.reservations import RESERVATIONS_MAX, WHY_SIZE_MAX, Reservation, Table, Told, covering, reserved_path, telling
+from failover.core.reservations import (
+    KNOWN_MAX,
+    WHY_SIZE_MAX,
+    Reservation,
+    Table,
+    Told,
+    at_or_below,
+    covering,
+    id_of,
+    reserved_path,
+    telling,
+)
 from failover.core.types import MS
 from failover.errors import RightsError
 
@@ -47,7 +61,7 @@ class Kept(msgspec.Struct, frozen=True):
 class Hearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What another robot tells."""
 
-    reservations: tuple[Told, ...]
+    reservations: tuple[Told, ...] = ()
 
 
 class Reservations:
@@ -59,14 +73,15 @@ class Reservations:
             reachable: the robots that can be asked now.
         """
         self._path, self._errands, self._reachable = state / FILE, errands, reachable
-        self._table = Table(self._kept())
+        self._table = Table(self._kept(), frozenset({ROOT, os.geteuid()}))
+        self._keeping = asyncio.Lock()
 
     def _kept(self) -> tuple[Reservation, ...]:
         try:
             kept = msgspec.msgpack.decode(self._path.read_bytes(), type=Kept)
         except (OSError, msgspec.DecodeError):
             return ()
-        return kept.reservations[:RESERVATIONS_MAX] if kept.boot_id == clock.kernel_boot() else ()
+        return kept.reservations if kept.boot_id == clock.kernel_boot() else ()
 
     # --- What is asked of it -------------------------------------------------------------------------------------------
 
@@ -76,7 +91,10 @@ class Reservations:
             found = self._table.hinders(uid, path, clock.now_ns())
         except RightsError:
             return ""  # what is no path cannot be reserved
-        return "" if found is None else f"{found.path} is {_told(found)}; ask {found.user}, or wait until then"
+        if found is None:
+            return ""
+        cure = f", or end it with failover unreserve {shlex.quote(found.path)} --break" if may(uid, None) else ""
+        return f"{found.path} is {_told(found)}; ask {found.user}, or wait until then{cure}"
 
     def check(self, uid: int, paths: Iterable[str]) -> None:
         """Let a user give an order about these.
@@ -110,41 +128,53 @@ class Reservations:
             path = reserved_path(path)
         except RightsError as error:
             raise RefusedError(str(error), "RightsError") from error
-        now_ns = clock.now_ns()
         user = await _name_of(uid)
-        wanted = Reservation(secrets.token_hex(8), path, uid, user, why, now_ns, now_ns + span_ms * MS)
+        now_ns = clock.now_ns()
+        wanted = Reservation(id_of(time.time_ns(), secrets.token_hex(4)), path, uid, user, why, now_ns + span_ms * MS)
         hindrance = self._table.why_not(wanted, now_ns)
         if isinstance(hindrance, Reservation):
-            raise RefusedError(f"cannot reserve {path}: {hindrance.path} is {_told(hindrance)}", "PermissionError")
+            raise _is_anothers(path, hindrance)
         if hindrance:
             raise RefusedError(hindrance)
-        changed = self._table.begin(wanted, now_ns)
+        answer = await self._spread(self._table.begin(wanted, now_ns), f"{path} is {_told(wanted)}")
+        hindrance = self._table.why_not(wanted, clock.now_ns())
+        if isinstance(hindrance, Reservation):  # another robot granted it at the same time, before it heard of this one
+            await self._spread((self._table.end(wanted),), "")
+            raise _is_anothers(path, hindrance)
         log.info("%s has reserved %s for %s: %s", user, path, _span(span_ms), why or "no reason given")
-        return await self._spread(changed, f"{path} is {_told(wanted)}") | {"path": path, "left_ms": span_ms}
+        return answer | {"path": path, "left_ms": span_ms}
 
     async def end(self, path: str, uid: int, breaks: bool, may_break: Callable[[str], Awaitable[str]]) -> dict[str, Any]:
         """End the reservation in which a path is.
 
         Args:
-            breaks: also another user's. may_break: why this user may not, asked for the path that is reserved.
+            breaks: also another user's; all at and below the path. may_break: why this user may not end one at a path.
 
         Raises:
             RefusedError: there is none, or it is another user's.
         """
+        standing = self._table.standing(clock.now_ns())
         try:
-            found = self._table.over_path(path, clock.now_ns())
+            covers = covering(standing, path)
+            found = [one for one in standing if breaks and at_or_below(path, [one.path])]
         except RightsError as error:
             raise RefusedError(str(error), "RightsError") from error
-        if found is None:
+        if not found and covers is not None:
+            found = [one for one in standing if one.path == covers.path]
+        if not found:
             raise RefusedError(f"{path} is not reserved")
-        user, sentence = await _name_of(uid), f"{found.path} is free again"
-        if found.uid != uid:
-            refusal = await may_break(found.path) if breaks else "with --break root may end it, and who has the right grant there"
-            if refusal:
-                raise RefusedError(f"{found.path} is {_told(found)}; {refusal}", "PermissionError")
-            sentence += f": {user} has broken the reservation of {found.user}"
+        for one in found:
+            refusal = "with --break root may end it, and who has the right grant there"
+            if one.uid != uid and (refusal := await may_break(one.path) if breaks else refusal):
+                raise RefusedError(f"{one.path} is {_told(one)}; {refusal}", "PermissionError")
+        user, paths = await _name_of(uid), list(dict.fromkeys(one.path for one in found))
+        others = {one.user for one in found if one.uid != uid}
+        sentence = f"{', '.join(paths)} {'is' if len(paths) == 1 else 'are'} free again"
+        if others:
+            sentence += f": {user} has broken the reservation{'s' * (len(paths) > 1)} of {', '.join(sorted(others))}"
         log.info("%s (by %s)", sentence, user)
-        return await self._spread((self._table.end(found),), sentence) | {"path": found.path, "user": found.user}
+        ended = tuple(self._table.end(one) for one in found)
+        return await self._spread(ended, sentence) | {"path": found[0].path, "user": found[0].user}
 
     async def _spread(self, changed: tuple[Reservation, ...], sentence: str) -> dict[str, Any]:
         """Keep it, and tell the others."""
@@ -154,16 +184,17 @@ class Reservations:
         return {"sentence": sentence, "untold": [peer for peer, has in zip(peers, heard, strict=True) if not has]}
 
     async def _keep(self) -> None:
-        kept = Kept(clock.kernel_boot(), self._table.all(clock.now_ns()))
-        try:
-            await asyncio.to_thread(write_whole, self._path, msgspec.msgpack.encode(kept))
-        except OSError as error:
-            log.warning("reservations do not outlive this agent: %s: %s", self._path, error.strerror)
+        async with self._keeping:
+            kept = Kept(clock.kernel_boot(), self._table.all(clock.now_ns()))
+            try:
+                await asyncio.to_thread(write_whole, self._path, msgspec.msgpack.encode(kept))
+            except OSError as error:
+                log.warning("reservations do not outlive this agent: %s: %s", self._path, error.strerror)
 
     # --- Between robots ------------------------------------------------------------------------------------------------
 
     async def hear(self, arguments: dict[str, Any], _by: int) -> dict[str, Any]:
-        """Another robot tells what it knows.
+        """Another robot tells what it knows; what it does not know yet is the answer.
 
         Raises:
             RefusedError: it is nothing that a robot of this version tells.
@@ -173,9 +204,10 @@ class Reservations:
         except msgspec.ValidationError as error:
             raise RefusedError(f"reservations were not understood: {error}; the robots are of different versions") from error
         now_ns = clock.now_ns()
-        if [one for one in told[:RESERVATIONS_MAX] if self._table.hear(one, now_ns)]:
+        if [one for one in told[:KNOWN_MAX] if self._table.hear(one, now_ns)]:
             await self._keep()
-        return {}
+        said = {(one.id, one.over) for one in told}
+        return _as_told(one for one in self._table.all(now_ns) if (one.id, one.over) not in said)
 
     async def tell_again(self) -> None:
         """Tell all robots again and again, until it is cancelled."""
@@ -190,10 +222,8 @@ class Reservations:
 
     async def _tell(self, peer: str, some: tuple[Reservation, ...]) -> bool:
         """Whether it has heard it."""
-        now_ns = clock.now_ns()
-        told = msgspec.to_builtins(Hearing(tuple(telling(one, now_ns) for one in some)))
         try:
-            await self._errands().send(peer, "reservations", told, patience_s=PATIENCE_S)
+            await self.hear(await self._errands().send(peer, "reservations", _as_told(some), patience_s=PATIENCE_S), ROOT)
         except RefusedError:
             return False
         return True
@@ -204,6 +234,16 @@ def checked_reason(why: str) -> str:
     if len(why) > WHY_SIZE_MAX or not why.isprintable():
         raise RefusedError(f"a reason is one line of at most {WHY_SIZE_MAX} characters")
     return why
+
+
+def _as_told(some: Iterable[Reservation]) -> dict[str, Any]:
+    now_ns = clock.now_ns()
+    told: dict[str, Any] = msgspec.to_builtins(Hearing(tuple(telling(one, now_ns) for one in some)))
+    return told
+
+
+def _is_anothers(path: str, other: Reservation) -> RefusedError:
+    return RefusedError(f"cannot reserve {path}: {other.path} is {_told(other)}", "PermissionError")
 
 
 async def _name_of(uid: int) -> str:

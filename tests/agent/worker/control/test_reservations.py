@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -95,3 +96,81 @@ def test_a_main_loop_that_does_not_answer_in_time_is_asked_again(reserved: Path,
     with pytest.raises(EOFError):
         asyncio.run(Reservations(reserved, no_errands, late).tell_again())
     assert asked == [0, 1, 2]
+
+
+def test_root_is_told_how_to_break_it_and_breaks_all_at_and_below_a_path_at_once(reserved: Path) -> None:
+    async def may(_path: str) -> str:
+        return ""
+
+    asyncio.run(at(reserved).begin("/lab/r2", BEN, 600_000, ""))
+    refusal = at(reserved).refusal(0, MAPPER)
+    assert refusal.endswith("or wait until then, or end it with failover unreserve /lab/r1 --break")
+    assert "--break" not in at(reserved).refusal(BEN, MAPPER)
+    told = asyncio.run(at(reserved).end("/lab", 0, True, may))
+    who = f"root has broken the reservations of uid {ANNA}, uid {BEN}"
+    assert told["sentence"] == f"/lab/r1, /lab/r2 are free again: {who}"
+    assert at(reserved).refusal(0, MAPPER) == at(reserved).refusal(0, "/lab/r2") == ""
+
+
+def test_the_deepest_of_ones_own_is_ended(reserved: Path) -> None:
+    asyncio.run(at(reserved).begin(MAPPER, ANNA, 600_000, ""))
+    assert asyncio.run(at(reserved).end(MAPPER, ANNA, False, no_right))["path"] == MAPPER
+    assert at(reserved).refusal(BEN, MAPPER).startswith("/lab/r1 is reserved")
+
+
+class Way:
+    """Between two robots: each message takes a few turns of the event loop, and answers do, too."""
+
+    def __init__(self, turns: int) -> None:
+        self.turns = turns
+        self.there: dict[str, Reservations] = {}
+
+    def errands(self) -> Errands:
+        return cast(Errands, self)
+
+    async def send(self, peer: str, _verb: str, arguments: dict[str, Any], patience_s: float) -> dict[str, Any]:
+        assert patience_s > 0
+        await self._travel()
+        answer = await self.there[peer].hear(arguments, 0)
+        await self._travel()
+        return answer
+
+    async def _travel(self) -> None:
+        for _ in range(self.turns):
+            await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("turns", [(0, 0), (50, 0), (0, 50), (9, 9)])
+def test_of_two_at_once_at_two_robots_one_is_refused_and_both_robots_agree(tmp_path: Path, turns: tuple[int, int]) -> None:
+    ways = [Way(each) for each in turns]
+
+    def robot(number: int) -> Reservations:
+        async def other() -> list[str]:
+            return [f"r{1 - number}"]
+
+        place = tmp_path / str(number)
+        place.mkdir()
+        return Reservations(place, ways[number].errands, other)
+
+    async def both() -> None:
+        first, second = robot(0), robot(1)
+        ways[0].there["r1"], ways[1].there["r0"] = second, first
+        begun = first.begin(MAPPER, ANNA, 600_000, ""), second.begin("/lab/r1", BEN, 600_000, "")
+        answers = await asyncio.gather(*begun, return_exceptions=True)
+        refused = [answer for answer in answers if isinstance(answer, RefusedError)]
+        assert len(refused) == 1 and "is reserved by uid" in str(refused[0]), answers
+        for user, answer in zip((ANNA, BEN), answers, strict=True):
+            stands = answer is not refused[0]
+            assert [each.refusal(60_003, MAPPER).count(f"by uid {user}") for each in (first, second)] == [stands, stands]
+
+    asyncio.run(both())
+
+
+def test_many_at_once_write_one_file_after_the_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def many() -> None:
+        table = at(tmp_path)
+        await asyncio.gather(*(table.begin(f"/lab/r{number}", ANNA + number, 600_000, "") for number in range(40)))
+
+    asyncio.run(many())
+    assert "do not outlive" not in caplog.text
+    assert all(at(tmp_path).refusal(BEN + 99, f"/lab/r{number}") for number in range(40))
