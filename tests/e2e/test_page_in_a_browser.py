@@ -285,16 +285,17 @@ def focused(window: Page, name: str) -> str | None:
 
 # --- For everybody's eyes and ears ---------------------------------------------------------------------------------------------
 
-VIEWS = (
-    "#/",
-    f"#/component/{NAME.replace('/', '%2F')}",
-    "#/robot/robot2",
-    "#/board",
-    "#/item/robot1%2Falarm",
-    "#/radio",
-    "#/orders",
-    f"#/driver/{LEDGER.replace('/', '%2F')}",
-)
+VIEWS = {
+    "#/": "The team",
+    f"#/component/{NAME.replace('/', '%2F')}": NAME,
+    "#/robot/robot2": "robot2",
+    "#/board": "The board",
+    "#/item/robot1%2Falarm": "robot1/alarm",
+    "#/radio": "Links and radio",
+    "#/orders": "Orders on this page",
+    f"#/driver/{LEDGER.replace('/', '%2F')}": LEDGER,
+}
+"""Address → heading."""
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -312,9 +313,9 @@ def test_axe_finds_nothing_wrong_with_any_view(browser: Browser, page_of_two: Se
         window.get_by_label("Password").wait_for()
         assert mistakes(window, *rules) == [], "the login"
         log_in(window, "anna")
-        for number, view in enumerate(VIEWS):
+        for number, (view, heading) in enumerate(VIEWS.items()):
             window.evaluate("(view) => { location.hash = view; }", view)
-            window.get_by_role("heading", level=2).first.wait_for()
+            window.get_by_role("heading", name=heading, exact=True, level=2).wait_for()
             if view == "#/board":
                 window.get_by_role("row", name=re.compile("alarm")).wait_for()
             if "component" in view:
