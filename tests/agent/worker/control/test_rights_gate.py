@@ -51,7 +51,7 @@ class Robot:
 
     errands = None
     settings = SimpleNamespace(
-        team=SimpleNamespace(team="lab", robots={}),
+        team=SimpleNamespace(team="lab"),
         config=SimpleNamespace(robot="robot1", state_directory="nowhere", insecure=False),
     )
 
@@ -254,16 +254,43 @@ def test_no_component_named_like_a_robot_lets_a_user_reserve_all_below_it(
         assert "all below a path only root" in reserved(tmp_path, name, NOBODY)
 
 
+def verbs_at(place: Path, gate: RightsGate | None = None, **peers: str) -> Verbs:
+    """Of robot1, which hears these peers: name → role."""
+    robot, told = cast(Any, Robot()), []
+
+    async def send(peer: str, *_what: Any, **_how: Any) -> dict[str, Any]:
+        told.append(peer)
+        return {}
+
+    team = SimpleNamespace(team="lab", robots={name: SimpleNamespace(role=role) for name, role in peers.items()})
+    config = SimpleNamespace(robot="robot1", state_directory=str(place), insecure=False)
+    robot.settings, robot.errands = SimpleNamespace(team=team, config=config), SimpleNamespace(send=send, told=told)
+    picture = {"peers": [{"name": name, "state": "live"} for name in peers], "components": []}
+    robot.picture = lambda _told: picture | {"components": [dict(one) for one in COMPONENTS]}
+    return Verbs(robot, gate)
+
+
+def test_a_witness_is_told_of_no_reservation(tmp_path: Path) -> None:
+    verbs = verbs_at(tmp_path, robot2="robot", gate="witness", store="server")
+    answer = asyncio.run(verbs.reservations.begin("/lab/robot1", os.geteuid(), 60_000, ""))
+    told = cast(Any, verbs.reservations)._errands().told
+    assert (sorted(told), answer["untold"]) == (["robot2", "store"], [])
+
+
+def test_a_name_that_is_no_path_and_so_is_in_no_reservation_is_refused(tmp_path: Path) -> None:
+    rights = SimpleNamespace(as_user=lambda *_: rights)
+    say = SimpleNamespace(caller=SimpleNamespace(uid=os.geteuid(), inheritance=rights))
+    order = verbs_at(tmp_path).table()["run"](cast(Any, say), {"name": "/lab" + 16 * "/x", "argv": ["/bin/true"], "wait": False})
+    with pytest.raises(RefusedError, match="is no path: at most 200 bytes and 16 steps"):
+        asyncio.run(cast(Any, order))
+
+
 def reserved(place: Path, path: str, uid: int) -> str:
     """What a user is told who reserves a path."""
-    robot = cast(Any, Robot())
-    robot.settings = SimpleNamespace(
-        team=Robot.settings.team, config=SimpleNamespace(robot="robot1", state_directory=str(place), insecure=False)
-    )
     gate = RightsGate(place, place)
     say = SimpleNamespace(caller=SimpleNamespace(uid=uid))
     try:
-        order = Verbs(robot, gate).gated()["reserve"](cast(Any, say), {"name": path, "span_ms": 60_000})
+        order = verbs_at(place, gate).gated()["reserve"](cast(Any, say), {"name": path, "span_ms": 60_000})
         return str(asyncio.run(cast(Any, order))["sentence"])
     except RefusedError as refusal:
         return str(refusal)
