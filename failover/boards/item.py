@@ -43,6 +43,8 @@ from failover.fencing.epoch import epoch
 
 SLICE_S: Final = 0.1
 """The longest sleep without a look: a wake-up may be lost (BOARD.md), and a board may be made anew."""
+NUMBER_MAX: Final = 1 << 63
+"""No put has such a number; a board's file that was written over may say so."""
 TURNS: Final = 100
 """Of a call whose board is made anew each time it looks."""
 PUT_WAIT_S: Final = 5.0
@@ -194,7 +196,12 @@ class ItemWriter:
             raise BoardError(f"item {self.name!r} of {file.path} may only be read by uid {os.geteuid()}")
         if not file.take_writer(record, os.getpid()):
             raise WriterTakenError(self._board.whose(file, record))
-        number = first_of_epoch(place.words[place.newest], epoch(), record.banks) - 1
+        newest = place.words[place.newest]
+        number = first_of_epoch(newest, epoch(), record.banks) - 1
+        if number >= NUMBER_MAX:
+            raise BoardError(
+                f"damaged: item {self.name!r} of {file.path}: its newest put has the number {newest}; none can follow"
+            )
         woken = _waker(file, record)
         return writer_of(place, number, boottime.CLOCK, self._board.skew_ns, self.put_slowly, woken, file.always_wakes, FENCE)
 
