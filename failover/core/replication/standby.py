@@ -65,7 +65,7 @@ def choose_standby(component: Component, turn: Turn) -> None:
         chosen = min(able, key=placing).robot
         if chosen == component.standby:
             return
-        component.standby = chosen
+        component.standby, component.replaced = chosen, ""
         component.due_ns = turn.now_ns
         turn.say(component, f"{component.standby} is its standby")
 
