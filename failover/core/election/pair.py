@@ -418,10 +418,14 @@ def _outlast(component: Component, turn: Turn, sender: str, entry: Entry, theirs
         renew(component, turn, entry.epoch)
         return
     patience_ns = turn.team.patience_ns(sender)
-    if turn.now_ns >= component.rival_ns + 2 * patience_ns:
-        component.rival_ns = turn.now_ns
-    elif turn.now_ns >= component.rival_ns + patience_ns and stronger(component, turn, sender, entry, theirs):
+    component.rival_ns = _waiting_since_ns(component.rival_ns, patience_ns, turn)
+    if turn.now_ns >= component.rival_ns + patience_ns and stronger(component, turn, sender, entry, theirs):
         lose(component, turn, sender, entry)
+
+
+def _waiting_since_ns(since_ns: int, patience_ns: int, turn: Turn) -> int:
+    """Since when something is waited for: a wait that was over for as long as it may last was for another cause."""
+    return turn.now_ns if turn.now_ns >= since_ns + 2 * patience_ns else since_ns
 
 
 def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
@@ -534,8 +538,7 @@ def _awaits_its_word(component: Component, turn: Turn, rival: str) -> bool:
     may_stay = component.state is State.PRIMARY and (component.ordered or not component.stood)
     if not may_stay or turn.config.by_majority or component.freezes or rival not in turn.team.peers:
         return False
-    if turn.now_ns >= component.told_of_ns + 2 * turn.config.grace_ns:
-        component.told_of_ns = turn.now_ns
+    component.told_of_ns = _waiting_since_ns(component.told_of_ns, turn.config.grace_ns, turn)
     return turn.now_ns < component.told_of_ns + turn.config.grace_ns
 
 
