@@ -18,6 +18,7 @@ from failover.cli.arguments.components import HOOKS
 from failover.cli.connection import connect
 from failover.cli.output import progress, render, team_tree
 from failover.client.control import Control, Output, Update
+from failover.client.health import OVER_STATES
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
 
 RECONNECT_S: Final = 30.0
@@ -28,7 +29,7 @@ RECONNECT_EVERY_S: Final = 0.2
 LOOK_EVERY_S: Final = 0.2
 """Between two looks whether a component is protected."""
 
-ENDED: Final = ("ended", "failed", "released")
+ENDED: Final = OVER_STATES | {"failed"}
 
 
 # --- run -------------------------------------------------------------------------------------------------------------
