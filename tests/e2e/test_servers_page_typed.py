@@ -18,8 +18,10 @@ from tests.e2e.test_decorator_page_typed import Terminal, terminal
 PAGE = DECORATOR_PAGE.with_name("servers.md")
 MEMBERS = ("r1", "r2", "hall")
 KEPT = "json=$(failover status --json --socket hall/run/control.sock); echo $json"
-OF_ITS_OWN = re.compile(r'"components": \[\{"name": "/here/r1/counter", "role": "standby"')
-"""What the server says of itself; what it says of the others follows below "elsewhere"."""
+OF_ITS_OWN = re.compile(r'"components": \[\{"name": "/here/r1/counter", "role": "standby"[^{}]*"sequence": \d')
+"""What the server says of itself, once it has a checkpoint: it is a standby before, and the program's files arrive first.
+What it says of the others follows below "elsewhere".
+"""
 SEEN = 20
 """Numbers that are counted before the robots die, and after."""
 
