@@ -437,6 +437,11 @@ def gives_up_to_any_end() -> Any:
     return patch.object(votes, "_heard_end", pair.heard_end), patch.object(pair, "_acted_all_along", lambda *_: False)
 
 
+def leaves_its_primary_for_an_end() -> Any:
+    """A voter records an end that any robot tells of, although its primary runs the component."""
+    return patch.object(majority, "may_record_end", lambda *_: True)
+
+
 def waits_for_every_server() -> Any:
     """A standby waits for what a server says to have, however long."""
     return patch.object(votes, "_waits_for_a_server", lambda component, turn, mine, best: best is not None and mine < best)
@@ -620,6 +625,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (deaf_to_denial, "a_lying_witness_ends_nothing"),
     (gives_up_to_any_end, "a_lying_robot_ends_nothing_of_a_majority"),
     (gives_up_to_any_end, "a_lying_robot_of_a_pair_ends_nothing"),
+    (leaves_its_primary_for_an_end, "a_lying_robot_ends_nothing_of_a_majority"),
     (waits_for_every_server, "a_robot_is_replaced_although_a_server_lies"),
     (never_mind_who_repeats, "a_robot_is_replaced_although_a_witness_lies"),
     (forgets_weeks, "a_robot_that_was_away_while_epochs_passed_takes_them_over"),

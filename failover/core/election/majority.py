@@ -67,6 +67,13 @@ def may_follow(component: Component, turn: Turn, sender: str, entry: Entry) -> b
     return bool(entry.flags & ORDERED) or eligible(component, turn, sender, entry.position)
 
 
+def may_record_end(component: Component, turn: Turn, entry: Entry) -> bool:
+    """Whether to believe a member that says the component has ended: as one would follow the robot that ended it."""
+    if entry.primary == component.primary or not component.primary or is_free(component, turn):
+        return True
+    return elected(component, turn, entry.primary, entry.epoch)
+
+
 def eligible(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
     """Whether nothing that was acknowledged is lost if this robot goes on from ``position``."""
     return component.open or component.state in ENDED or holds_all(component, turn, robot, position)
