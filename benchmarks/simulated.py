@@ -1,0 +1,147 @@
+"""Simulated robots with the page open: missed deadlines, processor time, memory, and what the page takes.
+
+python -m benchmarks.simulated --minutes 10     80 robots in 4 labs, and a browser that shows one of them
+
+The simulation registers with an agent on the loopback, whose page a browser has open: Debian's chromium, driven by playwright.
+Nothing else should run meanwhile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final
+
+import psutil
+
+from benchmarks.costs import pss_mb
+from benchmarks.figures import Figure, Findings, table
+from benchmarks.main_loop import TeamStage
+from benchmarks.running import BenchmarkError
+from failover.drivers.here import DIRECTORY, ROBOT
+
+LABS: Final = 4
+BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
+BROWSER_PATIENCE_MS: Final = 120_000
+LOOK_S: Final = 5.0
+SHOWN: Final = ("Simulated", "University", "Lab1", "Robotino1", "US")
+"""Rows of the tree that the browser opens, one below the other."""
+
+MISSED: Final = "missed deadlines"
+
+
+def simulated(count: int, span_s: float, directory: Path) -> Findings:
+    """Measure so many robots for so long."""
+    drivers, board = directory / "drivers", directory / "board"
+    drivers.mkdir(mode=0o700)
+    environment = {**os.environ, DIRECTORY: str(drivers), ROBOT: "robot1"}
+    with ExitStack() as stack:
+        stage = stack.enter_context(TeamStage(directory / "robots", 2, ""))
+        stage.start()
+        page, url = stack.enter_context(_page(stage.robots[0].socket, directory, environment))
+        words = ("--robots", str(count), "--labs", str(LABS), "--for", f"{span_s:.0f}s", "--json", "--board", str(board))
+        simulation = subprocess.Popen(
+            [sys.executable, "-m", "failover", "simulate", *words], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        stack.callback(simulation.kill)
+        stack.enter_context(_watching(url))
+        began, used, memory = time.monotonic(), _processor_s(page), 0.0
+        while simulation.poll() is None:
+            memory = max(memory, sum(pss_mb(one.pid) for one in _family(page)))
+            time.sleep(LOOK_S)
+        share = (_processor_s(page) - used) / (time.monotonic() - began) * 100
+        assert simulation.stdout is not None
+        said = json.loads(simulation.stdout.read())
+    case = f"{count} robots in {LABS} labs, {span_s:.0f} s"
+    figures = [
+        Figure("activations of controllers", case, "", (float(said["activations"]),)),
+        Figure(MISSED, case, "", (float(said["missed"]),)),
+        *(Figure(f"lateness, {part}", case, "ms", (float(ms),)) for part, ms in said["late_ms"].items()),
+        Figure("processor time of the simulation", case, "cores", (float(said["cores"]),)),
+        Figure("memory of the simulation", case, "MB", (float(said["memory_mb"]),)),
+        Figure("processor time of the page", case, "% of a core", (share,)),
+        Figure("memory of the page", case, "MB", (memory,)),
+    ]
+    story = "Each controller is due every 50 ms and is to end 50 ms later. A browser shows the sensors of one robot, live."
+    return Findings("Simulated robots with the page open", story, tuple(figures))
+
+
+@contextmanager
+def _page(socket: Path, directory: Path, environment: dict[str, str]) -> Iterator[tuple[psutil.Process, str]]:
+    """The page of a robot, at a free port of the loopback."""
+    config, log = directory / "page.toml", directory / "page.log"
+    config.touch()
+    options = ("--config", str(config), "--listen", "127.0.0.1:0", "--socket", str(socket), "--json")
+    with log.open("w") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "failover", "page", *options], env=environment, stdout=subprocess.PIPE, stderr=said, text=True
+        )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line:
+            raise BenchmarkError(f"the page did not start: {log.read_text()[-500:]}")
+        yield psutil.Process(process.pid), json.loads(line)["url"]
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@contextmanager
+def _watching(url: str) -> Iterator[None]:
+    """A browser that shows the sensors of one simulated robot, live."""
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), "")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        path = ""
+    if not path:
+        raise BenchmarkError("no browser can be driven here: install chromium, and playwright of requirements-test.txt")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], timeout=0)
+        window = browser.new_page()
+        window.set_default_timeout(BROWSER_PATIENCE_MS)
+        window.goto(url)
+        for step in SHOWN:
+            row = window.get_by_role("treeitem", name=re.compile(f"^{step}(,|$)")).first
+            row.wait_for()
+            row.locator(".name").first.click()
+        window.get_by_role("treeitem", name=re.compile(", simulated, live")).first.wait_for()
+        yield
+        browser.close()
+
+
+def _family(process: psutil.Process) -> list[psutil.Process]:
+    return [process, *process.children(recursive=True)]
+
+
+def _processor_s(process: psutil.Process) -> float:
+    return sum(sum(one.cpu_times()[:2]) for one in _family(process))
+
+
+def main() -> int:
+    """For as long as is asked for; fails where a deadline was missed."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.simulated", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=1.0, help="default 1")
+    parser.add_argument("--robots", type=int, default=80, help="default 80")
+    wanted = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="failover-benchmark-") as directory:
+        found = simulated(wanted.robots, wanted.minutes * 60, Path(directory))
+    print(found.story, table(found.figures), sep="\n\n")
+    return 1 if any(figure.benchmark == MISSED and figure.median for figure in found.figures) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
