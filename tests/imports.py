@@ -45,23 +45,28 @@ def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
                 yield node.lineno, first.value
 
 
+@functools.cache
+def imports_of(path: Path, package: tuple[str, ...]) -> tuple[tuple[int, str], ...]:
+    """Every import of a file: (line, dotted module). Read once: several rules look at all files."""
+    return tuple(imports(ast.parse(path.read_text(), str(path)), list(package)))
+
+
 def called(node: ast.Call) -> str:
     """The last part of the name that a call calls, "" for anything fancier."""
     return node.func.id if isinstance(node.func, ast.Name) else node.func.attr if isinstance(node.func, ast.Attribute) else ""
 
 
-def imported(tree: ast.AST, known: Iterable[str]) -> set[str]:
-    """The modules of the product that a source imports; ``from package import name`` may be a module."""
+def imported(found: Iterable[tuple[int, str]], known: Iterable[str]) -> set[str]:
+    """The modules of the product that a source with these imports has; ``from package import name`` may be a module."""
     known = set(known)
-    names = (name for _, name in imports(tree, []))
+    names = (name for _, name in found)
     return {name if name in known else name.rpartition(".")[0] for name in names} & known
 
 
-@functools.cache
 def graph(root: Path = ROOT) -> dict[str, set[str]]:
     """The imports of all modules of the product."""
     known = modules(root)
-    return {name: imported(ast.parse(path.read_text()), known) - {name} for name, path in known.items()}
+    return {name: imported(imports_of(path, path.relative_to(root).parent.parts), known) - {name} for name, path in known.items()}
 
 
 def circles(edges: Graph) -> list[list[str]]:

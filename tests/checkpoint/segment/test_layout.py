@@ -207,6 +207,7 @@ def test_a_commit_that_is_not_named_yet_is_not_read(monkeypatch: pytest.MonkeyPa
             assert found is not None and number_read(found) == found.number == BANKS
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_instant_leaves_one_whole_commit_no_older_than_what_was_read() -> None:
     dice = random.Random(SEED)
     print(f"FAILOVER_SEED={SEED}")

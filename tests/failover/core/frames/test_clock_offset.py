@@ -86,6 +86,7 @@ WAYS = [(quiet, quiet), (queueing, queueing), (one_sided, quiet), (quiet, one_si
 CLOCKS = [((0, 0), 0), ((100, -100), 3 * YEAR_NS), ((-550, 550), -YEAR_NS // 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("there", "back"), WAYS)
 @pytest.mark.parametrize(("ppm", "apart_ns"), CLOCKS)
 def test_in_an_hour_no_frame_was_longer_on_its_way_than_its_bound(

@@ -451,6 +451,7 @@ def test_a_message_brought_forward_overtakes_other_senders_and_never_its_own() -
     assert [(one.sender, one.verb) for one in found] == [("one", "_look"), ("two", "set")]  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MUTANTS)
 def test_a_mistake_in_the_mailbox_is_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     attribute, wrong = MUTANTS[name]
