@@ -151,10 +151,10 @@ def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> Non
         while True:
             status = agent.ask("status")
             one = next((one for one in status["components"] if one["name"] == name), None)
-            if one is None or one["state"] in ENDED:
-                raise FailoverError(
-                    f"{name} is {one['state'] if one else 'gone'}: it will not be protected; see failover why {name}"
-                )
+            if one is None:
+                raise FailoverError(f"{name} is not seen: it was released, or you may not see it; see failover rights why")
+            if one["state"] in ENDED:
+                raise FailoverError(f"{name} is {one['state']}: it will not be protected; see failover why {name}")
             if one["protection"] == "protected":
                 return
             if one["protection"] == "stopped":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from bisect import bisect_right
+from collections import deque
 from typing import Any, Final
 
 from msgspec import Struct, field
@@ -99,20 +100,20 @@ def _show_tail(agent: Control, shown: Shown) -> dict[str, Any]:
     """Show the last lines of each stream; returns the agent's last answer."""
     lines, since_ms, size = shown.arguments.tail, shown.arguments.since or 0, TAIL_SIZE
     while True:
-        pieces: dict[int, list[Output]] = {stream: [] for stream in STREAMS}
+        tails = {stream: Tail(lines) for stream in STREAMS}
         offsets = [0, 0] if since_ms else [-size, -size]
         answer: dict[str, Any] = {}
         for reply in agent.stream("logs", name=shown.arguments.name, offsets=offsets, **_besides(shown.arguments, since_ms)):
             if isinstance(reply, Output):
-                pieces[reply.stream].append(reply)
+                tails[reply.stream].add(reply)
             elif isinstance(reply, Result):
                 answer = reply.value
         is_all = since_ms or size >= KEPT_SIZE
-        if is_all or all(_has_lines(of_stream, lines, size) for of_stream in pieces.values()):
+        if is_all or all(tail.is_enough(size) for tail in tails.values()):
             break
         size *= 2
-    for of_stream in pieces.values():
-        for piece in _last_lines(of_stream, lines):
+    for tail in tails.values():
+        for piece in tail.last_lines():
             shown.show(piece)
     shown.offsets[:] = answer["totals"]
     return answer
@@ -123,26 +124,47 @@ def _besides(arguments: argparse.Namespace, since_ms: int) -> dict[str, Any]:
     return ({"since_ms": since_ms} if since_ms else {}) | ({"times": True} if arguments.times else {})
 
 
-def _has_lines(pieces: list[Output], lines: int, size: int) -> bool:
-    """Whether there are so many whole lines, or no more than what came."""
-    content = sum(len(piece.content) for piece in pieces)
-    return content < size or sum(piece.content.count(b"\n") for piece in pieces) > lines
+class Tail:
+    """The last lines of one stream, while its pieces come: of all that was written since yesterday no more than is shown."""
 
+    def __init__(self, lines: int) -> None:
+        self._lines = lines
+        self._pieces: deque[Output] = deque()
+        self._newlines = 0
 
-def _last_lines(pieces: list[Output], lines: int) -> list[Output]:
-    """The last lines of one stream; a last one that is not whole yet counts."""
-    found: list[Output] = []
-    left = lines + (not pieces or pieces[-1].content.endswith(b"\n"))
-    for piece in reversed(pieces):
-        begin = len(piece.content)
-        while left > 0 and (newline := piece.content.rfind(b"\n", 0, begin)) >= 0:
-            begin, left = newline, left - 1
-        if left > 0:
-            found.append(piece)
-            continue
-        found.append(Output(piece.stream, piece.offset + begin + 1, piece.content[begin + 1 :], piece.times))
-        break
-    return found[::-1] if lines else []
+    def add(self, piece: Output) -> None:
+        """Take one that follows; forget those before the last lines."""
+        if not piece.content:
+            return
+        self._pieces.append(piece)
+        self._newlines += piece.content.count(b"\n")
+        while self._newlines - (first := self._pieces[0].content.count(b"\n")) > self._lines:
+            self._newlines -= first
+            self._pieces.popleft()
+
+    @property
+    def held(self) -> int:
+        """Pieces."""
+        return len(self._pieces)
+
+    def is_enough(self, size: int) -> bool:
+        """Whether there are so many whole lines, or fewer bytes came than were asked for."""
+        return self._newlines > self._lines or sum(len(piece.content) for piece in self._pieces) < size
+
+    def last_lines(self) -> list[Output]:
+        """What is shown; a last line that is not whole yet counts."""
+        found: list[Output] = []
+        left = self._lines + (not self._pieces or self._pieces[-1].content.endswith(b"\n"))
+        for piece in reversed(self._pieces):
+            begin = len(piece.content)
+            while left > 0 and (newline := piece.content.rfind(b"\n", 0, begin)) >= 0:
+                begin, left = newline, left - 1
+            if left > 0:
+                found.append(piece)
+                continue
+            found.append(Output(piece.stream, piece.offset + begin + 1, piece.content[begin + 1 :], piece.times))
+            break
+        return found[::-1] if self._lines else []
 
 
 def _instant(piece: Output, offset: int) -> str:

@@ -209,7 +209,7 @@ def test_a_program_whose_output_is_shown_is_not_waited_for(agent: Start) -> None
 @pytest.mark.parametrize(
     ("shown", "told"),
     [
-        ({"components": []}, "is gone: it will not be protected"),
+        ({"components": []}, "is not seen: it was released, or you may not see it"),
         ({"components": [COMPONENT | {"state": "failed", "protection": "none"}]}, "is failed: it will not be protected"),
         ({"peers": [], "components": [COMPONENT | {"protection": "none"}]}, "no other member of the team keeps checkpoints"),
     ],
