@@ -185,3 +185,14 @@ def test_of_three_robots_the_copy_that_never_stopped_stays_though_another_one_ha
     world.network.cuts.clear()
     assert later(world, 2_000) == ["robot2"]
     assert "never stopped acting" in " ".join(one.sentence for one in world.robots["robot2"].told)
+
+
+def test_a_robot_that_ran_it_before_tells_the_age_of_the_checkpoint_it_takes_over_from_and_not_of_its_own_last_one() -> None:
+    world = at_robot1(lacks=())
+    assert later(world, 1_000) == ["robot2"]
+    world.command("robot2", Prefer(world.request(), PART, "robot1"))
+    assert later(world, LONG_MS) == ["robot1"]
+    world.power_off("robot1")
+    assert later(world, LONG_MS) == ["robot2"]
+    claim = next(one for one in reversed(world.robots["robot2"].told) if " claims epoch " in one.sentence)
+    assert 0 <= claim.facts.checkpoint_age_ns < 1_000 * MS

@@ -174,7 +174,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.unprotected, component.needs_base = False, False
     component.degraded = component.awaited = ""
     component.undelivered = component.unstored = ""
-    component.resumed_ns = component.lost_ns = -1
+    component.acked, component.acked_ns, component.resumed_ns, component.lost_ns = None, -1, -1, -1
     component.safe = component.vouched = component.shown = None
     component.handing, component.reported = None, False
     component.ending, component.end_signal = False, 0
