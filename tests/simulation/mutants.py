@@ -442,6 +442,12 @@ def leaves_its_primary_for_an_end() -> Any:
     return patch.object(majority, "may_record_end", lambda *_: True)
 
 
+def asks_the_dead_for_their_vote() -> Any:
+    """The vote of the robot that ended it counts only while that robot tells it."""
+    found = majority.elected
+    return patch.object(majority, "elected", lambda component, turn, robot, epoch, _=0: found(component, turn, robot, epoch))
+
+
 def waits_for_every_server() -> Any:
     """A standby waits for what a server says to have, however long."""
     return patch.object(votes, "_waits_for_a_server", lambda component, turn, mine, best: best is not None and mine < best)
@@ -626,6 +632,7 @@ SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (gives_up_to_any_end, "a_lying_robot_ends_nothing_of_a_majority"),
     (gives_up_to_any_end, "a_lying_robot_of_a_pair_ends_nothing"),
     (leaves_its_primary_for_an_end, "a_lying_robot_ends_nothing_of_a_majority"),
+    (asks_the_dead_for_their_vote, "an_end_is_learned_although_the_robot_that_tells_of_it_first_is_gone"),
     (waits_for_every_server, "a_robot_is_replaced_although_a_server_lies"),
     (never_mind_who_repeats, "a_robot_is_replaced_although_a_witness_lies"),
     (forgets_weeks, "a_robot_that_was_away_while_epochs_passed_takes_them_over"),

@@ -69,9 +69,11 @@ def may_follow(component: Component, turn: Turn, sender: str, entry: Entry) -> b
 
 def may_record_end(component: Component, turn: Turn, entry: Entry) -> bool:
     """Whether to believe a member that says the component has ended: as one would follow the robot that ended it."""
-    if entry.primary == component.primary or not component.primary or is_free(component, turn):
+    ender = entry.primary
+    if ender == component.primary or not component.primary or is_free(component, turn):
         return True
-    return elected(component, turn, entry.primary, entry.epoch)
+    implied = ender != turn.me and not turn.alive(ender)  # the vote that it had from itself, which it cannot tell
+    return elected(component, turn, ender, entry.epoch, implied)
 
 
 def eligible(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
@@ -79,10 +81,14 @@ def eligible(component: Component, turn: Turn, robot: str, position: Position | 
     return component.open or component.state in ENDED or holds_all(component, turn, robot, position)
 
 
-def elected(component: Component, turn: Turn, robot: str, epoch: int) -> bool:
-    """Whether a majority of the others names that robot, none of them with a copy of its own: its election is a fact."""
+def elected(component: Component, turn: Turn, robot: str, epoch: int, implied: int = 0) -> bool:
+    """Whether a majority of the others names that robot, none of them with a copy of its own: its election is a fact.
+
+    Args:
+        implied: votes of members that cannot tell them.
+    """
     words = (entry for _, entry in _words(component, turn) if state_of(entry) is not State.STOPPING)
-    return sum((entry.epoch, entry.primary) == (epoch, robot) for entry in words) >= turn.config.quorum
+    return implied + sum((entry.epoch, entry.primary) == (epoch, robot) for entry in words) >= turn.config.quorum
 
 
 def won(component: Component, turn: Turn) -> bool:
