@@ -1,4 +1,4 @@
-"""Decides which robot runs a component: claims, consent, and the consequences of another robot's word.
+"""Decides which robot runs a component: claims, consent, and the consequences of another robot's word. `votes` shares half of it.
 
 A primacy is an epoch and the robot that all robots which know of it name as its primary. The rules:
 

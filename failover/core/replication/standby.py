@@ -1,4 +1,4 @@
-"""Replication of a component's state to its standby, and its acknowledgement there.
+"""Replication of a component's state to its standby: the primary's side, and `stored` at the standby, which acknowledges.
 
 Invariants: one snapshot in flight per component (a slower link means fewer snapshots, not longer queues); a position is
 acknowledged to the keeper only when it is safe elsewhere, or no other robot is there; a delta counts from the standby's position.
