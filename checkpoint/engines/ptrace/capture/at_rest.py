@@ -50,11 +50,14 @@ class LastLook(Struct, frozen=True):
     pages: dict[int, memoryview]
     areas: tuple[Area, ...]
 
+    @staticmethod
+    def may_be_of(taken: Taken) -> bool:
+        """Whether a look copied little enough to be compared."""
+        return not taken.is_base and sum(page_set.total_size(copy.pages) for copy in taken.copies) <= REST_PAGES * abi.PAGE_SIZE
+
     @classmethod
-    def of(cls, pid: int, standing: Standing, taken: Taken) -> LastLook | None:
-        """None if it copied too much to be compared. Valid until the next freeze, which uses the same memory."""
-        if taken.is_base or sum(page_set.total_size(copy.pages) for copy in taken.copies) > REST_PAGES * abi.PAGE_SIZE:
-            return None
+    def of(cls, pid: int, standing: Standing, taken: Taken) -> LastLook:
+        """Of one that `may_be_of`. Valid until the next freeze, which uses the same memory."""
         threads: list[tuple[int, Read, bytes]] = [(pid, standing.place, standing.place.registers)]
         threads += [(other.place.tracee.pid, other.place, other.place.registers) for other in standing.others]
         areas = (read.rseq for _, read, _ in threads)

@@ -157,7 +157,7 @@ class FreezeBuffer:
         self._wanted += size
         if self._wanted <= len(self._content):
             return memoryview(self._content)[begin : self._wanted]
-        return memoryview(bytearray(size))
+        return np.empty(size, dtype=np.uint8).data
 
 
 class MemoryCapture:

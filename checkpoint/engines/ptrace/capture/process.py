@@ -203,9 +203,10 @@ class CapturedProcess:
         return last is not None and last.waits_there(self.pid) and self.memory.has_rested(last)
 
     def settle(self, position: Position) -> None:
-        """The last look has become part of the snapshot with this position."""
+        """The last look has become part of the snapshot with this position. Pages that are of no use go: perhaps gigabytes."""
         self.memory.settle(position)
-        self._settled, self._look = self._look, None
+        look, self._look, self._last = self._look, None, None
+        self._settled = look if look is not None and LastLook.may_be_of(look.taken) else None
         self.is_new = False
 
     @property
@@ -234,6 +235,7 @@ class CapturedProcess:
 
     def copy_running(self, *, base: bool, enough: int = 0, copied: RunningCopy | None = None) -> RunningCopy:
         """As `MemoryCapture.copy_running`, with what is prepared before."""
+        self._look = None  # of a capture that failed: its pages may be gigabytes
         self.prepare(base=base)
         copied = self.memory.copy_running(base=base, enough=enough, copied=copied)
         if base:  # which takes long: a thread may have confined itself since

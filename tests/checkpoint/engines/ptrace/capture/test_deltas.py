@@ -12,6 +12,7 @@ import random
 import subprocess
 import sys
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -323,6 +324,21 @@ def test_a_capture_that_waits_long_keeps_one_copy_of_a_page(tmp_path: Path, monk
         program.kill()
     assert len(snapshot.contents) >= 32 << 20
     assert sizes and max(sizes) < 3 * 32 << 20, "one copy of the arena, and the first one with the rest of the program"
+
+
+def test_between_two_captures_no_page_is_held(tmp_path: Path) -> None:
+    """Else a keeper needs as much memory as its program while a large snapshot travels, and twice as much for the next one."""
+    size = 24 << 20
+    script = f"import os, time; held = os.urandom({size}); print('ready', flush=True); time.sleep(1000)"
+    with ended(start([sys.executable, "-S", "-c", script], tmp_path)) as program:
+        program.wait_for_line("ready")
+        tracemalloc.start()
+        try:
+            with protected(program) as session:
+                assert len(captured_at_last(session, CaptureOrder()).contents) > size
+                assert tracemalloc.get_traced_memory()[0] < size // 4
+        finally:
+            tracemalloc.stop()
 
 
 @pytest.mark.write_protection
