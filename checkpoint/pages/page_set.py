@@ -293,6 +293,22 @@ def digest_pages(contents: Buffer, addresses: Words, page_size: int, places: NDA
     return np.frombuffer(packed, dtype=_LANE).astype(np.uint64, copy=False).reshape(-1, 2)
 
 
+def _digest_each(
+    pieces: Iterable[Buffer], addresses: Words, page_size: int, copied: Words, places: NDArray[np.intp] | None
+) -> Words:
+    """The digests of pages that come in pieces, and behind them those of copied pages, with the places of their bytes."""
+    digests = np.empty((len(addresses) + len(copied), 2), dtype=np.uint64)
+    last = 0
+    for piece in pieces:
+        first, last = last, last + memoryview(piece).nbytes // page_size
+        digests[first:last] = digest_pages(piece, addresses[first:last], page_size)
+        if places is not None:
+            here = np.flatnonzero((places >= first) & (places < last))
+            digests[len(addresses) + here] = digest_pages(piece, copied[here], page_size, places[here] - first)
+    assert last == len(addresses), "each page has its bytes"
+    return digests
+
+
 def sum_of(lanes: Words) -> bytes:
     """The page sum of the pages with these digests, 16 bytes."""
     return _packed(lanes.sum(axis=0, dtype=np.uint64))
@@ -415,12 +431,22 @@ class PageTable(Struct, frozen=True, eq=False):
             contents: bytes of ``runs``, in address order.
             copies: pages with the bytes of others of ``runs``.
         """
+        return self.apply_each(cleared, runs, (contents,), vmas, copies)
+
+    def apply_each(
+        self,
+        cleared: Iterable[PageRun],
+        runs: Iterable[PageRun],
+        pieces: Iterable[Buffer],
+        vmas: Iterable[Vma | PageRun],
+        copies: Sequence[PageCopy] = (),
+    ) -> PageTable:
+        """The same, where the bytes of ``runs`` come in pieces of whole pages. Each is done with when the next is asked for."""
         mapped, carried, gone = extents(vmas), extents(runs), extents(cleared)
         addresses = addresses_of(carried, self.page_size)
-        digests = digest_pages(contents, addresses, self.page_size)
+        copied, places = copied_pages(copies, addresses, self.page_size) if copies else (addresses[:0], None)
+        digests = _digest_each(pieces, addresses, self.page_size, copied, places)
         if copies:
-            copied, places = copied_pages(copies, addresses, self.page_size)
-            digests = np.concatenate((digests, digest_pages(contents, copied, self.page_size, places)))
             addresses = np.concatenate((addresses, copied))
             order = np.argsort(addresses)
             addresses, digests = addresses[order], digests[order]

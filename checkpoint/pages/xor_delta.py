@@ -7,7 +7,7 @@ chain (`checkpoint.store.chain.fold`) needs nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, TypeAlias
 
 from msgspec.structs import replace
@@ -25,6 +25,15 @@ Reference = Callable[[Words], Rows]
 
 CHANGED_LIMIT: Final = 1 / 2
 """A page of which more than this part has changed is told whole: it compresses better by itself."""
+
+SMALL_SIZE: Final = 8 << 20
+"""Bytes of a delta that is copied for any difference in it."""
+
+FEW_SHARE: Final = 8
+"""A larger delta is told whole, and not copied, where less than one part in so many of its pages would be told as differences."""
+
+HELD_SIZE: Final = 4 << 20
+"""Bytes of earlier content that are asked for at once: of gigabytes never all, and seldom, for each time may read files."""
 
 
 def rows_of(contents: Buffer, page_size: int) -> Rows:
@@ -70,7 +79,7 @@ def told(delta: Snapshot, known: Words, contents: Rows) -> Snapshot:
     places = np.searchsorted(addresses_of(delta.runs, page_size), known)
     differences = whole[places] ^ contents
     worth = are_worth_it(differences)
-    if not worth.any():
+    if not worth.any() or (whole.nbytes > SMALL_SIZE and FEW_SHARE * np.count_nonzero(worth) < len(whole)):
         return delta
     changed = whole.copy()
     changed[places[worth]] = differences[worth]
@@ -94,3 +103,33 @@ def resolved(delta: Snapshot, reference: Reference) -> Snapshot:
     whole = rows_of(delta.contents, page_size).copy()
     whole[np.searchsorted(addresses_of(delta.runs, page_size), wanted)] ^= reference(wanted)
     return replace(delta, contents=whole.reshape(-1).data.toreadonly(), differences=())
+
+
+def resolved_each(outline: Snapshot, pieces: Iterable[memoryview], reference: Reference) -> Iterator[memoryview]:
+    """As `resolved`, of a delta whose pages come in pieces, each of whole pages: the pieces themselves are changed.
+
+    Args:
+        outline: the delta without its pages.
+        pieces: in memory that may be changed.
+
+    Raises:
+        ChainError: from ``reference``.
+    """
+    if not outline.differences:
+        yield from pieces
+        return
+    page_size = outline.machine.page_size
+    wanted = addresses_of(outline.differences, page_size)
+    places = np.searchsorted(addresses_of(outline.runs, page_size), wanted)
+    first = asked = done = 0
+    held = np.empty((0, page_size), dtype=np.uint8)
+    for piece in pieces:
+        rows = rows_of(piece, page_size)
+        end = int(np.searchsorted(places, first + len(rows)))
+        if end > done:
+            if end > asked + len(held):
+                asked, last = done, max(end, done + HELD_SIZE // page_size)
+                held = reference(wanted[asked:last])
+            rows[places[done:end] - first] ^= held[done - asked : end - asked]
+        yield piece
+        first, done = first + len(rows), end

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterable
-from contextlib import closing
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from threading import local
 from typing import Final
 
@@ -28,7 +28,7 @@ from checkpoint.runtime.lazy_numpy import NDArray, np
 from checkpoint.snapshot import canonical_state, compression, layout
 from checkpoint.snapshot.byte_sources import Reader, Source, opened
 from checkpoint.snapshot.canonical_state import Header, State
-from checkpoint.snapshot.frames import Frame, FrameWriter, Packer, Sink, frames_of, read_frame, verified, write_all
+from checkpoint.snapshot.frames import Frame, FrameWriter, Packer, Sink, check_frame, frames_of, read_frame, write_all
 from checkpoint.snapshot.layout import Codec, Preamble, Section, SectionKind
 from checkpoint.snapshot.validity import check_snapshot
 
@@ -170,16 +170,8 @@ def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *,
     Raises:
         FormatError: not a whole, unaltered snapshot of a version that we read; says what and where.
     """
-    return decode_with_digest(source, max_contents_size, threads=threads)[0]
-
-
-def decode_with_digest(
-    source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *, threads: int = 1
-) -> tuple[Snapshot, bytes]:
-    """As `decode`; and the digest that the position must have (`canonical_state.state_digest`), of the bytes as read."""
     with opened(source) as reader:
-        preamble = _read_preamble(reader)
-        outline, state = _read_outline(reader, preamble)
+        preamble, outline = outlined(reader)
         check_contents_size(preamble.contents_size, max_contents_size)
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
 
@@ -191,8 +183,45 @@ def decode_with_digest(
         frames = enumerate(frames_of(reader, preamble))
         for _ in parallel.in_order(read, frames, worth(threads, preamble)):
             pass
-    digest = canonical_state.digest_of_state(outline.page_sum, state)
-    return replace(outline, contents=contents.toreadonly()), digest
+    return replace(outline, contents=contents.toreadonly())
+
+
+class Streamed(Struct, frozen=True):
+    """A whole file that is read piece by piece, so that gigabytes of pages need no memory.
+
+    Attributes:
+        outline: all but the pages.
+        digest: the digest that the position must have (`canonical_state.state_digest`), of the bytes as read.
+        pieces: the bytes of the pages, in order, `layout.FRAME_SIZE` at a time: verified, and the caller's to change until the
+            next piece is asked for. After the last one every byte of the file has been verified.
+    """
+
+    outline: Snapshot
+    digest: bytes
+    pieces: Iterator[memoryview]
+
+
+@contextmanager
+def streamed(source: Source) -> Iterator[Streamed]:
+    """Open a whole file for one pass over it.
+
+    Raises:
+        FormatError: as `decode`, here or from the pieces.
+    """
+    with opened(source) as reader:
+        preamble = _read_preamble(reader)
+        outline, state = _read_outline(reader, preamble)
+        check_contents_size(preamble.contents_size)
+        digest = canonical_state.digest_of_state(outline.page_sum, state)
+        yield Streamed(outline, digest, _pieces(reader, preamble))
+
+
+def _pieces(reader: Reader, preamble: Preamble) -> Iterator[memoryview]:
+    buffer = np.empty(min(preamble.contents_size, layout.FRAME_SIZE), dtype=np.uint8).data
+    for frame in frames_of(reader, preamble):
+        piece = buffer[: frame.head.raw_size]
+        read_frame(reader, frame, piece)
+        yield piece
 
 
 def read_header(source: Source) -> Header:
@@ -290,8 +319,9 @@ def verified_outline(source: Source) -> Snapshot:
     """
     with opened(source) as reader:
         preamble, outline = outlined(reader)
+        body = np.empty(min(preamble.contents_size, layout.FRAME_SIZE), dtype=np.uint8).data  # used again: new memory costs time
         for frame in frames_of(reader, preamble):
-            verified(reader, frame)
+            check_frame(reader, frame, body[: frame.head.stored_size])
     return outline
 
 

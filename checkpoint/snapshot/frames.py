@@ -41,9 +41,13 @@ class Body(Struct, frozen=True):
 
 
 class Packer:
-    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time."""
+    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time.
+
+    Behind a frame that did not compress there are often gigabytes more: of those it tries samples first.
+    """
 
     def __init__(self, threads: int) -> None:
+        self._was_raw = False
         self._compressors: SimpleQueue[Compressor] = SimpleQueue()
         for _ in range(threads):
             self._compressors.put(compression.compressor() if threads > 1 else compression.own_compressor())
@@ -51,7 +55,10 @@ class Packer:
     def __call__(self, raw: memoryview) -> Body:
         """The body of one frame."""
         with self._borrowed() as compressor:
+            if self._was_raw and compression.seems_incompressible(raw, compressor):
+                return Body(Codec.RAW, raw, len(raw), layout.digest_of(raw))
             codec, content = compression.stored(raw, compressor)
+        self._was_raw = codec is Codec.RAW
         return Body(codec, content, len(raw), layout.digest_of(content))
 
     def each(self, raws: Sequence[memoryview]) -> list[Body]:
@@ -151,10 +158,15 @@ def content_of(reader: Reader, frame: Frame) -> bytes | memoryview:
 def read_frame(reader: Reader, frame: Frame, target: memoryview) -> None:
     """The same, put into ``target``."""
     if frame.head.codec is Codec.RAW:
-        reader.read_into(frame.body_offset, target, frame.where)
-        check_digest(target, frame)
+        check_frame(reader, frame, target)
     else:
         compression.decompress_into(target, verified(reader, frame), frame.where)
+
+
+def check_frame(reader: Reader, frame: Frame, body: memoryview) -> None:
+    """Put a frame's body, as it is stored, into memory of its size. Raises FormatError."""
+    reader.read_into(frame.body_offset, body, frame.where)
+    check_digest(body, frame)
 
 
 class DecodedFrames:

@@ -9,7 +9,7 @@ digest covers the result (``state_digest``), so a fold proves itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 from msgspec.structs import replace
@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from checkpoint.errors import ChainError
 from checkpoint.model import OutputPiece, PageCopy, Position, Snapshot
 from checkpoint.pages import page_set
-from checkpoint.pages.page_set import PageMap, PageTable
+from checkpoint.pages.page_set import Buffer, PageMap, PageTable
 from checkpoint.runtime.lazy_numpy import np
 from checkpoint.snapshot.canonical_state import digest_of_state, state_digest
 from checkpoint.snapshot.process_tree import every_mapping
@@ -53,11 +53,13 @@ def check_continues(parent: Position, delta: Snapshot) -> None:
     raise ChainError(f"{named}, not {place(parent)}, which is held here; ask for a base")
 
 
-def applied(table: PageTable, snapshot: Snapshot) -> PageTable:
-    """The page table of a state after one more snapshot, which tells its pages whole (`checkpoint.pages.xor_delta.resolved`)."""
-    assert not snapshot.differences, "a difference is not the page"
-    contents = memoryview(snapshot.contents)
-    return table.apply(snapshot.cleared, snapshot.runs, contents, every_mapping(snapshot), snapshot.copies)
+def applied(table: PageTable, outline: Snapshot, pieces: Iterable[Buffer]) -> PageTable:
+    """The page table of a state after one more snapshot.
+
+    Args:
+        outline: all but its pages; ``pieces``: those, told whole (`checkpoint.pages.xor_delta.resolved_each`).
+    """
+    return table.apply_each(outline.cleared, outline.runs, pieces, every_mapping(outline), outline.copies)
 
 
 def check_state(snapshot: Snapshot, page_sum: bytes, digest: bytes = b"") -> None:

@@ -26,13 +26,14 @@ from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
 from checkpoint.snapshot.canonical_state import header_of
+from checkpoint.snapshot.format import Streamed
 from checkpoint.snapshot.required_files import needs
 from checkpoint.snapshot.validity import place
 from checkpoint.store import inventory
 from checkpoint.store.atomic_files import WholeFiles, disk_trouble
 from checkpoint.store.chain_files import ChainFiles, entry_of
 from checkpoint.store.content_store import Contents
-from checkpoint.store.disk import Disk, lock_exclusively
+from checkpoint.store.disk import FILE_MODE, Disk, lock_exclusively
 from checkpoint.store.fold_rules import fold_is_due, held_at_once
 from checkpoint.store.index import SUFFIXES, Entry, Shelf, file_name, folder_name, order_of_name
 from checkpoint.store.inventory import why_not_ours
@@ -90,7 +91,7 @@ class Store:
         self._lock = threading.RLock()
         self._changing: dict[str, threading.RLock] = {}
         self._shelves: dict[str, Shelf] = {}
-        self._proofs = Proofs(budget, self._decoded)
+        self._proofs = Proofs(budget, self._streamed)
         self._made_last: dict[str, tuple[Path, Snapshot]] = {}
         """Of each component the snapshot that was put last without a proof, without its pages and its output, and where."""
         self.notices: list[str] = []
@@ -197,6 +198,15 @@ class Store:
         """Make room on the disk for a snapshot of so many bytes, as far as snapshots that are kept for people can give it."""
         self._history.make_room(size)
 
+    def unnamed(self) -> int:
+        """An empty file without a name, which `put` need not copy; the caller closes its descriptor.
+
+        Raises:
+            StoreError: the disk gives none.
+        """
+        with disk_trouble(f"make a file in {self._root}"):
+            return os.open(self._root, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, FILE_MODE)
+
     def put(self, source: int, *, prove: bool = True) -> Snapshot:
         """Keep a snapshot; when this returns it survives a power cut.
 
@@ -213,11 +223,21 @@ class Store:
             ChainError: it continues no position that the store holds, or does not lead to the state it names; ask for a base.
             StoreError: the disk does not take it; nothing of it is left.
         """
-        snapshot, digest = format.decode_with_digest(source) if prove else (format.verified_outline(source), b"")
+        if not prove:
+            return self._put(source, format.verified_outline(source))
+        with format.streamed(source) as told:
+            return self._put(source, told.outline, told)
+
+    def _put(self, source: int, snapshot: Snapshot, told: Streamed | None = None) -> Snapshot:
+        """Keep the file of a snapshot, which is given without its pages.
+
+        Args:
+            told: the same with its pages, to be proved; None: it was made here.
+        """
         with self._change_of(snapshot.component):
             shelf = self._shelf(snapshot.component)
             self._check_parent(shelf, snapshot)
-            proved = self._proofs.prove(shelf, snapshot, digest) if prove else None
+            proved = self._proofs.prove(shelf, told) if told is not None else None
             final = self._root / folder_name(snapshot.component) / file_name(header_of(snapshot))
             if all(entry.position != snapshot.position or entry.path != final for entry in shelf.entries):
                 size = self._files.write(final, lambda file: file.copy_from(source), source)
@@ -229,7 +249,7 @@ class Store:
             outline = replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
             with self._lock:
                 self._made_last.pop(snapshot.component, None)
-                if not prove:
+                if told is None:
                     self._made_last[snapshot.component] = (final, replace(outline, output=()))
         return outline
 
@@ -254,9 +274,12 @@ class Store:
                 f"which is not held with that digest: {ours}; ask for a base"
             )
 
-    def _decoded(self, component: str, entry: Entry) -> Snapshot:
+    @contextmanager
+    def _streamed(self, component: str, entry: Entry) -> Iterator[Streamed]:
+        """One of its files, for one pass over it; its damage is found during that pass."""
         try:
-            return format.decode(entry.path)
+            with format.streamed(entry.path) as told:
+                yield told
         except FormatError as error:
             self._set_out_of_use(component, entry, str(error))
             raise ChainError(

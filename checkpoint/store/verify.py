@@ -7,19 +7,21 @@ differences. Pages that it does not remember (any more) are counted and read aga
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 from msgspec import Struct
 
 from checkpoint.errors import ChainError, FormatError
 from checkpoint.model import Position, Snapshot
 from checkpoint.pages.page_set import PageTable, Words
-from checkpoint.pages.xor_delta import Rows, resolved
+from checkpoint.pages.xor_delta import Rows, resolved_each
 from checkpoint.runtime.lazy_numpy import np
+from checkpoint.snapshot.format import Streamed
 from checkpoint.snapshot.validity import place
 from checkpoint.store import chain
 from checkpoint.store.index import Entry, Shelf
 from checkpoint.store.page_lookup import pages_at
-from checkpoint.store.xor_cache import HotPages, Step
+from checkpoint.store.xor_cache import FirstPages, HotPages, Step
 from checkpoint.store.xor_cache_budget import PageBudget
 
 
@@ -40,28 +42,27 @@ class Proved(Struct, frozen=True):
 class Proofs:
     """The newest proved position of each component. Calls of one component follow one another."""
 
-    def __init__(self, budget: PageBudget, decoded: Callable[[str, Entry], Snapshot]) -> None:
+    def __init__(self, budget: PageBudget, streamed: Callable[[str, Entry], AbstractContextManager[Streamed]]) -> None:
         """
         Args:
             budget: for content to remember, of all components.
-            decoded: reads a component's file; raises ChainError where it is damaged.
+            streamed: reads a component's file; raises ChainError where it is damaged.
         """
         self._budget = budget
-        self._decoded = decoded
+        self._streamed = streamed
         self._proved: dict[str, Proved] = {}
 
-    def prove(self, shelf: Shelf, snapshot: Snapshot, digest: bytes) -> Proved:
-        """Apply a snapshot to the pages of its parent, which the shelf holds, and compare.
-
-        Args:
-            digest: that its position must have.
+    def prove(self, shelf: Shelf, told: Streamed) -> Proved:
+        """Apply a snapshot to the pages of its parent, which the shelf holds, and compare. Its pages are read, a few at a time.
 
         Raises:
             ChainError: it leads elsewhere.
+            FormatError: its pages are not what they were.
         """
-        parent = self._unproved(snapshot) if snapshot.parent is None else self._at(shelf, snapshot.parent)
-        proved = self._applied(shelf, parent, snapshot)
-        chain.check_state(snapshot, proved.table.page_sum, digest)
+        outline = told.outline
+        parent = self._unproved(outline) if outline.parent is None else self._at(shelf, outline.parent)
+        proved = self._applied(shelf, parent, told)
+        chain.check_state(outline, proved.table.page_sum, told.digest)
         return proved
 
     def keep(self, component: str, proved: Proved) -> None:
@@ -96,21 +97,24 @@ class Proofs:
             return known
         proved: Proved | None = None
         for entry in shelf.chain_to(position):
-            snapshot = self._decoded(shelf.component, entry)
-            proved = self._applied(shelf, proved or self._unproved(snapshot), snapshot)
+            with self._streamed(shelf.component, entry) as told:
+                proved = self._applied(shelf, proved or self._unproved(told.outline), told)
             assert proved.step is not None, "it was made this instant"
             proved.hot.advance(proved.step)
         assert proved is not None, "a chain has a base"
         return proved
 
-    def _applied(self, shelf: Shelf, before: Proved, snapshot: Snapshot) -> Proved:
-        if (size := snapshot.machine.page_size) != before.table.page_size:
+    def _applied(self, shelf: Shelf, before: Proved, told: Streamed) -> Proved:
+        outline = told.outline
+        if (size := outline.machine.page_size) != before.table.page_size:
             raise ChainError(
-                f"snapshot {place(snapshot.position)} of {shelf.component} has pages of {size} bytes, "
+                f"snapshot {place(outline.position)} of {shelf.component} has pages of {size} bytes, "
                 f"the chain of {before.table.page_size}; ask for a base"
             )
-        whole = resolved(snapshot, lambda wanted: _held(shelf, before, wanted))
-        return Proved(snapshot.position, chain.applied(before.table, whole), before.hot, Step.of(whole, before.hot.limit))
+        whole = resolved_each(outline, told.pieces, lambda wanted: _held(shelf, before, wanted))
+        kept = FirstPages(outline, before.hot.limit)
+        table = chain.applied(before.table, outline, kept.passing(whole))
+        return Proved(outline.position, table, before.hot, Step.keeping(outline, kept.rows))
 
 
 def _user(component: str) -> str:

@@ -7,6 +7,7 @@ correctness: a sender sends a page whole, a store reads it from its files.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from msgspec import Struct
@@ -51,15 +52,44 @@ class Step(Struct, frozen=True, eq=False):
             limit: bytes of them that are worth keeping: the first ones, where a program has its heap.
         """
         page_size = snapshot.machine.page_size
-        every = xor_delta.addresses_of(snapshot.runs, page_size)
-        addresses = every[: limit // page_size]
         rows = xor_delta.rows_of(snapshot.contents, page_size)
-        if len(addresses) < len(rows):
-            rows = rows[: len(addresses)].copy()  # a base need not stay for the sake of a part of it
-        told = page_set.extents((*snapshot.runs, *snapshot.cleared, *snapshot.copies))
-        return cls(
-            snapshot.position, snapshot.parent, page_set.extents(every_mapping(snapshot)), told, addresses, rows, len(every)
-        )
+        if limit // page_size < len(rows):
+            rows = rows[: limit // page_size].copy()  # a base need not stay for the sake of a part of it
+        return cls.keeping(snapshot, rows)
+
+    @classmethod
+    def keeping(cls, outline: Snapshot, rows: Rows) -> Step:
+        """
+        Args:
+            outline: without its pages.
+            rows: the first ones of them, told whole.
+        """
+        every = xor_delta.addresses_of(outline.runs, outline.machine.page_size)
+        told = page_set.extents((*outline.runs, *outline.cleared, *outline.copies))
+        kept = page_set.extents(every_mapping(outline))
+        return cls(outline.position, outline.parent, kept, told, every[: len(rows)], rows, len(every))
+
+
+class FirstPages:
+    """The first pages of a snapshot whose pages come in pieces, for its `Step`."""
+
+    def __init__(self, outline: Snapshot, limit: int) -> None:
+        """
+        Args:
+            limit: bytes of them.
+        """
+        page_size = outline.machine.page_size
+        size = min(sum(run.size for run in outline.runs), limit)
+        self.rows: Rows = np.empty((size // page_size, page_size), dtype=np.uint8)
+
+    def passing(self, pieces: Iterable[memoryview]) -> Iterator[memoryview]:
+        """The same pieces; ``rows`` has what it keeps of those that have passed."""
+        content, filled = self.rows.reshape(-1).data, 0
+        for piece in pieces:
+            size = min(len(piece), len(content) - filled)
+            content[filled : filled + size] = piece[:size]
+            filled += size
+            yield piece
 
 
 class HotPages:

@@ -141,7 +141,7 @@ def family(count: int) -> list[Snapshot]:
         )
         runs, contents, copies = process_tree.told_once(whole.runs, memoryview(whole.contents), PAGE)
         whole = replace(whole, runs=runs, contents=bytes(contents), copies=copies)
-        table = applied(table, whole)
+        table = applied(table, whole, (whole.contents,))
         whole = replace(whole, page_sum=table.page_sum)
         made.append(replace(whole, position=position_of(whole, 1, sequence)))
     return made

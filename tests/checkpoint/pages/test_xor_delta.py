@@ -7,6 +7,7 @@ import random
 import struct
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,8 +20,9 @@ from msgspec.structs import replace
 from checkpoint.errors import ChainError, FormatError
 from checkpoint.keeper import messages
 from checkpoint.model import PageRun, Snapshot
-from checkpoint.pages import page_set
+from checkpoint.pages import page_set, xor_delta
 from checkpoint.pages.page_set import Buffer, PageTable, Words
+from checkpoint.pages.xor_delta import Rows
 from checkpoint.snapshot import format, layout
 from checkpoint.store import chain
 from checkpoint.store.base_on_disk import stored_base
@@ -40,6 +42,7 @@ STEPS = st.lists(
 )
 ROOM = 1 << 20
 SMALL = 4 * PAGE
+LARGE = 48 << 20
 
 
 def whole_chain(steps: Sequence[tuple[dict[int, int], frozenset[int]]]) -> list[Snapshot]:
@@ -215,6 +218,41 @@ def test_a_page_that_has_become_another_one_is_told_whole() -> None:
     assert as_told([base, delta])[1].differences == runs_of({1})
 
 
+def test_a_large_delta_is_not_copied_for_few_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A copy of gigabytes takes as much memory again, and longer than to send a few pages whole."""
+    base = snapshot({number: page("before") for number in range(100)})
+    delta = snapshot({number: page("behind") for number in range(100)}, parent=base.position, sequence=2)
+    enough, too_few = (100 // xor_delta.FEW_SHARE + 1) * PAGE, 100 // xor_delta.FEW_SHARE * PAGE
+    assert as_told([base, delta], too_few)[1].differences, "it is small"
+    monkeypatch.setattr(xor_delta, "SMALL_SIZE", 10 * PAGE)
+    assert as_told([base, delta], too_few)[1] is delta
+    assert as_told([base, delta], enough)[1].differences
+
+
+@settings(max_examples=60, deadline=None)
+@given(STEPS, st.integers(1, 4), st.integers(1, 4))
+def test_pages_that_come_in_pieces_are_resolved_as_all_together(
+    steps: list[tuple[dict[int, int], frozenset[int]]], piece_count: int, held_count: int
+) -> None:
+    whole = whole_chain(steps)
+    states = [chain.fold(whole[:count]) for count in range(1, len(whole))]
+    asked: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(xor_delta, "HELD_SIZE", held_count * PAGE)
+        for before, after, told in zip(states, whole[1:], as_told(whole)[1:], strict=True):
+
+            def reference(wanted: Words, before: Snapshot = before) -> Rows:
+                asked.append(len(wanted))
+                pages = pages_of(before)
+                found = [np.frombuffer(pages[(address - START) // PAGE], np.uint8) for address in wanted.tolist()]
+                return np.array(found).reshape(-1, PAGE)
+
+            raw = bytes(told.contents)
+            pieces = [memoryview(bytearray(raw[at : at + piece_count * PAGE])) for at in range(0, len(raw), piece_count * PAGE)]
+            assert b"".join(xor_delta.resolved_each(told, pieces, reference)) == bytes(after.contents)
+    assert all(count <= max(piece_count, held_count) for count in asked)
+
+
 def test_without_a_cache_every_page_is_told_whole() -> None:
     assert as_told(busy(), 0) == busy()
 
@@ -245,7 +283,7 @@ def test_a_page_that_two_processes_had_in_common_changes_in_one_of_them_alone() 
     assert base.copies
     changed = snapshot({0: page("both?"), 1: page("parent 1")}, parent=base.position, sequence=2)
     delta = replace(changed, members=base.members, zombies=base.zombies, runs=runs_of({0}), contents=page("both?"))
-    table = applied(applied(PageTable.empty(PAGE), base), delta)
+    table = applied(applied(PageTable.empty(PAGE), base, (base.contents,)), delta, (delta.contents,))
     delta = replace(delta, page_sum=table.page_sum)
     delta = replace(delta, position=chain.position_of(delta, 1, 2))
     told = as_told([base, delta])
@@ -292,6 +330,27 @@ def test_a_store_proves_differences_whatever_it_remembers_and_after_a_restart(tm
     store.prune(COMPONENT, whole[4].position)
     assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(whole))
     store.close()
+
+
+def test_a_store_proves_a_large_snapshot_in_little_memory(tmp_path: Path) -> None:
+    """A standby may have little memory to spare, and the pages of a snapshot may be gigabytes."""
+    noise, count = np.random.default_rng(1).bytes(LARGE), LARGE // PAGE
+    state = {number: noise[number * PAGE : (number + 1) * PAGE] for number in range(count)}
+    base = snapshot(state, vmas=(vma(0, count),))
+    after = {number: content[:-1] + bytes([content[-1] ^ 1]) for number, content in state.items()}
+    delta = snapshot(after, vmas=(vma(0, count),), parent=base.position, sequence=2)
+    told = as_told([base, delta], LARGE // 2)
+    assert page_set.total_size(page_set.extents(told[1].differences)) == LARGE // 2
+    files, store = files_of(told, tmp_path), open_store(tmp_path / "store", budget=PageBudget(0))
+    tracemalloc.start()
+    try:
+        for path in files:
+            with path.open("rb") as file:
+                store.put(file.fileno())
+        assert tracemalloc.get_traced_memory()[1] < LARGE // 2
+    finally:
+        tracemalloc.stop()
+        store.close()
 
 
 def test_a_store_takes_no_difference_that_leads_elsewhere(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from msgspec.structs import replace
 from checkpoint.errors import FormatError
 from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot, Vma
 from checkpoint.pages.page_set import Mappings
-from checkpoint.snapshot import format, layout, validity
+from checkpoint.snapshot import compression, format, layout, validity
+from checkpoint.snapshot.frames import Packer
 from tests.checkpoint.snapshots import PAGE, START, family, history, page, snapshot, vma
 
 FACTS = st.recursive(
@@ -48,6 +49,25 @@ def snapshots(draw: st.DrawFn) -> Snapshot:
         epoch=draw(st.integers(0, 1 << 62)),
         cleared=() if draw(st.booleans()) else (PageRun(START, START + PAGE),),
     )
+
+
+def test_behind_what_does_not_compress_samples_are_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of gigabytes of noise nearly nothing is compressed in vain; what compresses among them still is."""
+    tried: list[memoryview] = []
+    stored = compression.stored
+
+    def noted(raw: memoryview, compressor: compression.Compressor) -> tuple[layout.Codec, bytes | memoryview]:
+        tried.append(raw)
+        return stored(raw, compressor)
+
+    monkeypatch.setattr(compression, "stored", noted)
+    noise = memoryview(random.Random(1).randbytes(layout.FRAME_SIZE))
+    text = memoryview(b"text" * (layout.FRAME_SIZE // 4))
+    packer = Packer(1)
+    bodies = [packer(raw) for raw in (noise, noise, noise, text, text, noise, noise[: 64 << 10])]
+    assert [body.codec for body in bodies] == [layout.Codec.RAW] * 3 + [layout.Codec.ZSTD] * 2 + [layout.Codec.RAW] * 2
+    assert tried == [noise, text, text, noise, noise[: 64 << 10]]
+    assert all(body.digest == layout.digest_of(body.content) for body in bodies)
 
 
 @settings(max_examples=150, deadline=None)
@@ -218,7 +238,8 @@ def test_a_family_that_does_not_hold_together_is_not_written(words: str) -> None
 
 FUZZ = """
 import random, sys
-from checkpoint.snapshot import format, layout, validity
+from checkpoint.snapshot import compression, format, layout, validity
+from checkpoint.snapshot.frames import Packer
 from checkpoint.errors import FormatError
 sample = open(sys.argv[1], "rb").read()
 dice = random.Random(int(sys.argv[2]))

@@ -109,7 +109,7 @@ def test_equal_pages_of_one_process_are_all_there_when_the_others_have_ended() -
     whole = process_tree.expanded(family(1)[0])
     runs, contents, copies = process_tree.told_once(whole.runs, memoryview(page("both") * 4), PAGE)
     whole = replace(whole, runs=runs, contents=bytes(contents), copies=copies)
-    whole = replace(whole, page_sum=chain.applied(PageTable.empty(PAGE), whole).page_sum)
+    whole = replace(whole, page_sum=chain.applied(PageTable.empty(PAGE), whole, (whole.contents,)).page_sum)
     base = replace(whole, position=chain.position_of(whole, 1, 1))
     alone = {0: page("both"), 1: page("both")}
     folded = chain.fold((base, snapshot(alone, carried={}, parent=base.position, sequence=2)))
