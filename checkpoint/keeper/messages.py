@@ -230,6 +230,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     With a descriptor, of an empty file: it is encoded there, and the answer brings none.
 
     Attributes:
+        spare: that file is for a large snapshot alone; a small one comes in a memfd, and leaves the file empty.
         hold: leave the program standing still afterwards, until `Release`: an end now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
         lag_ns: how long it may wait for a moment between two activations of the program's tasks; 0: it does not wait.
@@ -244,6 +245,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     xor_cache: int = 0
     lag_ns: int = 0
     if_changed: bool = False
+    spare: bool = False
 
 
 class Acknowledge(msgspec.Struct, frozen=True, tag=True):

@@ -57,6 +57,7 @@ from checkpoint.store import chain
 from checkpoint.store.base_in_process import UnreadBase
 from checkpoint.store.base_on_disk import stored_base
 from checkpoint.store.digest_cache import DigestsOfFiles
+from checkpoint.store.disk import Disk, DiskFile
 from checkpoint.store.xor_cache import Sender
 
 if TYPE_CHECKING:
@@ -71,6 +72,9 @@ FILES: Final = 65536
 
 COLLECTED_AFTER: Final = 128
 """Requests after which we collect objects that refer to each other, and give free memory back: 4 ms, every few seconds."""
+
+LARGE_SIZE: Final = 16 << 20
+"""Bytes of pages of a snapshot that is encoded into a spare file, where there is one: else memory holds it once more."""
 
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
@@ -253,7 +257,8 @@ class Keeper:
     def _made(self, session: Session, order: CaptureOrder, target: int | None, request: messages.Capture) -> _Encoded:
         """Capture, and encode what was captured: into the target, or into a memory file where there is none."""
         threads = parallel.thread_count() if request.hold else 1  # a program that runs needs the processors itself
-        captured = session.capture(order) if target is None else session.capture_standing(order)
+        may_stay = target is not None and not request.spare
+        captured = session.capture_standing(order) if may_stay else session.capture(order)
         if not isinstance(captured, Snapshot):
             assert target is not None, "it was to be read otherwise"
             try:
@@ -266,8 +271,12 @@ class Keeper:
                 os.lseek(target, 0, os.SEEK_SET)
                 captured = session.capture(order)
         told, known_bytes = self._sender.told(captured, request.xor_cache)
-        if target is not None:
+        if target is not None and not request.spare:
             return _Encoded(captured, encoded_in(target, told, threads), len(captured.contents), known_bytes)
+        if target is not None and len(captured.contents) >= LARGE_SIZE:
+            with _written(captured.component):
+                size = format.encode(told, DiskFile(Disk(), target), threads=threads)
+            return _Encoded(captured, size, len(captured.contents), known_bytes)
         descriptor, size = encoded_in_memory(told, threads)
         return _Encoded(captured, size, len(captured.contents), known_bytes, (descriptor,))
 

@@ -55,7 +55,7 @@ class Captured(Struct, frozen=True):
 
     Attributes:
         parent: None for a base: also when a delta was asked of a keeper that has nothing to start from.
-        snapshot: a sealed memfd with the encoded snapshot; the receiver closes it.
+        snapshot: a sealed memfd with the encoded snapshot, or what was the keeper's spare file; the receiver closes it.
         size: bytes of it.
         commit, age_ns: of a program that keeps its state: number of the commit that it holds, and how old that was.
         slack: how it met the activations of the program's tasks; None: it has none, or the capture was not to wait.
@@ -307,14 +307,15 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, self.keeper.share(), lag_ns, if_changed=True)
+        share, is_lent = self.keeper.share(), bool(self.keeper.spare)
+        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, share, lag_ns, if_changed=True, spare=is_lent)
         async with self._standing_still(is_held_by_guard):
-            with self._patience():
-                captured, descriptors = await self.keeper.ask(order)
+            with self._patience(), self.keeper.lending() as spare:
+                captured, descriptors = await self.keeper.ask(order, spare)
         if isinstance(captured, keeper_messages.Unchanged):
             return captured
         self.keeper.note(captured)
-        (snapshot,) = descriptors
+        (snapshot,) = descriptors or self.keeper.take_spare()
         self._held = hold and not is_held_by_guard
         self._commits[captured.position] = captured.commit
         self._totals[captured.position] = captured.totals

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from agent.errors import KeeperLostError
@@ -9,9 +11,9 @@ from agent.worker.components.paths import Places
 from agent.worker.components.process_pool import KeeperLink
 from checkpoint import errors
 from checkpoint.engine import NO_TERMS
-from checkpoint.errors import CheckpointError, RestoreError, UnsupportedError
+from checkpoint.errors import CheckpointError, RestoreError, StoreError, UnsupportedError
 from checkpoint.keeper import messages
-from checkpoint.keeper.messages import Failed
+from checkpoint.keeper.messages import Failed, close_all
 
 
 class Following:
@@ -21,6 +23,7 @@ class Following:
         followed: engine and pid; None while nothing is followed.
         terms: under which.
         names: by which the program knows those of its files that were brought here, by their paths here.
+        spare: descriptor of an empty file, for its next large snapshot; or none.
     """
 
     def __init__(self, name: str, places: Places) -> None:
@@ -31,6 +34,7 @@ class Following:
         self._places = places
         self._link: KeeperLink | None = None
         self._wanted = self._remembered = 0
+        self.spare: tuple[int, ...] = ()
 
     @property
     def is_there(self) -> bool:
@@ -99,9 +103,34 @@ class Following:
     def drop(self) -> None:
         """The keeper ends, and lets go of the component that it follows."""
         self._remembers_nothing()
+        close_all(self.take_spare())
         link, self._link, self.followed = self._link, None, None
         if link is not None:
             link.end()
+
+    def lend(self, unnamed: Callable[[], int]) -> None:
+        """Have a spare file. A keeper with the rights of a user gets none: it could write to what is stored.
+
+        Args:
+            unnamed: makes one; raises StoreError.
+        """
+        if not self.spare and self.terms.owner is None:
+            with contextlib.suppress(StoreError):  # memory will do
+                self.spare = (unnamed(),)
+
+    @contextlib.contextmanager
+    def lending(self) -> Iterator[tuple[int, ...]]:
+        """The spare file, if there is one, for a capture in the body. Of one that failed it may hold a part, and so it goes."""
+        try:
+            yield self.spare
+        except BaseException:
+            close_all(self.take_spare())
+            raise
+
+    def take_spare(self) -> tuple[int, ...]:
+        """The spare file, with the snapshot that was written to it; the caller's to close."""
+        spare, self.spare = self.spare, ()
+        return spare
 
     def share(self) -> int:
         """Bytes in which the keeper may remember pages, from its next capture on."""

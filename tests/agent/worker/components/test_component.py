@@ -28,10 +28,13 @@ from agent.worker.components.launch import Program, RestoreOptions
 from agent.worker.components.paths import Places, guard_sockets
 from agent.worker.components.process_pool import ProcessPool, connect
 from checkpoint.engine import NO_TERMS
-from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError
+from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError, StoreError
+from checkpoint.keeper.messages import close_all
+from checkpoint.keeper.server import LARGE_SIZE
 from checkpoint.model import OutputPiece
 from checkpoint.segment.output_counters import StreamCounts
 from checkpoint.snapshot import format
+from checkpoint.snapshot.credentials import Owner
 from tests.agent.guards import PATIENCE_S, POLL_S, PYTHON, lives
 
 NAME: Final = "/test/robot1/one"
@@ -514,6 +517,47 @@ def test_a_program_that_has_ended_or_was_let_go_leaves_no_descriptor(tmp_path: P
         for let_go in (False, True, False, True):
             await lived(let_go=let_go)
         await closed_again(before)
+
+    live(tmp_path, story)
+
+
+BIG: Final = f"import os, time; held = os.urandom({2 * LARGE_SIZE}); print('ready', flush=True); time.sleep(1000)"
+
+
+def test_a_large_snapshot_goes_straight_into_a_file_of_the_store_and_a_small_one_into_memory(tmp_path: Path) -> None:
+    """A base of gigabytes in a memory file takes as much memory again, and is written once more."""
+    made: list[int] = []
+
+    def unnamed() -> int:
+        made.append(os.open(tmp_path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600))
+        return made[-1]
+
+    def unwritable() -> int:
+        return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+
+    async def story(places: Places) -> None:
+        async with started(places, BIG) as component:
+            keeper, captures = component.keeper, Captures(component)
+            while not component.logs.read(1, 0, committed=False).content:
+                await asyncio.sleep(POLL_S)
+            keeper.lend(unnamed)
+            large = await captures.take()
+            assert (large.snapshot, keeper.spare) == (made[0], ())
+            assert len(format.decode(large.snapshot).contents) > 2 * LARGE_SIZE
+            keeper.lend(unnamed)
+            keeper.lend(unnamed)
+            small = await captures.take()
+            assert format.decode(small.snapshot).parent == large.position
+            assert keeper.spare == (made[1],) and not os.fstat(made[1]).st_size, "it waits for a large one"
+            close_all(keeper.take_spare())
+            keeper.lend(unwritable)
+            with pytest.raises(StoreError, match="cannot write a snapshot"):
+                await component.capture(base=True, generation=1, sequence=9, epoch=1)
+            assert not keeper.spare, "it may hold a part of a snapshot"
+            keeper.terms = replace(keeper.terms, owner=Owner(1000))
+            keeper.lend(unnamed)
+            assert not keeper.spare, "that keeper has the rights of a user, who could write to what is stored"
+            captures.close()
 
     live(tmp_path, story)
 
