@@ -537,7 +537,7 @@ class ReplicationLink:
             while True:
                 frames = await router.recv_multipart(copy=False)
                 peer = self._speaker(frames)
-                message = decode_bulk(frames[1].bytes) if peer and len(frames) == 2 else None
+                message = decode_bulk(frames[1].buffer) if peer and len(frames) == 2 else None
                 if message is not None:
                     self._callbacks.receive(peer, message)
                 elif peer:

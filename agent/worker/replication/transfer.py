@@ -11,7 +11,7 @@ import itertools
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
@@ -54,6 +54,9 @@ SIGN_S: Final = 1.0
 
 GIVE_WAY_S: Final = 0.02
 """How long a chunk of a file waits for snapshots at most: they have the link to themselves, and a file arrives all the same."""
+
+BATCH_CHUNKS: Final = WINDOW_CHUNKS // 2
+"""Chunks that are written at once, where so many have come: credit for the others is out meanwhile."""
 
 INCOMING_LIMIT: Final = 64
 """Transfers that one peer may have open here: one a component is all that it needs."""
@@ -380,7 +383,7 @@ class Receiver:
         self._desk.make_room(transfer.offer.size)
         transfer.descriptor = os.open(self._directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
         if transfer.content:
-            _keep(DiskFile(Disk(), transfer.descriptor), transfer.content, transfer.digest)
+            _keep(DiskFile(Disk(), transfer.descriptor), [transfer.content], transfer.digest)
 
     def _require_whole(self, peer: str, transfer: _Incoming) -> None:
         """See that it is what was offered.
@@ -403,13 +406,17 @@ class Receiver:
         while end < offer.size:
             try:
                 async with asyncio.timeout(PATIENCE_S):
-                    chunk = await transfer.chunks.get()
+                    batch = [await transfer.chunks.get()]
             except TimeoutError:
                 raise LaneError(f"{peer} was silent for {PATIENCE_S:.0f} s in the middle of a {what}") from None
-            if chunk.offset != end or len(chunk.content) != min(CHUNK_SIZE_MAX, offer.size - end):
-                raise LaneError(f"{peer} sent {len(chunk.content)} bytes at {chunk.offset} where {end} of {offer.size} was due")
-            await to_its_end(_keep, file, chunk.content, transfer.digest)
-            end += len(chunk.content)
+            while len(batch) < BATCH_CHUNKS and not transfer.chunks.empty():
+                batch.append(transfer.chunks.get_nowait())
+            for chunk in batch:
+                size = len(chunk.content)
+                if chunk.offset != end or size != min(CHUNK_SIZE_MAX, offer.size - end):
+                    raise LaneError(f"{peer} sent {size} bytes at {chunk.offset} where {end} of {offer.size} was due")
+                end += size
+            await to_its_end(_keep, file, [chunk.content for chunk in batch], transfer.digest)
             transfer.credit = end + WINDOW
             self._link.say(peer, Credit(offer.transfer, transfer.credit))
 
@@ -425,9 +432,10 @@ def _named(offer: Offered) -> str:
     return f"a file of {offer.size} bytes ({offer.digest.hex()[:16]}…)"
 
 
-def _keep(file: DiskFile, content: bytes, digest: blake3) -> None:
-    file.write(content)
-    digest.update(content)
+def _keep(file: DiskFile, contents: Sequence[bytes], digest: blake3) -> None:
+    for content in contents:
+        file.write(content)
+        digest.update(content)
 
 
 def digest_of(descriptor: int, size: int) -> bytes:

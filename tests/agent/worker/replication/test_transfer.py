@@ -10,12 +10,14 @@ from typing import Any
 
 import msgspec
 import pytest
+from blake3 import blake3
 
 from agent.errors import LaneError
 from agent.system import crash
 from agent.worker.replication import transfer
-from agent.worker.replication.transfer import Receiver, Refusal, Shipper, digest_of
+from agent.worker.replication.transfer import BATCH_CHUNKS, Receiver, Refusal, Shipper, digest_of
 from checkpoint.model import Position
+from checkpoint.store.disk import DiskFile
 from failover.core.types import ComponentSpec
 from failover.core.wire.codec import encode_bulk
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk, Credit, Offer, Refuse, Taken
@@ -409,6 +411,35 @@ def test_an_absurd_size_is_refused_at_once(tmp_path: Path, size: int) -> None:
         assert isinstance(two.back.said[0], Refuse)
 
     run(body())
+
+
+def test_chunks_that_have_come_meanwhile_are_written_at_once(
+    tmp_path: Path, content: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A snapshot of gigabytes has ten thousand chunks, and each turn of a thread takes as long as to write one."""
+    written: list[int] = []
+    keep = transfer._keep
+
+    def noted(file: DiskFile, contents: list[bytes], digest: blake3) -> None:
+        written.append(len(contents))
+        keep(file, contents, digest)
+
+    monkeypatch.setattr(transfer, "_keep", noted)
+
+    async def body() -> None:
+        raw, desk = content.read_bytes(), Desk()
+        two = Two(tmp_path, desk)
+        offer = Offer(1, "/lab/a", 1, Position(1, 1, b""), None, SIZE, blake3(raw).digest(), ComponentSpec("/lab/a"))
+        two.receiver.offered("robot1", offer)
+        for offset in range(0, SIZE, CHUNK_SIZE_MAX):
+            two.receiver.chunk("robot1", Chunk(1, offset, raw[offset : offset + CHUNK_SIZE_MAX]))
+        async with asyncio.timeout(BOUND_S):
+            while not desk.taken:
+                await asyncio.sleep(0.01)
+        assert desk.taken == [raw]
+
+    run(body())
+    assert written == [BATCH_CHUNKS, 2]
 
 
 def test_a_chunk_without_credit_ends_its_transfer(tmp_path: Path) -> None:
