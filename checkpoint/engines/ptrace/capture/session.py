@@ -20,6 +20,7 @@ same time.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from typing import Final
 
@@ -65,7 +66,7 @@ from checkpoint.segment.output_counters import Totals
 from checkpoint.store.base_in_process import UnreadBase
 
 MOVED_S: Final = 2.0
-"""How long a capture is made again because processes came and went in the middle of it."""
+"""How long a freeze is made again because processes came and went in the middle of it, since the first one."""
 MOVED_PAUSE_S: Final = 0.005
 FREEZES_MAX: Final = 4
 """Freezes of one capture that may be given up because they would take too long."""
@@ -289,8 +290,7 @@ class PtraceSession:
             may_stay: the pages of a single process need not be read.
         """
         self._standstill.longest_us = 0
-        began = time.monotonic()
-        waited = 0.0
+        moved_until = math.inf
         copied: RunningCopy | None = None
         given_up = 0
         self._budget.begin_capture()
@@ -305,7 +305,7 @@ class PtraceSession:
                         copied = self._ready(order, copied, base=base)
                     finally:  # no wait for the gate counts as time in which the capture did not succeed
                         passed = time.monotonic() - asked
-                        waited += passed
+                        moved_until += passed
                         self._budget.waited(passed)
                 self._budget.begin(is_free=order.hold, is_last=given_up == FREEZES_MAX - 1)
                 frozen = self._frozen_look(copied, base=base, order=order)
@@ -316,8 +316,9 @@ class PtraceSession:
                 return frozen
             except MovedError as moved:
                 let_go(moved)  # its frames hold what was copied
-                is_late = time.monotonic() > began + waited + MOVED_S
+                is_late = time.monotonic() > moved_until
                 is_last = is_late and not may_stay  # one that took it for a single process is never the last
+                moved_until = min(moved_until, time.monotonic() + MOVED_S)  # not counted before: to copy gigabytes takes longer
                 self._is_single, may_stay = self._is_single and not may_stay, False
                 if is_last:
                     raise

@@ -15,6 +15,7 @@ from checkpoint.engine import CaptureOrder
 from checkpoint.engines.ptrace.capture import session as session_module
 from checkpoint.engines.ptrace.capture.freeze_budget import LONG_CAPTURE_NS
 from checkpoint.engines.ptrace.capture.frozen_component import Frozen
+from checkpoint.engines.ptrace.capture.memory import RunningCopy
 from checkpoint.engines.ptrace.capture.process import CapturedProcess
 from checkpoint.engines.ptrace.capture.session import MOVED_S, PtraceSession
 from checkpoint.engines.ptrace.capture.tree import MovedError
@@ -73,6 +74,33 @@ def test_a_process_that_is_born_during_the_wait_is_entered_before_the_freeze(
         session.capture(CaptureOrder(sequence=1, gate=WaitingGate(have_a_child)))
         program.kill()
     assert not entered, "to enter one while it stands still takes milliseconds"
+
+
+def test_a_capture_whose_copy_took_long_is_made_again_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else gigabytes would be copied anew for a process that came in the middle of the first freeze."""
+    now, moves, copies = [0.0], [MovedError("one has come")], list[object]()
+    look, copy = PtraceSession._frozen_look, CapturedProcess.copy_running
+
+    def slow(self: CapturedProcess, *, copied: RunningCopy | None = None, **named: Any) -> RunningCopy:
+        copies.append(copied)
+        now[0] += MOVED_S + 1
+        return copy(self, copied=copied, **named)
+
+    def moving(self: PtraceSession, *given: Any, **named: Any) -> Frozen:
+        if moves:
+            raise moves.pop()
+        return look(self, *given, **named)
+
+    monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=time.sleep))
+    monkeypatch.setattr(PtraceSession, "_frozen_look", moving)
+    monkeypatch.setattr(CapturedProcess, "copy_running", slow)
+    with ended(start([sys.executable, "-S", "-c", PARENT, tmp_path], tmp_path)) as program, protected(program) as session:
+        program.wait_for_line("ready")
+        session.capture(CaptureOrder(sequence=1))
+        program.kill()
+    assert len(copies) == 2
+    assert copies[0] is None
+    assert copies[1] is not None, "the second freeze goes on with the copy of the first"
 
 
 def test_the_wait_counts_neither_as_a_capture_that_is_made_again_too_often_nor_as_a_long_one(
