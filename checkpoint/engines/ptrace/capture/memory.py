@@ -54,7 +54,8 @@ BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first, where earlier ones copied as much."""
 BUFFER_SIZE_MIN: Final = 1 << 20
 ROOM_SIZE: Final = 64 << 10
-"""Bytes that a copy has room for behind its pages: of the vdso, and of what came since."""
+"""Bytes that a copy has room for behind its pages: of the vdso, and of what came since. A large one has as much again: room that
+is not used takes no memory."""
 WORTH_COUNT: Final = 16
 """Pages that are worth the first pass of a delta while the program runs."""
 LARGE_COUNT: Final = 256
@@ -75,6 +76,14 @@ standby whose disk is full for a week must not make every freeze longer."""
 
 SharedPlaces = frozenset[tuple[int, int, int, int]]
 """Parts of shared memory: device and inode number of the object, first and last offset of the part."""
+
+
+def _with_room(size: int) -> memoryview:
+    """Memory for so many bytes of pages, and for others that will come between them."""
+    try:
+        return np.empty(size + max(ROOM_SIZE, size if size > BUFFER_SIZE else 0), dtype=np.uint8).data
+    except MemoryError:  # a strict system promises no more than it has
+        return np.empty(size + ROOM_SIZE, dtype=np.uint8).data
 
 
 def _part_of(copy: Copy, wanted: Words) -> Copy:
@@ -342,7 +351,7 @@ class MemoryCapture:
 
     def _read_into(self, copied: RunningCopy, wanted: Words) -> None:
         """Read a set as far as it is there."""
-        buffer = np.empty(page_set.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
+        buffer = _with_room(page_set.total_size(wanted))
         found, filled = [], 0
         chunks = page_set.cut(wanted, READ_CHUNK)
         bounds = itertools.pairwise(itertools.accumulate(map(page_set.total_size, chunks), initial=0))
@@ -360,7 +369,7 @@ class MemoryCapture:
             found.append(readable)
             filled += size
         if found:
-            copied.add(Copy(pagemap.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
+            copied.add(Copy(pagemap.pages_joined(np.concatenate(found)), buffer))
 
     def rehearse(self) -> None:
         """See ``checkpoint.engines.ptrace.capture.process``."""
