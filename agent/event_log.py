@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_all
 from failover.core.event_log.decisions import Line
 
@@ -53,7 +54,7 @@ def unpacked(content: bytes) -> Line | None:
         if int(content[: SUM_SIZE - 1], 16) != zlib.crc32(body):
             return None
         return _decoder.decode(body)
-    except (ValueError, msgspec.MsgspecError):
+    except UNDECODABLE:
         return None
 
 

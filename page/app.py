@@ -31,6 +31,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from checkpoint.errors import UNDECODABLE
 from failover.config import accounts
 from failover.config.page import PageConfig
 from failover.config.rights import is_loopback
@@ -500,7 +501,7 @@ async def _body(request: Request, kind: type[T]) -> T:
         raise TurnedAwayError(408, f"the request did not end within {BODY_S:.0f} s") from None
     try:
         return msgspec.json.decode(bytes(content), type=kind)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except UNDECODABLE as error:
         raise TurnedAwayError(400, f"a request that no page of ours sends: {error}") from error
 
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from failover.client.control import Output
 from failover.errors import FailoverError
 from page.agent_link import AgentLink
@@ -95,7 +96,7 @@ class Viewer:
                 raise TurnedAwayError(429, "too many messages in a short time")
             try:
                 wanted = _looks.decode(text)
-            except (msgspec.DecodeError, RecursionError) as error:
+            except UNDECODABLE as error:
                 raise TurnedAwayError(400, f"a message that no page of ours sends: {error}") from error
             self._wanted = wanted.look
             if self._looking is None or self._looking.done():

@@ -19,6 +19,7 @@ import msgspec
 
 from agent.directory.server import LdapServer, UnknownUserError, WrongPasswordError
 from agent.errors import DirectoryError
+from checkpoint.errors import UNDECODABLE
 
 REQUESTS: Final = 4
 """Times ``timeout_s`` that a whole question may take: it is a handful of requests, each quick where the server is well."""
@@ -66,7 +67,7 @@ class BoundedServer:
             raise DirectoryError(f"the server has not answered in {self._limit_s:g} s")
         try:
             told = msgspec.msgpack.decode(body, type=Told)
-        except msgspec.DecodeError:
+        except UNDECODABLE:
             raise DirectoryError("the process that asks the server ended in the middle of its answer") from None
         if told.kind:
             raise KINDS[told.kind](told.sentence)

@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 
 from agent.errors import BallotError
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_whole
 
 FILE_NAME: Final = "ballot"
@@ -114,7 +115,7 @@ class VoteRecordFile:
             if rest.strip().decode() != _digest(body):
                 raise BallotError(_altered(self._path, "its digest does not fit"))
             record = msgspec.json.decode(body, type=Record)
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        except UNDECODABLE as error:
             raise BallotError(_altered(self._path, str(error))) from error
         if record.version != VERSION:
             raise BallotError(f"cannot read {self._path}: it is of version {record.version}, this agent reads {VERSION}")

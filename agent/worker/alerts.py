@@ -37,6 +37,7 @@ from agent.system.crash import end_worker_on_mistake
 from agent.system.permissions import without_output
 from agent.worker.components.hooks import PATH, Hook, Hooks
 from agent.worker.control.queries import Questions
+from checkpoint.errors import UNDECODABLE
 from checkpoint.linux.spawn.inherited_limits import Inheritance
 from checkpoint.sentences import in_words
 from checkpoint.store.whole_file import write_whole
@@ -279,7 +280,7 @@ class Alerts:
             return msgspec.json.decode(self._path.read_bytes(), type=Kept)
         except FileNotFoundError:
             return Kept()
-        except (OSError, ValueError, RecursionError) as error:  # ValueError: of msgspec, and of bytes that are no text
+        except (OSError, *UNDECODABLE) as error:
             log.warning("%s cannot be used, so what was told before may be told again: %s", self._path, in_words(error))
             return Kept()
 

@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 from msgspec.structs import replace
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_whole
 from failover.boards.directory import OWN_NAME, PRIVATE_NAME
 from failover.config.board import BoardConfig, as_toml, board_of
@@ -45,7 +46,7 @@ def read(state: Path) -> tuple[Item, ...]:
         items = board_of(msgspec.convert(table, BoardConfig), lambda keys: f"{path}: {'.'.join(keys)}").items
     except FileNotFoundError:
         return ()
-    except (OSError, ValueError, FailoverError) as error:
+    except (OSError, *UNDECODABLE, FailoverError) as error:
         log.warning("items that were to be kept over a reboot are not added: %s: %s", path, error)
         return ()
     return tuple(replace(item, keep=True) for item in items)

@@ -13,6 +13,7 @@ from typing import Any, Final, Protocol
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.board.banks import EPOCH_SHIFT, Reading
 from failover.errors import BoardError, NeverWrittenError
 
@@ -57,7 +58,7 @@ def decode(content: bytes) -> Mapping[str, Primary]:
     """
     try:
         return _decode(content)
-    except ValueError as error:
+    except UNDECODABLE as error:
         raise BoardError(f"damaged: the agent's table of primaries: {error}") from None
 
 

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.board import layout, recording
 from failover.core.board.recording import Schema
 from failover.errors import BridgeError, FailoverError, RecordingError
@@ -254,7 +255,7 @@ class _Callers:
         said = b"" if query.payload is None else bytes(query.payload)
         try:
             fields = _decode(said) if said else {}
-        except (msgspec.DecodeError, RecursionError) as error:
+        except UNDECODABLE as error:
             raise BridgeError(f"the payload of a call of {driver} is no JSON object: {error}") from None
         return msgspec.json.encode(self._proxy(driver).call(verb, fields or None))
 

@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_whole
 from failover.errors import TeamFileError
 
@@ -31,7 +32,7 @@ def config_beside(directory: Path) -> Path:
 
 def said_name(directory: Path) -> str:
     """The name that agent.toml says; "" where it says none, or cannot be read."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, *UNDECODABLE):
         return str(tomllib.loads(config_beside(directory).read_text()).get("robot", ""))
     return ""
 

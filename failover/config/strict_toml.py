@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.sentences import near
 from failover.config.choices import misfit
 from failover.errors import FileMistakeError
@@ -39,7 +40,7 @@ def read(path: Path, kind: type[T]) -> T:
     text = _text(path)
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except UNDECODABLE as error:  # also a number of thousands of digits, and tables in tables without end
         raise FileMistakeError(f"{path}: this is not TOML: {error}") from error
     for keys, valid in _unknown(table, kind, ()):
         raise FileMistakeError(_unknown_key(path, text, keys, valid))

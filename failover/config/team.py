@@ -47,6 +47,7 @@ FORMER_LIMIT: Final = 16
 
 CHANGE_MAX: Final = 1 << 40
 
+_PORT = re.compile(r"[0-9]{1,5}", re.ASCII)
 _ODD = re.compile(r"[:\"\\.]")
 """Not in a robot's name: it is the name of a file, a word of TOML, and stands before addresses."""
 
@@ -118,7 +119,11 @@ def read(directory: Path) -> Team:
         TeamFileError: it is missing, or its content makes no team.
     """
     path = directory / TEAM_FILE
-    if not path.exists():
+    try:
+        is_there = path.exists()
+    except OSError as error:
+        raise TeamFileError(f"{path}: cannot be read: {error.strerror}") from error
+    if not is_there:
         raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or copy it here from another robot")
     team = strict_toml.read(path, Team)
     check_team(str(path), team)
@@ -200,7 +205,7 @@ def split_address(address: str, where: str) -> tuple[str, int]:
     """
     host, separator, port = address.rpartition(":")
     is_host = bool(separator and host) and host.isprintable() and not set(host) & set(' "\\')
-    if not is_host or not port.isdecimal() or not port.isascii() or not 0 < int(port) < 1 << 16:
+    if not is_host or not _PORT.fullmatch(port) or not 0 < int(port) < 1 << 16:
         raise TeamFileError(f"{where}: {address!r} is no address; write host:port")
     return host.strip("[]"), int(port)
 

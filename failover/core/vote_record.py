@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.types import VoteRecord
 from failover.errors import RulesError
 
@@ -26,7 +27,7 @@ def decode(body: bytes) -> VoteRecord:
         return VoteRecord()
     try:
         return _decoder.decode(body)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except UNDECODABLE as error:
         raise RulesError(
             f"cannot read the vote record: {error}; restore it, or start this robot as new with an empty state"
         ) from error

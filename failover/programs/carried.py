@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.programs import states, versions
 from failover.core.programs.manifest import Manifest
 from failover.core.programs.states import Shelf, Version
@@ -149,6 +150,6 @@ def _check_entry(shelf: Shelf, one: Version, said: Manifest) -> None:
 def _read(content: bytes, kind: type[T]) -> T:
     try:
         found: T = (msgspec.json if kind is Shelf else msgspec.msgpack).decode(content, type=kind)
-    except msgspec.MsgspecError as error:
+    except UNDECODABLE as error:
         raise ProgramError(f"what came with the program's state is damaged: {error}") from error
     return found

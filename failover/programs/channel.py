@@ -18,6 +18,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.errors import ProgramError
 from failover.kept_state.api import Resumed
 
@@ -165,7 +166,7 @@ class Channel:
             raise ChannelClosedError("its process sent what is no message")
         try:
             found: Message = self._decode(self._exactly(length, end, timeout_s))
-        except msgspec.MsgspecError as error:
+        except UNDECODABLE as error:
             raise ChannelClosedError(f"its process sent what is no message: {error}") from error
         return found
 

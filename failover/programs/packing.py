@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.programs import bundle, manifest
 from failover.core.programs.archive import BUNDLE_SIZE_MAX, FILES_MAX, Member
 from failover.core.programs.bundle import Signature
@@ -43,7 +44,7 @@ def manifest_of(directory: Path) -> Manifest:
             raise ProgramError(f"it has more than {MANIFEST_SIZE_MAX} bytes")
         found = msgspec.convert(tomllib.loads(content.decode()), Manifest)
         manifest.check(found)
-    except (ProgramError, UnicodeError, tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+    except (ProgramError, *UNDECODABLE) as error:
         raise ProgramError(f"{path} is mistaken: {error}") from error
     return found
 

@@ -25,6 +25,7 @@ import msgspec
 from blake3 import blake3
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_whole
 from failover.core.messaging.mailbox import Stream
 from failover.core.programs import manifest, states, versions
@@ -216,7 +217,7 @@ class Store:
             return msgspec.json.decode(path.read_bytes(), type=Shelf)
         except FileNotFoundError:
             return None
-        except (OSError, msgspec.MsgspecError) as error:
+        except (OSError, *UNDECODABLE) as error:
             raise ProgramError(f"{path} cannot be read: {error}") from error
 
     def shelf(self, name: str) -> Shelf:
@@ -310,7 +311,7 @@ class Store:
         """The newest whole one."""
         found: list[Kept] = []
         for turn in (0, 1):
-            with contextlib.suppress(OSError, msgspec.MsgspecError):
+            with contextlib.suppress(OSError, *UNDECODABLE):
                 content = self._kept(path, turn).read_bytes()
                 if blake3(content[_CHECK_SIZE:]).digest(_CHECK_SIZE) == content[:_CHECK_SIZE]:
                     found.append(msgspec.msgpack.decode(content[_CHECK_SIZE:], type=Kept))

@@ -12,6 +12,7 @@ import msgspec
 
 from checkpoint.device_rules import DeviceRule
 from checkpoint.engine import NO_TERMS, NOTHING_CARRIED, Carry, Terms
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.index import folder_name
 from checkpoint.store.whole_file import write_whole
 
@@ -64,7 +65,7 @@ class Records:
     def _noted(self, component: str) -> Running | None:
         try:
             return msgspec.json.decode(self._path(component).read_bytes(), type=Running)
-        except (OSError, msgspec.MsgspecError):
+        except (OSError, *UNDECODABLE):
             return None
 
     def forget(self, component: str) -> None:

@@ -23,6 +23,7 @@ from agent.errors import TROUBLE, RefusedError
 from agent.system import clock
 from agent.system.permissions import ROOT, may
 from agent.worker.network.remote_orders import Errands
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store.whole_file import write_whole
 from failover.config import accounts
 from failover.core.reservations import (
@@ -79,7 +80,7 @@ class Reservations:
     def _kept(self) -> tuple[Reservation, ...]:
         try:
             kept = msgspec.msgpack.decode(self._path.read_bytes(), type=Kept)
-        except (OSError, msgspec.DecodeError):
+        except (OSError, *UNDECODABLE):
             return ()
         return kept.reservations if kept.boot_id == clock.kernel_boot() else ()
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.store import lost_copies
 from checkpoint.store.lost_copies import LostCopy
 from failover.cli.output import render, team_tree
@@ -75,7 +76,7 @@ def _directory(arguments: argparse.Namespace) -> Path:
     """Where they lie: as said, else as agent.toml says."""
     state = arguments.state or STATE
     if not arguments.state:
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, *UNDECODABLE):
             state = str(tomllib.loads(CONFIG.read_text()).get("state_directory", STATE))
     return Path(state) / lost_copies.FOLDER
 

@@ -19,6 +19,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, UNBOUNDED_NS
 from failover.core.board.item_types import Opaque, Type, canonical, parse, size_of
@@ -379,5 +380,5 @@ def read_robots(content: bytes) -> Robots:
 def _read(decode: Callable[[bytes], T], content: bytes, topic: str) -> T:
     try:
         return decode(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except UNDECODABLE as error:
         raise RecordingError(f"damaged: a message of {topic}: {error}") from None

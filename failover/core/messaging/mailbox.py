@@ -31,6 +31,7 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.messaging.envelope import Envelope, refusal
 from failover.errors import EnvelopeError, MailboxFullError
 
@@ -293,7 +294,7 @@ def unpacked(content: bytes) -> dict[str, Stream]:
     """
     try:
         return dict(_streams.decode(content)) if content else {}
-    except msgspec.DecodeError as error:
+    except UNDECODABLE as error:
         raise EnvelopeError(f"the kept mailbox is damaged: {error}") from error
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.naming import names
 from failover.core.naming.names import Kind
 from failover.core.naming.tables import BODY_SIZE_MAX
@@ -81,7 +82,7 @@ def unpack(body: bytes) -> Record | None:
     """The record of an entry's body; keys of later versions are left out of it, not of the table. None: it is no record."""
     try:
         return checked(_decoder.decode(body))
-    except (msgspec.DecodeError, NameFormatError, UnicodeDecodeError):
+    except (*UNDECODABLE, NameFormatError):
         return None
 
 

@@ -21,6 +21,7 @@ import msgspec
 import xxhash
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.naming import records
 from failover.core.naming.records import Record
 from failover.core.naming.tables import (
@@ -118,7 +119,7 @@ def decode(content: bytes | memoryview) -> Message | None:
         return None
     try:
         message = _decoder.decode(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    except UNDECODABLE:
         return None
     return message if all(0 <= number < COUNT_MAX for number in _numbers(message)) else None
 

@@ -16,6 +16,10 @@ from failover.errors import ScheduleError
 WORDS: Final = ("name", "period", "phase", "deadline", "priority")
 
 
+DIGITS_MAX: Final = 15
+"""Of a number: more ticks are longer than any period that is possible."""
+
+
 def declarations(text: str, tick_ns: int, where: str = "pman.conf") -> list[Declaration]:
     """The tasks of a file.
 
@@ -59,6 +63,6 @@ def _declaration(words: list[str], tick_ns: int, at: str) -> Declaration:
 
 
 def _number(word: str, what: str, at: str) -> int:
-    if not (word.isascii() and word.isdecimal()):
-        raise ScheduleError(f"{at}: {what} is {word!r}: a number of ticks is expected")
+    if not (word.isascii() and word.isdecimal() and len(word) <= DIGITS_MAX):
+        raise ScheduleError(f"{at}: {what} is {word[:40]!r}: a number of ticks is expected")
     return int(word)

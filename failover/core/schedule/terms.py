@@ -10,6 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from failover.core.schedule.course import Overrun
+from failover.core.wire.names import text_size
 from failover.errors import ScheduleError
 
 TASKS_MAX: Final = 256
@@ -127,13 +128,13 @@ def checked(declaration: Declaration, cpus_there: int = 0) -> Declaration:
         ScheduleError: something in it cannot be; names it.
     """
     terms, what = declaration.terms, f"cannot schedule {declaration.name!r}"
-    if not declaration.name.strip() or len(declaration.name.encode()) > NAME_SIZE_MAX or "\0" in declaration.name:
+    if not declaration.name.strip() or text_size(declaration.name) > NAME_SIZE_MAX or "\0" in declaration.name:
         raise ScheduleError(f"{what}: a name has 1 to {NAME_SIZE_MAX} bytes of UTF-8")
     if len(declaration.after) > PREDECESSORS_MAX:
         raise ScheduleError(f"{what}: {len(declaration.after)} predecessors; {PREDECESSORS_MAX} are possible")
     if declaration.name in declaration.after:
         raise ScheduleError(f"{what}: it is to run after itself")
-    if len(declaration.modes) > MODES_MAX or any(not 0 < len(mode.name.encode()) <= MODE_SIZE_MAX for mode in declaration.modes):
+    if len(declaration.modes) > MODES_MAX or any(not 0 < text_size(mode.name) <= MODE_SIZE_MAX for mode in declaration.modes):
         raise ScheduleError(f"{what}: it may have {MODES_MAX} modes, with names of 1 to {MODE_SIZE_MAX} bytes")
     for mode in declaration.modes:
         checked_terms(in_mode(terms, declaration.modes, mode.name), f"{what} in mode {mode.name!r}", cpus_there)

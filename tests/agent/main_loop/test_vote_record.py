@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 from agent.errors import BallotError
+from agent.main_loop import vote_record
 from agent.main_loop.vote_record import FILE_NAME, VoteRecordFile
+from failover.core import vote_record as core
+from failover.errors import RulesError
 
 
 def test_what_was_kept_is_there_in_the_next_life_which_counts_one_more(tmp_path: Path) -> None:
@@ -90,3 +93,16 @@ def test_a_vote_finds_room_on_a_disk_that_became_full(tmp_path: Path) -> None:
         assert (tmp_path / "ballot.reserve").stat().st_blocks * 512 >= 64 << 10
     finally:
         subprocess.run(["umount", str(tmp_path)], check=True)
+
+
+@pytest.mark.parametrize("body", [b'{"version":1,"robot":"\xff"}', b'{"version":' + b"[" * 12_000])
+def test_a_vote_record_with_a_right_digest_that_is_no_record_is_not_trusted(tmp_path: Path, body: bytes) -> None:
+    (tmp_path / FILE_NAME).write_bytes(body + b"\n" + vote_record._digest(body).encode() + b"\n")
+    with pytest.raises(BallotError, match="cannot trust"):
+        VoteRecordFile(tmp_path, "robot1").open()
+
+
+@pytest.mark.parametrize("body", [b"{", b'{"records":"\xff"}', b'{"x":' + b"[" * 12_000])
+def test_rules_that_are_no_vote_record_are_refused(body: bytes) -> None:
+    with pytest.raises(RulesError, match="cannot read the vote record"):
+        core.decode(body)

@@ -11,7 +11,7 @@ import pytest
 
 import failover
 from agent.main_loop.primaries import Primaries
-from failover.boards import directory
+from failover.boards import component_item, directory
 from failover.boards.board import Board
 from failover.boards.received import ReceivedItems
 from failover.core.board import layout
@@ -152,3 +152,9 @@ def test_a_table_with_more_components_than_it_holds_leaves_some_out_and_says_how
     agent.primaries.tell(names, now())
     assert 0 < agent.primaries.left_out < 900
     assert board.primary(next(iter(names))).robot == "robot1"
+
+
+@pytest.mark.parametrize("content", [b"\x81\xa1a\x81\xa1x" + b"\x91" * 12_000, b"\x81\xa1\xff\xc0", b"\xc1", b""])
+def test_a_table_of_primaries_that_is_none_is_told(content: bytes) -> None:
+    with pytest.raises(BoardError, match="damaged: the agent's table of primaries"):
+        component_item.decode(content)

@@ -24,6 +24,7 @@ import failover
 from failover.boards import directory
 from failover.boards.board import Board
 from failover.boards.received import ReceivedItems
+from failover.bridges.zenoh_bridge import CALLERS
 from failover.cli import main
 from failover.core.board import layout
 from failover.core.frames.frame import Portion
@@ -147,7 +148,9 @@ def test_drivers_are_called_and_refusals_are_told(board: Board, here: object) ->
         assert got(program, "lab/@call/engine/set", payload=b'{"duty": 0.5}') == {"lab/@call/engine/set": None}
         assert got(program, "lab/@call/engine/read") == {"lab/@call/engine/read": {"duty": 0.5}}
         assert "<= 1" in refused(program, "lab/@call/engine/set", payload=b'{"duty": 7}')
-        assert "no JSON object" in refused(program, "lab/@call/engine/set", payload=b"[1]")
+        for payload in (b"[1]", b'{"duty":"\xff"}', b'{"duty":' + b"[" * 12_000):
+            for _ in range(CALLERS + 1):  # one that ended a thread would leave the last without an answer
+                assert "no JSON object" in refused(program, "lab/@call/engine/set", payload=payload)
         assert "fly" in refused(program, "lab/@call/engine/fly")
         assert "wing" in refused(program, "lab/@call/wing/set")
         assert "one driver and one verb" in refused(program, "lab/@call/engine/*")

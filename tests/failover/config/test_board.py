@@ -13,7 +13,7 @@ from failover.config.board import BoardConfig, as_toml, text_of_board
 from failover.config.team import Robot, Team
 from failover.core.board.item_types import Opaque
 from failover.core.board.items import Board, Item
-from failover.errors import FileMistakeError
+from failover.errors import FileMistakeError, TeamFileError
 from tests.failover.core.board.test_item_types import STRUCTS
 
 ROBOTS = '[robots.robot1]\nbeats = ["127.0.0.1:7420"]\nbulk = "127.0.0.1:7421"\n'
@@ -137,3 +137,20 @@ def _under(directory: Path, text: str) -> Path:
     path = directory / "team.toml"
     path.write_text(f'team = "lab"\n{text}')
     return path
+
+
+@pytest.mark.parametrize("odd", ["period = " + "1" * 5_000, "period = " + "[" * 5_000, "type = " + "{a=" * 2_000])
+def test_a_value_that_no_reader_of_toml_can_hold_is_refused(tmp_path: Path, odd: str) -> None:
+    with pytest.raises(FileMistakeError, match=r"team\.toml: this is not TOML: "):
+        read(tmp_path, f"[board.items.ball]\n{odd}")
+
+
+@pytest.mark.parametrize("port", ["1" * 5_000, "65536", "0", "٣", "-1", ""])
+def test_a_port_that_cannot_be_is_refused(port: str) -> None:
+    with pytest.raises(TeamFileError, match="is no address; write host:port"):
+        team.split_address(f"10.0.0.1:{port}", "robot1")
+
+
+def test_a_team_directory_whose_name_cannot_be_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TeamFileError, match="cannot be read: File name too long"):
+        team.read(tmp_path / ("x" * 300))

@@ -102,11 +102,13 @@ def test_a_bundle_under_another_ones_name_is_refused_and_so_is_a_state_that_is_d
     carried.bundles = {}
     with pytest.raises(ProgramError, match="the bundle of its active version did not come with its state"):
         unpack(carried, other)
-    shelf, carried.shelf = carried.shelf, b"{"
-    with pytest.raises(ProgramError, match="what came with the program's state is damaged"):
-        unpack(carried, other)
-    with pytest.raises(ProgramError, match="what came with the program's state is damaged"):
-        kept_in(b"\xc1")
+    shelf = carried.shelf
+    for carried.shelf in (b"{", b'{"name":"\xff"}', b'{"x":' + b"[" * 12_000):
+        with pytest.raises(ProgramError, match="what came with the program's state is damaged"):
+            unpack(carried, other)
+    for damaged in (b"\xc1", b"\x81\xa1\xff\x01", b"\x81\xa1x" + b"\x91" * 12_000):
+        with pytest.raises(ProgramError, match="what came with the program's state is damaged"):
+            kept_in(damaged)
     carried.shelf = shelf
     with pytest.raises(ProgramError, match="is that of the program engine, and this host is for arm"):
         unpack(carried, msgspec.structs.replace(other, name="arm"))

@@ -8,6 +8,7 @@ import random
 from collections import Counter
 from collections.abc import Callable
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ from failover.core.messaging.mailbox import (
     Outbox,
     unpacked,
 )
-from failover.errors import MailboxFullError
+from failover.errors import EnvelopeError, MailboxFullError
 
 
 class Sender:
@@ -498,3 +499,12 @@ def test_a_held_message_keeps_the_deadline_that_it_came_with() -> None:
     box.done(taken, answer(taken, None))
     assert box.take(20 * MS) is None
     assert [one.error.kind for one in box.committed() if one.error is not UNSET] == ["expired"]
+
+
+DEEP = msgspec.msgpack.encode([("me", mailbox.Stream(1, 1, 1, {1: Envelope(ok=0)}))])
+
+
+@pytest.mark.parametrize("content", [b"\x91\x92\xa1\xff\x81", DEEP[:-1] + b"\x91" * 12_000 + b"\x01", b"\xc1"])
+def test_a_kept_mailbox_that_is_damaged_is_refused(content: bytes) -> None:
+    with pytest.raises(EnvelopeError, match="the kept mailbox is damaged"):
+        unpacked(content)

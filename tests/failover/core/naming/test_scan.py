@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from failover.core.naming import scan
+from failover.core.naming import records, scan, tables
 from failover.core.naming.records import Record
 from failover.core.naming.scan import SECOND, Ask, Digest, Pages, Row, Scan, Terms
 from failover.core.naming.tree import Reach
@@ -180,3 +180,23 @@ def test_an_answer_without_anything_new_ends_the_asking() -> None:
     old = scan.Page("robot2", 1, 0, 1, "b", 1, 0, (scan.Entry("Lab/robot2/PWM", 1),))
     assert len(one.heard(Pages("b", (old,), ("robot2",)), 1)) == 1
     assert one.heard(Pages("b", (old,), ("robot2",)), 2) == []
+
+
+def nested(depth: int) -> bytes:
+    """A record with a schema of a verb so deep; its size is within the limit of a body."""
+    whole = records.pack(Record("lab/robot2/PWM", verbs={"set": 1}))
+    assert whole.endswith(b"\xa3set\x01")
+    return whole[:-1] + b"\x91" * depth + b"\x01"
+
+
+@pytest.mark.parametrize("body", [nested(4_000), nested(12_000), b"\x81\xa4path\xa2\xff\xff", b"\x81\xa2\xff\xff\x01", b""])
+def test_a_body_that_is_no_record_is_no_name_and_ends_no_process_that_hears_of_it(body: bytes) -> None:
+    assert records.unpack(body) is None
+    ours = Scan("robot1", 1, 0)
+    ours.put(Record("lab/robot1/PWM"), 1)
+    page = tables.Page("robot2", 1, 0, 2, "", 1, 0, (tables.Entry("lab/robot2/PWM", 1, body), tables.Entry("x/y", 2, GOOD)))
+    ours.heard(Pages("tcp://10.0.0.2:1", (page,)), 2)
+    assert [one.record.path for one in ours.tree(3).under()] == ["lab/robot1/PWM", "x/y"]
+
+
+GOOD = records.pack(Record("x/y"))

@@ -40,6 +40,9 @@ def test_each_line_is_a_task_in_ticks() -> None:
         ("vision 1 0 -1 40", "pman.conf:1: deadline is '-1': a number of ticks is expected"),
         ("vision 1 0 ² 40", "pman.conf:1: deadline is '²'"),
         ("vision 0 0 0 40", "pman.conf:1: cannot schedule 'vision': a period of 0 s"),
+        (f"vision {'1' * 5_000} 0 0 40", f"pman.conf:1: period is '{'1' * 40}': a number of ticks is expected"),
+        ("vision 1 0 0 " + "9" * 400, f"pman.conf:1: priority is '{'9' * 40}': a number of ticks is expected"),
+        ("vis\udcffion 1 0 0 40", "pman.conf:1: cannot schedule 'vis\\udcffion': a name has 1 to 200 bytes of UTF-8"),
         (f"vision {10**12} 0 0 40", "pman.conf:1: cannot schedule 'vision': a period of"),
     ],
 )
