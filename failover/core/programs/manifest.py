@@ -7,13 +7,13 @@
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Any, Final, Literal
 
 import msgspec
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.core.naming import names
 from failover.core.programs import versions
 from failover.core.programs.archive import FILES, check_path
@@ -115,7 +115,7 @@ def decode(content: bytes) -> Manifest:
         raise ProgramError(f"{MANIFEST} has {len(content)} bytes, {MANIFEST_SIZE_MAX} are the most")
     try:
         found = msgspec.json.decode(content, type=Manifest)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+    except UNDECODABLE as error:
         raise ProgramError(f"{MANIFEST} is not as documented: {error}") from error
     check(found)
     return found
@@ -169,7 +169,7 @@ def _check_health(said: Health) -> None:
         ("answer_s", said.answer_s, ANSWER_MAX_S),
     )
     for key, value, most in limits:
-        if not math.isfinite(value) or not 0 <= value <= most:
+        if not 0 <= value <= most:  # neither is a number that is none
             raise ProgramError(f"health.{key}: {value} is not within 0 and {most:g}")
     if not said.answer_s:
         raise ProgramError("health.answer_s: 0 leaves no time for an answer")

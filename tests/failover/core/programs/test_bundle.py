@@ -158,6 +158,8 @@ MANIFEST_PATH = manifest.MANIFEST
         ({"permissions": Permissions(memory_mb=-1)}, "permissions.memory_mb"),
         ({"health": Health(seconds=-1)}, "health.seconds"),
         ({"health": Health(seconds=float("nan"))}, "health.seconds"),
+        ({"health": Health(seconds=float("inf"))}, "health.seconds"),
+        ({"health": Health(messages=10**400)}, "health.messages"),
         ({"health": Health(answer_s=0)}, "health.answer_s"),
         ({"health": Health(query="a b")}, "health.query"),
     ],
