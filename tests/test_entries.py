@@ -109,7 +109,7 @@ RUN = Path(__file__).parents[1] / "run"
 def test_run_explains_itself_when_it_is_asked(words: list[str]) -> None:
     ran = subprocess.run([RUN, *words], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (0, "")
-    assert all(f"./run {verb}" in ran.stdout for verb in ("demo", "test", "setup", "table"))
+    assert all(f"./run {verb}" in ran.stdout for verb in ("demo", "test", "setup", "table", "fuzz", "audit"))
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,6 +101,20 @@ def test_the_package_brings_a_command_pages_headers_and_completions(machine: Mac
     assert "No module named 'checkpoint'" in imported.stderr
     nowhere = machine.run("grep", "-rlI", str(machines.CHECKOUT), "/usr/lib/failover", "/usr/bin", check=False).stdout
     assert nowhere == ""
+
+
+def test_the_package_says_what_it_is_made_of(machine: Machine) -> None:
+    bill = json.loads((machine.root / "usr/share/doc/failover/sbom.cdx.json").read_text())
+    told = {one["name"]: one["version"] for one in bill["components"]}
+    lists = [(machines.CHECKOUT / f"requirements{kind}.txt").read_text() for kind in ("", "-programs", "-page", "-tui")]
+    assert told == dict(re.findall(r"(?m)^([a-z0-9-]+)==(\S+)", "\n".join(lists)))
+    for one in bill["components"]:
+        (digest,) = (said["content"] for said in one["hashes"])
+        assert any(f"--hash=sha256:{digest}" in text for text in lists), one["name"]
+    there = machine.run("find", "/usr/lib/failover", "-name", "*.dist-info").stdout.splitlines()
+    assert len(there) == len(told) + 1
+    ours = bill["metadata"]["component"]
+    assert machine.run("failover", "--version").stdout.split() == [ours["name"], ours["version"]]
 
 
 def test_a_program_runs_on_while_the_package_is_replaced(machine: Machine) -> None:
