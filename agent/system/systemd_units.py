@@ -19,6 +19,8 @@ import subprocess
 from pathlib import Path
 from typing import Final, Literal
 
+from checkpoint.linux.systemd_service import own_service
+
 SLICE: Final = "failover.slice"
 STARTED: Final = "SYSTEMD_EXEC_PID"
 """By it systemd (since version 248) names the process that it started; that process's children inherit the variable."""
@@ -89,17 +91,6 @@ def is_restarted() -> bool:
     except (OSError, subprocess.TimeoutExpired):
         return False
     return any(line.split()[1:3] == [unit, "restart"] for line in found.stdout.splitlines())
-
-
-def own_service(cgroups: str) -> str:
-    """The systemd service that a process belongs to, by its /proc/PID/cgroup; "" if none."""
-    for line in filter(None, cgroups.split("\n")):  # a group that a user named may hold other processes
-        controllers, path = line.split(":", 2)[1:]
-        if controllers in ("", "name=systemd"):
-            units = [part for part in path.split("/") if part.endswith(".service")]
-            if units:  # else systemd does not use this hierarchy, or the process is in none of its services
-                return units[-1]
-    return ""
 
 
 def _own_cgroups() -> str:

@@ -104,6 +104,20 @@ def group(machine: Machine) -> str:
     return machine.run("getent", "group", "failover").stdout.split(":")[2]
 
 
+def test_a_service_that_systemd_would_start_again_is_told_of(machine: Machine) -> None:
+    command = ("python3", "-c", "import time; time.sleep(1000)")
+    for unit, restart in (("again", "always"), ("once", "no")):
+        machine.run("systemd-run", f"--unit={unit}", f"--property=Restart={restart}", *command)
+        robots.until(lambda unit=unit: machine.property(f"{unit}.service", "MainPID") != "0", "the service to run")
+        pid = machine.property(f"{unit}.service", "MainPID")
+        checked = machine.run("failover", "check", pid, check=False)
+        told = machine.run("failover", "protect", pid, "--name", unit)
+        for said in (checked.stderr, told.stderr):
+            assert (f"belongs to {unit}.service, which says Restart=always" in said) is (restart == "always")
+        machine.run("failover", "release", unit)
+        machine.run("systemctl", "stop", f"{unit}.service")
+
+
 def test_a_component_lives_outside_the_service(machine: Machine) -> None:
     pid = started(machine, "outside")
     cgroup = Path(f"/proc/{machine.outer(pid)}/cgroup").read_text()

@@ -17,6 +17,7 @@ from checkpoint.sentences import visible
 from failover.cli.arguments.components import HOOKS
 from failover.cli.connection import connect
 from failover.cli.output import progress, render, team_tree
+from failover.cli.systemd_note import notes_of_service
 from failover.client.control import Control, Output, Update
 from failover.client.health import OVER_STATES
 from failover.errors import AgentRefusedError, FailoverError, LostAgentError, NoAgentError
@@ -235,6 +236,7 @@ def protect(arguments: argparse.Namespace) -> int:
         answer = agent.ask("protect", pid=arguments.pid, name=name, carry=carry, **rules)
         if arguments.wait:
             until_protected(agent, str(answer["name"]), is_quiet=arguments.json)
+    answer = {**answer, "notes": [*answer.get("notes", ()), *notes_of_service(arguments.pid)]}
     return _tell(arguments, answer, f"pid {answer['pid']} is protected as {answer['name']}")
 
 

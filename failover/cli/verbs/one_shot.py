@@ -57,6 +57,7 @@ from checkpoint.snapshot.credentials import Owner
 from checkpoint.store.whole_file import written_aside
 from failover.cli.keeper_client import Keeper
 from failover.cli.output import progress, render, team_tree
+from failover.cli.systemd_note import notes_of_service
 from failover.cli.verbs.components import exit_like
 from failover.core.types import CARRY, DETACH, REFUSE, RESET
 from failover.errors import FailoverError
@@ -486,8 +487,9 @@ def check(arguments: argparse.Namespace) -> int:
         return check_machine(arguments)
     with Keeper.spawn() as keeper:
         report = keeper.ask(messages.Probe(arguments.pid), messages.Probed)[0].report
+    notes = notes_of_service(arguments.pid)
     if arguments.json:
-        render.as_json(msgspec.to_builtins(report) | {"supported": report.supported})
+        render.as_json(msgspec.to_builtins(report) | {"supported": report.supported, "notes": notes})
         return 0 if report.supported else 1
     print(f"pid {report.pid}: {report.command}")
     print(f"{team_tree.size(report.resident_size)} in memory; written pages are found by {report.tracking}")
@@ -495,6 +497,7 @@ def check(arguments: argparse.Namespace) -> int:
     count = len(report.reasons)
     cannot = f"it cannot be captured: {count} reason{'s' if count > 1 else ''}, see refused above"
     print("it can be captured" if report.supported else cannot)
+    _print_notes(notes)
     return 0 if report.supported else 1
 
 
