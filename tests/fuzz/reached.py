@@ -28,12 +28,19 @@ class Reached:
     def __init__(self) -> None:
         self.count = 0
         self._left: dict[CodeType, set[int]] = {}
+        self._monitoring: Any = getattr(sys, "monitoring", None)
+        if self._monitoring is not None:
+            if self._monitoring.get_tool(TOOL) is None:
+                self._monitoring.use_tool_id(TOOL, "fuzz")
+            self._monitoring.register_callback(TOOL, self._monitoring.events.LINE, self._line)
+            self._monitoring.set_events(TOOL, self._monitoring.events.LINE)
+            self._monitoring.restart_events()
 
     def call(self, function: Callable[[bytes], object], content: bytes) -> bool:
         """Call it; whether it reached a new line. What it raises passes through, and counts all the same (see `count`)."""
         before = self.count
-        if hasattr(sys, "monitoring"):
-            self._monitored(function, content)
+        if self._monitoring is not None:
+            function(content)
         else:
             sys.settrace(self._entered)
             try:
@@ -58,20 +65,9 @@ class Reached:
 
         return line_reached(frame, "", None)
 
-    def _monitored(self, function: Callable[[bytes], object], content: bytes) -> None:
-        monitoring: Any = sys.monitoring  # type: ignore[attr-defined, unused-ignore]
-        if monitoring.get_tool(TOOL) is None:
-            monitoring.use_tool_id(TOOL, "fuzz")
-            monitoring.register_callback(TOOL, monitoring.events.LINE, self._line)
-        monitoring.set_events(TOOL, monitoring.events.LINE)
-        try:
-            function(content)
-        finally:
-            monitoring.set_events(TOOL, 0)
-
     def _line(self, code: CodeType, _line: int) -> Any:
         self.count += _is_followed(code)
-        return sys.monitoring.DISABLE  # type: ignore[attr-defined, unused-ignore]
+        return self._monitoring.DISABLE
 
 
 def _is_followed(code: CodeType) -> bool:
