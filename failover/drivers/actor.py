@@ -90,6 +90,8 @@ class Actor:
         }
         self.fence: Fence = _acts
         self._traffic = Traffic()
+        self._uncounted: list[tuple[Envelope, int, int, Envelope | None]] = []
+        """What `count` has still to count: (message, instant, bytes, what was said to it; None: it came)."""
         self._routes: OrderedDict[str, tuple[int, Whose]] = OrderedDict()
         """Sender → its life, and the way back to it."""
 
@@ -124,7 +126,7 @@ class Actor:
         except EnvelopeError as error:
             return [refusal(envelope, "circle", str(error))]
         if envelope.verb not in self._own:
-            self._traffic.came(envelope.sender, envelope.verb, size, now_ns)
+            self._uncounted.append((envelope, now_ns, size, None))
         return self._mailbox.arrived(envelope, now_ns)
 
     def route(self, sender: str) -> Whose | None:
@@ -210,13 +212,22 @@ class Actor:
     def _done(self, message: Envelope, said: Envelope, left_ns: int) -> None:
         hops = envelopes.left_hops(message, left_ns)
         if message.verb not in self._own:
-            took_ns = left_ns - message.hops[-1].came_ns
-            self._traffic.done(message.sender, message.verb, took_ns, left_ns, is_error=said.error is not UNSET)
+            self._uncounted.append((message, left_ns, 0, said))
         if message.id:
             self._paths[message.id] = hops
             if len(self._paths) > PATHS_MAX:
                 self._paths.popitem(last=False)
         self._mailbox.done(message, msgspec.structs.replace(said, hops=hops))
+
+    def count(self) -> None:
+        """Count what came and was handled since the last time. Called once the answers have left: no sender waits for it."""
+        uncounted, self._uncounted = self._uncounted, []
+        for message, at_ns, size, said in uncounted:
+            if said is None:
+                self._traffic.came(message.sender, message.verb, size, at_ns)
+            else:
+                took_ns = at_ns - message.hops[-1].came_ns
+                self._traffic.done(message.sender, message.verb, took_ns, at_ns, is_error=said.error is not UNSET)
 
     def carried_out(self, run: Sequence[Envelope]) -> Envelope:
         """The answer to messages that become one; the mailbox is not touched."""
@@ -251,6 +262,7 @@ class Actor:
         return {"path": self._declaration.path, "aliases": list(self._declaration.aliases), "verbs": self._declaration.schemas()}
 
     def _graph(self, _: Envelope, now_ns: int) -> Any:
+        self.count()
         return self._traffic.rows(now_ns)
 
     def _path(self, message: Envelope, _: int) -> Any:
@@ -282,6 +294,8 @@ class Actor:
 
     def sample(self, publish: Publish, clock: Callable[[], int]) -> None:
         """Send the streams that are due to those that have subscribed."""
+        if not self._samples_ns:
+            return
         now_ns = clock()
         for name in [name for name, due_ns in self._samples_ns.items() if due_ns <= now_ns]:
             those = [one for one in self._subscribers.values() if one.verb.name == name and now_ns < one.until_ns]
@@ -313,13 +327,11 @@ def _arguments(verb: Verb, body: Any) -> Mapping[str, Any]:
     Raises:
         msgspec.ValidationError: it does not fit.
     """
-    fields = verb.arguments.__struct_fields__
     if body is UNSET or body is None:
         body = {}
-    elif not isinstance(body, dict) and len(fields) == 1:
+    elif not isinstance(body, dict) and len(fields := verb.arguments.__struct_fields__) == 1:
         body = {fields[0]: body}
-    made = msgspec.convert(body, verb.arguments)
-    return {name: getattr(made, name) for name in fields}
+    return msgspec.structs.asdict(msgspec.convert(body, verb.arguments))
 
 
 def _plain(value: Any) -> Any:

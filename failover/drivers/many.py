@@ -82,8 +82,7 @@ class ManyDrivers(Serving):
 
     def _act(self) -> None:
         for actor in tuple(self._busy):
-            self._send(actor, actor.handle(self.now_ns))
-            actor.sample(self._publish, self.now_ns)
+            self._act_for(actor)
 
     def _due_ns(self, now_ns: int) -> int | None:
         waits: list[int] = []

@@ -80,9 +80,7 @@ class Sending:
             MailboxFullError: so many wait already as may.
         """
         with self._lock:
-            posted = self._outbox.post(envelope, now_ns)
-            self._outbox.committed()
-        return posted
+            return self._outbox.post(envelope, now_ns)
 
     def abandon(self) -> tuple[list[Envelope], list[Envelope]]:
         """Messages without an answer, which are forgotten: those that may have left, and those that have not."""
@@ -98,11 +96,14 @@ class Sending:
         Returns:
             Final answers; also that a message expired before it left, or had none until long after its deadline.
         """
-        if over := self._over():
+        now_ns = self.now_ns()
+        if over := self._over(now_ns):
             return over
-        if not self._is_open(until_ns, wake):
-            return []
-        self._send_due(until_ns)
+        if not self._outbox.is_connected:
+            if not self._await_open(until_ns, wake):
+                return []
+            now_ns = self.now_ns()
+        self._send_due(now_ns, until_ns)
         if not self._outbox.is_connected:
             return []
         now_ns = self.now_ns()
@@ -142,17 +143,16 @@ class Sending:
             if self._look_again(self._heard_ns + LOOK_NS):
                 self._disconnected()
 
-    def _over(self) -> list[Envelope]:
-        now_ns = self.now_ns()
+    def _over(self, now_ns: int) -> list[Envelope]:
         with self._lock:
             late, lost = self._outbox.expired(now_ns), self._outbox.given_up(now_ns)
+        if not (late or lost):
+            return late
         why = f"{self.path} has not answered, also after the deadline; it may have carried it out"
         return late + [envelopes.refusal(one, "no_answer", why) for one in lost]
 
-    def _is_open(self, until_ns: int, wake: int) -> bool:
-        """Whether there is a connection; without one it is waited for, and now and then the name is looked up anew."""
-        if self._outbox.is_connected:
-            return True
+    def _await_open(self, until_ns: int, wake: int) -> bool:
+        """Whether there is a connection by then; now and then the name is looked up anew."""
         now_ns = self.now_ns()
         with self._lock:
             next_ns = self._outbox.next_ns() or until_ns
@@ -172,13 +172,14 @@ class Sending:
             self._outbox.returned(unsent)
         self._look_ns = self.now_ns() + self._pause_ns
 
-    def _send_due(self, until_ns: int) -> None:
-        now_ns = self.now_ns()
+    def _send_due(self, now_ns: int, until_ns: int) -> None:
         with self._lock:
             is_silent = self._outbox.must_look(now_ns)
-        if is_silent and self._look_again(min(until_ns, now_ns + LOOK_NS)):
-            self._disconnected()
-            return
+        if is_silent:
+            if self._look_again(min(until_ns, now_ns + LOOK_NS)):
+                self._disconnected()
+                return
+            now_ns = self.now_ns()
         with self._lock:
             self._outbox.committed()  # this sender keeps nothing: each answer that it has is had
             due = self._outbox.due(now_ns)

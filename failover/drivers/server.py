@@ -267,12 +267,13 @@ class Serving:
 
     def _fence(self, told: int) -> str:
         """Why this copy may not act any more: another one runs under a later epoch, as a sender or the names say."""
-        own, path = self._epoch(), self.service.record.path
+        own = self._epoch()
         if own != self._epoch_told:
             self._epoch_told = own
             self.service.look()
         if not own:
             return ""
+        path = self.service.record.path
         rival = self.service.rival
         if rival is not None and rival.record.epoch > max(own, told):
             return f"{path} runs on {rival.robot} under epoch {rival.record.epoch}; this copy has epoch {own}"
@@ -290,8 +291,12 @@ class Serving:
 
     def _act(self) -> None:
         """Carry out what is due now."""
-        self._send(self._actor, self._actor.handle(self.now_ns))
-        self._actor.sample(self._publish, self.now_ns)
+        self._act_for(self._actor)
+
+    def _act_for(self, actor: Actor) -> None:
+        self._send(actor, actor.handle(self.now_ns))
+        actor.count()
+        actor.sample(self._publish, self.now_ns)
 
     def _addressed(self, to: str) -> Actor | None:
         """Who is to get a message; None: nothing here has that name."""

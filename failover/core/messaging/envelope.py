@@ -32,13 +32,16 @@ STAMP_MAX: Final = (1 << 63) - 1
 TEXT_MAX: Final = 512
 """Characters of ``to``, ``verb``, ``id``, ``from``, ``by``, ``re`` and of a name in ``hops``: tables keep thousands of them."""
 
+FEW: Final = 64
+"""Numbers of a body that is small whatever they are."""
+
 HOPS_MAX: Final = 16
 """Processes that pass on a message; more is a circle of names."""
 
 Encoding = Literal["json", "msgpack", "avro"]
 
 
-class Hop(Struct, frozen=True, array_like=True):
+class Hop(Struct, frozen=True, array_like=True, gc=False):
     """One process that passed the message on: when it came and when it left, in ns of that process's own clock.
 
     A stamp above `INTEGER_MAX`, a machine that runs for 104 days, is written as text.
@@ -59,14 +62,14 @@ class Hop(Struct, frozen=True, array_like=True):
         return None if self.left is None else int(self.left)
 
 
-class Fault(Struct, frozen=True):
+class Fault(Struct, frozen=True, gc=False):
     """Why a message was not carried out. ``kind``: one word for programs; ``sentence``: for people."""
 
     kind: str
     sentence: str = ""
 
 
-class Envelope(Struct, frozen=True, omit_defaults=True, rename={"sender": "from", "rest": "\x7frest"}):
+class Envelope(Struct, frozen=True, omit_defaults=True, gc=False, rename={"sender": "from", "rest": "\x7frest"}):
     """A message, or the answer to one.
 
     Attributes:
@@ -379,9 +382,9 @@ def _check_text(text: str) -> None:
 
 
 def _check_head(envelope: Envelope) -> None:
-    texts = (envelope.to, envelope.verb, envelope.id, envelope.sender, envelope.by, envelope.re)
-    if sum(map(len, texts)) > TEXT_MAX:  # seldom: then each by itself
-        for text in texts:
+    size = len(envelope.to) + len(envelope.verb) + len(envelope.id) + len(envelope.sender) + len(envelope.by) + len(envelope.re)
+    if size > TEXT_MAX:  # seldom: then each by itself
+        for text in (envelope.to, envelope.verb, envelope.id, envelope.sender, envelope.by, envelope.re):
             if len(text) > TEXT_MAX:
                 raise EnvelopeError(f"the message has the name {text[:40]!r}… of {len(text)} characters; {TEXT_MAX} are the most")
     if not 0 <= envelope.boot | envelope.seq | envelope.after | envelope.had | envelope.epoch < INTEGER_MAX:
@@ -426,8 +429,18 @@ def check_size(envelope: Envelope, room: int, encoding: Encoding = "json") -> No
         EnvelopeError: it is too large, or a name in it is.
     """
     _check_head(envelope)
+    if _is_small(envelope):
+        return
     if (size := max(len(encode(envelope, one)) for one in {"json", encoding}) + room) > MESSAGE_SIZE_MAX:
         raise EnvelopeError(f"the message has {size} bytes, {MESSAGE_SIZE_MAX} are the most; send the name of a file instead")
+
+
+def _is_small(envelope: Envelope) -> bool:
+    """Whether it has a few numbers for a body: then it has some kilobytes at most, in any encoding."""
+    body = envelope.body
+    if envelope.ok is not UNSET or envelope.rest:
+        return False
+    return body is UNSET or (type(body) is dict and len(body) <= FEW and sum(map(len, body)) <= TEXT_MAX and _is_flat(body))
 
 
 def encode_answer(said: Envelope, encoding: Encoding = "json") -> bytes:

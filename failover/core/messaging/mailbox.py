@@ -75,7 +75,7 @@ ANSWER_NS: Final = 5_000 * MS
 # --- Sending ----------------------------------------------------------------------------------------------------------
 
 
-class Waiting(Struct, frozen=True):
+class Waiting(Struct, frozen=True, gc=False):
     """A posted message. ``until_ns``: its deadline; None: it has none."""
 
     envelope: Envelope
@@ -298,7 +298,7 @@ def unpacked(content: bytes) -> dict[str, Stream]:
         raise EnvelopeError(f"the kept mailbox is damaged: {error}") from error
 
 
-class Arrived(Struct):
+class Arrived(Struct, gc=False):
     """A message that waits. ``until_ns``: its deadline by the receiver's clock."""
 
     envelope: Envelope

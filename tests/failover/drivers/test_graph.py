@@ -7,13 +7,17 @@ import json
 import random
 import threading
 from collections import Counter
+from typing import Any
 
 import pytest
 
 from failover.cli import main
 from failover.core.messaging.envelope import Envelope, encode
+from failover.core.messaging.traffic import Traffic
+from failover.drivers.actor import Whose
 from failover.drivers.here import Here
 from failover.drivers.local import LocalWay
+from failover.drivers.server import Serving
 from failover.errors import CallRefusedError, DriverError
 from tests.failover.drivers.devices import ENGINE, Arm, Engine
 from tests.failover.drivers.serving import LIMIT_S, called, serving, until
@@ -63,6 +67,26 @@ def test_the_graph_is_the_matrix_of_what_was_sent(here: Here, capsys: pytest.Cap
     assert all(one["p99_us"] for one in edges.values()) and told["silent"] == []
     assert dot.count(" -> ") == len(edges) and dot.startswith("digraph")
     assert table.count("robot1/") == len(edges)
+
+
+def test_an_answer_leaves_before_its_message_is_counted(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    left: list[str] = []
+    publish, done = Serving._publish, Traffic.done
+
+    def published(self: Serving, whose: Whose, envelope: Envelope) -> bool:
+        left.append("answer")
+        return publish(self, whose, envelope)
+
+    def counted(self: Traffic, *arguments: Any, **named: Any) -> None:
+        left.append("count")
+        done(self, *arguments, **named)
+
+    monkeypatch.setattr(Serving, "_publish", published)
+    monkeypatch.setattr(Traffic, "done", counted)
+    with serving(Engine, here), called(here, "engine") as proxy:
+        for _ in range(3):
+            proxy.call("read")
+    assert left == ["answer", "count"] * 3
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import importlib.util
 import json
 import random
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -316,6 +316,14 @@ def test_a_message_is_measured_in_each_encoding_in_which_it_may_leave() -> None:
     module.check_size(asked, 0)
     with pytest.raises(EnvelopeError, match="are the most"):
         module.check_size(asked, 0, "msgpack")
+
+
+def test_a_body_that_is_small_without_a_look_at_its_bytes_is() -> None:
+    names = [f"{number:0{TEXT_MAX // module.FEW}d}"[: TEXT_MAX // module.FEW].replace("0", "\0") for number in range(module.FEW)]
+    asked = Envelope("a", body=dict.fromkeys(names, -1.2345678901234567e-300))
+    assert module._is_small(asked) and not module._is_small(Envelope("a", body={"x": ["y"]}))
+    encodings = [one for one in get_args(module.Encoding) if one != "avro" or importlib.util.find_spec("fastavro") is not None]
+    assert max(len(encode(asked, one)) for one in encodings) < 8 << 10
 
 
 # --- The document ---------------------------------------------------------------------------------------------------------
