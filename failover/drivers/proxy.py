@@ -33,7 +33,7 @@ from failover.drivers.here import Here, here, is_served
 from failover.drivers.local import SCHEME
 from failover.drivers.lookup import lookup
 from failover.drivers.route import Route
-from failover.drivers.sending import EXPIRED, SECOND_NS, Posting, refused, sending
+from failover.drivers.sending import EXPIRED, SECOND_NS, Posting, Sending, refused
 from failover.drivers.streaming import Streaming
 from failover.errors import CallRefusedError, DriverError, EnvelopeError, NoAnswerError
 
@@ -60,7 +60,7 @@ class _Described(Struct, frozen=True):
     verbs: dict[str, _Role] = {}
 
 
-def proxy(name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json") -> Proxy:
+def proxy(name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json", durable: bool = False) -> Proxy:
     """The driver of that name: a path, an alias, or an address.
 
     Args:
@@ -68,22 +68,34 @@ def proxy(name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encodin
         sender: a name of this program that stays the same when it is started again: what its process before has sent and was not
             carried out is then never carried out after what this one sends. One process at a time uses it. "": a new name.
         encoding: of messages and their answers: json, msgpack or avro; a driver that cannot read it gets JSON.
+        durable: what has no answer when the program ends is kept in a file, and sent when a program with this ``sender`` and
+            ``durable`` runs again on this robot, before what that one posts. The file is in ``$FAILOVER_STATE``, else in the
+            working directory. Each call and post then waits for the disk.
 
     Raises:
         NameFormatError, NameUnknownError, NameAmbiguousError: it names nothing, or several things.
         DriverError: it is on another robot, and no key of the team can be read here; or an argument cannot work.
     """
     place = here()
-    return Proxy(place, lookup(place, name), queue=queue, sender=sender, encoding=encoding)
+    return Proxy(place, lookup(place, name), queue=queue, sender=sender, encoding=encoding, durable=durable)
 
 
 class Proxy:
     """One driver, as another process calls it; a context manager."""
 
-    def __init__(self, here: Here, place: Place, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json") -> None:
+    def __init__(
+        self,
+        here: Here,
+        place: Place,
+        *,
+        queue: int = WINDOW,
+        sender: str = "",
+        encoding: Encoding = "json",
+        durable: bool = False,
+    ) -> None:
         """
         Raises:
-            DriverError: it is on another robot that cannot be reached, or an argument cannot work.
+            DriverError: it is on another robot that cannot be reached, an argument cannot work, or no file can be kept.
         """
         self.here = here
         self.path = place.record.path
@@ -94,12 +106,16 @@ class Proxy:
         _check_encoding(encoding)
         if not sender.isprintable() or "/" in sender or len(sender) + len(here.robot) >= TEXT_MAX // 2:
             raise DriverError(f"sender={sender[:64]!r} cannot name a program: write visible characters without /, 200 at most")
+        if durable and not sender:
+            raise DriverError("durable=True needs a name by which this program's messages are found again: give it a sender, too")
         program = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python").stem
         self.sender = f"{here.robot}/{sender or f'{program}-{os.getpid()}-{next(_NUMBERS)}'}"
         self._by = accounts.name_of(os.geteuid())
         """For a driver at another robot, now or after it has moved; one at this robot believes the kernel."""
-        self._sending = sending(here, place, self.sender, queue, encoding)
-        self._posting: Posting | None = None
+        self._sending = Sending(here, place, self.sender, queue, encoding, is_durable=durable)
+        self._posting: Posting | None = Posting(self._sending) if self._sending.left_over else None
+        self.left_over: tuple[concurrent.futures.Future[Any], ...] = self._posting.left_over if self._posting is not None else ()
+        """Of what an earlier process of a durable sender has posted and that had no answer, in order."""
         self._lock = threading.RLock()
         self._is_closed = False
 
@@ -124,6 +140,9 @@ class Proxy:
         try:
             if kind is None:
                 self.flush(TIMEOUT_S)
+        except NoAnswerError:
+            if not self._sending.is_durable:
+                raise
         finally:
             self.close()
 
@@ -181,7 +200,7 @@ class Proxy:
         Raises:
             MailboxFullError: so many messages wait already as the queue takes; this one was not taken.
             EnvelopeError: no message can say this body.
-            DriverError: the proxy is closed.
+            DriverError: the proxy is closed, or a durable one cannot keep the message.
         """
         envelope = self._envelope(verb, self._body(body, fields), deadline_s)
         with self._lock:

@@ -11,19 +11,22 @@ import os
 import select
 import threading
 from concurrent.futures import Future
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from msgspec import UNSET
 
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Encoding, Envelope
-from failover.core.messaging.mailbox import MOVED, RESEND_FIRST_NS, RESEND_MOST_NS, Outbox
+from failover.core.messaging.mailbox import MOVED, MS, RESEND_FIRST_NS, RESEND_MOST_NS, Outbox, Outgoing
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here
 from failover.drivers.name_service import new_boot
 from failover.drivers.route import LOOK_NS, Route
 from failover.errors import CallRefusedError, DriverError, EnvelopeError, NoAnswerError
+
+if TYPE_CHECKING:
+    from failover.drivers.posts_file import PostsFile
 
 SECOND_NS: Final = 1_000_000_000
 
@@ -43,19 +46,28 @@ log = logging.getLogger("failover.drivers")
 class Sending:
     """What one sender has to tell one driver, and the way there. `post` may be called by any thread, `turn` by one at a time."""
 
-    def __init__(self, here: Here, place: Place, outbox: Outbox, encoding: Encoding = "json") -> None:
+    def __init__(
+        self, here: Here, place: Place, sender: str, limit: int, encoding: Encoding = "json", *, is_durable: bool = False
+    ) -> None:
         """
         Args:
+            limit: messages that may wait for an answer.
             encoding: of messages; a driver that cannot read it gets JSON.
+            is_durable: messages without an answer are kept in a file, and those that are there are sent first.
 
         Raises:
-            DriverError: the driver is on another robot that cannot be reached.
+            DriverError: the driver is on another robot that cannot be reached, or the file cannot be used.
         """
         self.encoding: Encoding = encoding
         self.route = Route(here, place)
         self.path = self.route.path
         self.now_ns = self.route.now_ns
-        self._outbox = outbox
+        self._file = self._opened(sender) if is_durable else None
+        kept = self._file.kept if self._file is not None else Outgoing(new_boot())
+        self.left_over = tuple(one.envelope.id for one in kept.waiting)
+        """The ids of messages that an earlier process has posted, and that are sent now."""
+        self._outbox = Outbox(sender, kept.boot, kept, limit)
+        self._outbox.committed()
         self._lock = threading.Lock()
         self._epoch = place.record.epoch
         """The highest of the driver of which this sender has heard."""
@@ -64,9 +76,27 @@ class Sending:
         self._look_ns = self._heard_ns = 0
         self._pause_ns = RESEND_FIRST_NS
 
+    def _opened(self, sender: str) -> PostsFile:
+        from failover.drivers.posts_file import PostsFile  # only who keeps messages loads it
+
+        try:
+            return PostsFile(sender, self.path, new_boot(), self.now_ns())
+        except DriverError:
+            self.route.close()
+            raise
+
     def close(self) -> None:
-        """Let the connection go."""
+        """Let the connection go; what is in the file stays there."""
         self.route.close()
+        with self._lock:
+            if self._file is not None:
+                self._file.close()
+                self._file = None
+
+    @property
+    def is_durable(self) -> bool:
+        """Whether messages without an answer outlive this process."""
+        return self._file is not None
 
     @property
     def is_idle(self) -> bool:
@@ -78,9 +108,19 @@ class Sending:
 
         Raises:
             MailboxFullError: so many wait already as may.
+            DriverError: it cannot be kept.
         """
         with self._lock:
-            return self._outbox.post(envelope, now_ns)
+            posted = self._outbox.post(envelope, now_ns)
+            if self._file is not None:
+                until_ns = None if posted.deadline_ms is None else now_ns + round(posted.deadline_ms * MS)
+                try:
+                    self._file.posted(posted, until_ns, now_ns)
+                except DriverError:
+                    self._outbox.withdrawn()
+                    raise
+                self._outbox.committed()
+            return posted
 
     def abandon(self) -> tuple[list[Envelope], list[Envelope]]:
         """Messages without an answer, which are forgotten: those that may have left, and those that have not."""
@@ -134,6 +174,8 @@ class Sending:
         self._epoch = max(self._epoch, answer.epoch)
         with self._lock:
             is_final = self._outbox.answered(answer, self._heard_ns)
+            if is_final and self._file is not None:
+                self._file.over(answer.seq)
         return [answer] if is_final or kind == "busy" else []
 
     def _moved(self) -> None:
@@ -146,8 +188,11 @@ class Sending:
     def _over(self, now_ns: int) -> list[Envelope]:
         with self._lock:
             late, lost = self._outbox.expired(now_ns), self._outbox.given_up(now_ns)
-        if not (late or lost):
-            return late
+            if not (late or lost):
+                return late
+            if self._file is not None:
+                for one in (*late, *lost):
+                    self._file.over(one.seq)
         why = f"{self.path} has not answered, also after the deadline; it may have carried it out"
         return late + [envelopes.refusal(one, "no_answer", why) for one in lost]
 
@@ -181,7 +226,8 @@ class Sending:
                 return
             now_ns = self.now_ns()
         with self._lock:
-            self._outbox.committed()  # this sender keeps nothing: each answer that it has is had
+            if self._file is None:
+                self._outbox.committed()  # this sender keeps nothing: each answer that it has is had
             due = self._outbox.due(now_ns)
         for place, one in enumerate(due):
             if not self.route.way.send(self._encoded(one)):
@@ -208,7 +254,11 @@ class Posting:
 
     def __init__(self, sending: Sending) -> None:
         self._sending = sending
-        self._futures: dict[str, Future[Any]] = {}
+        self._futures: dict[str, Future[Any]] = {name: Future() for name in sending.left_over}
+        self.left_over = tuple(self._futures.values())
+        """Of what an earlier process has posted and that had no answer, in order."""
+        for future in self.left_over:
+            future.set_running_or_notify_cancel()
         self._lock = threading.Lock()
         self._is_over = False
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -282,12 +332,14 @@ class Posting:
     def _end(self, why: str) -> None:
         with self._lock:
             self._is_over = True
+            is_kept = self._sending.is_durable
             left, _ = self._sending.abandon()
             futures, self._futures = self._futures, {}
             os.close(self._wake)
         may_be_done = {one.id for one in left}
         for name, future in futures.items():
             told = "it may have been carried out" if name in may_be_done else "it has not left"
+            told += "; it is kept, and sent when its sender runs again" * is_kept
             future.set_exception(NoAnswerError(f"{self._sending.path} has not answered: {why}; {told}"))
 
 
@@ -295,19 +347,6 @@ def refused(answer: Envelope) -> CallRefusedError:
     """The error that an answer tells."""
     assert answer.error is not UNSET
     return CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
-
-
-def sending(here: Here, place: Place, sender: str, limit: int, encoding: Encoding) -> Sending:
-    """To the driver of a place.
-
-    Args:
-        limit: messages that may wait for an answer.
-        encoding: of messages.
-
-    Raises:
-        DriverError: it is on another robot that cannot be reached.
-    """
-    return Sending(here, place, Outbox(sender, new_boot(), limit=limit), encoding)
 
 
 def decoded(content: bytes) -> Envelope | None:

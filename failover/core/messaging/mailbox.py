@@ -142,6 +142,11 @@ class Outbox:
         self._unsent.append(Waiting(envelope, until_ns))
         return envelope
 
+    def withdrawn(self) -> None:
+        """The message that was posted last cannot be kept: it is as if it had not been posted. None was `committed` since."""
+        self._unsent.pop()
+        self._seq -= 1
+
     def committed(self) -> None:
         """All that was posted so far is kept, and may leave; so is which answers have come."""
         self._free = self._seq

@@ -1,0 +1,239 @@
+"""What a program has posted and has no answer to, in a file: it outlives the program, which sends it when it runs again.
+
+A record is written for each message that is posted, before `failover.proxy`'s ``post`` returns, and for each that is over. The
+file is written anew when it is opened, and when most of it is over. Each record: the size of its content (four bytes,
+little-endian); the XXH3 of that, eight bytes; the content in msgpack, a `Begun` first.
+
+Source: rename(2), fdatasync(2); doc/xxhash_spec.md of xxHash.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import xxhash
+from msgspec import Struct
+
+from failover.boards import locks
+from failover.core.messaging import envelope as envelopes
+from failover.core.messaging.envelope import Envelope, Hop
+from failover.core.messaging.mailbox import Outgoing, Waiting
+from failover.errors import DriverError, EnvelopeError
+
+FOLDER: Final = "FAILOVER_STATE"
+"""The variable that names the folder, as for a kept state without an agent; else it is the working directory."""
+
+TIDY_SIZE: Final = 256 << 10
+"""Bytes of a file that is not written anew, however little of it still counts."""
+
+NAME_MAX: Final = 200
+"""Bytes of a file's name, with room for an ending. Source: a file system's 255."""
+
+_HEAD: Final = 12
+_LOCK_AT: Final = 0
+NS: Final = 1_000_000_000
+
+
+class Begun(Struct, frozen=True, tag="begun"):
+    """The sender's life, and how many messages it had posted when the file was written."""
+
+    boot: int
+    seq: int
+
+
+class Posted(Struct, frozen=True, tag="posted"):
+    """A message. ``until_s``: its deadline in seconds since 1970: no other clock outlives a machine's boot; None: it has none."""
+
+    message: bytes
+    until_s: float | None
+
+
+class Over(Struct, frozen=True, tag="over"):
+    """The message of this number has its answer, or has expired."""
+
+    seq: int
+
+
+_read: Final = msgspec.msgpack.Decoder(Begun | Posted | Over).decode
+_written: Final = msgspec.msgpack.Encoder().encode
+
+
+class PostsFile:
+    """The file of one sender to one driver; used under its `Sending`'s lock."""
+
+    def __init__(self, sender: str, path: str, boot: int, now_ns: int) -> None:
+        """
+        Args:
+            boot: of a sender that has no file.
+            now_ns: by the clock of the outbox's deadlines.
+
+        Raises:
+            DriverError: it cannot be read or written, is damaged, or another process has it.
+        """
+        self.path = place_of(sender, path)
+        self._waiting: dict[int, bytes] = {}
+        self._descriptor = -1
+        self._size = 0
+        self._is_behind = False
+        """Whether the file lacks that a message is over."""
+        try:
+            self._lock = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise self._refused(error) from error
+        try:
+            if not locks.take(self._lock, _LOCK_AT):
+                raise DriverError(
+                    f"another process posts as {sender} to {path}, and has {self.path}: end it, or use another name"
+                )
+            self.kept = self._found(boot, now_ns)
+            self._seq = self.kept.seq
+            self._write_anew()
+        except OSError as error:
+            self.close()
+            raise self._refused(error) from error
+        except DriverError:
+            self.close()
+            raise
+
+    def _refused(self, error: OSError) -> DriverError:
+        return DriverError(f"cannot keep what is posted in {self.path}: {error.strerror}; {FOLDER} names another folder")
+
+    # --- Read ---------------------------------------------------------------------------------------------------------------
+
+    def _found(self, boot: int, now_ns: int) -> Outgoing:
+        """What is in the file; the last record may be half there: its ``post`` has not returned."""
+        try:
+            content = self.path.read_bytes()
+        except FileNotFoundError:
+            return Outgoing(boot)
+        begun: Begun | None = None
+        found: dict[int, Waiting] = {}
+        seq = 0
+        try:
+            for number, record in enumerate(self._records(content)):
+                one = _read(record)
+                if isinstance(one, Begun) is not (number == 0):
+                    raise DriverError(f"{self.path} is damaged: its record {number} is in the wrong place; {_CURE}")
+                if isinstance(one, Begun):
+                    begun, seq = one, one.seq
+                elif isinstance(one, Over):
+                    found.pop(one.seq, None)
+                    self._waiting.pop(one.seq, None)
+                else:
+                    message = envelopes.decode(one.message)
+                    hops = (Hop(message.sender, now_ns),)  # the clock of the stamps there may have begun anew
+                    message = msgspec.structs.replace(message, hops=hops)
+                    until_ns = None if one.until_s is None else now_ns + round((one.until_s - time.time()) * NS)
+                    found[message.seq], self._waiting[message.seq] = Waiting(message, until_ns), record
+                    seq = max(seq, message.seq)
+        except (msgspec.DecodeError, EnvelopeError) as error:
+            raise DriverError(f"{self.path} is damaged: {error}; {_CURE}") from error
+        return Outgoing(begun.boot, seq, list(found.values())) if begun is not None else Outgoing(boot)
+
+    def _records(self, content: bytes) -> Iterator[bytes]:
+        at = 0
+        while at + _HEAD <= len(content):
+            end = at + _HEAD + int.from_bytes(content[at : at + 4], "little")
+            record = content[at + _HEAD : end]
+            if end > len(content) or xxhash.xxh3_64_digest(record) != content[at + 4 : at + _HEAD]:
+                if end < len(content):
+                    raise DriverError(f"{self.path} is damaged at byte {at}; {_CURE}")
+                return
+            yield record
+            at = end
+
+    # --- Write --------------------------------------------------------------------------------------------------------------
+
+    def posted(self, message: Envelope, until_ns: int | None, now_ns: int) -> None:
+        """Keep a message; once this returns it survives a power cut, and so does all that was `over` before.
+
+        Raises:
+            DriverError: it cannot be kept.
+        """
+        until_s = None if until_ns is None else time.time() + (until_ns - now_ns) / NS
+        record = _written(Posted(envelopes.encode(message, "msgpack"), until_s))
+        try:
+            if self._is_behind:
+                self._write_anew()
+            self._append(record)
+            os.fdatasync(self._descriptor)
+        except OSError as error:
+            self._take_back()
+            raise self._refused(error) from error
+        self._waiting[message.seq], self._seq = record, message.seq
+        self._size += _HEAD + len(record)
+
+    def over(self, seq: int) -> None:
+        """A message needs to be sent no more. If this cannot be written now, it is before the next message."""
+        if self._waiting.pop(seq, None) is None:
+            return
+        record = _written(Over(seq))
+        try:
+            self._append(record)
+            self._size += _HEAD + len(record)
+            if self._size > TIDY_SIZE and self._size > 2 * sum(map(len, self._waiting.values())):
+                self._write_anew()
+        except OSError:
+            self._is_behind = True
+            self._take_back()
+
+    def _take_back(self) -> None:
+        """What was half appended; if it stays, the next record is written over it."""
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._descriptor, self._size)
+
+    def _append(self, record: bytes) -> None:
+        whole = _framed(record)
+        if os.pwrite(self._descriptor, whole, self._size) < len(whole):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _write_anew(self) -> None:
+        """With what waits, and nothing else."""
+        content = b"".join(map(_framed, (_written(Begun(self.kept.boot, self._seq)), *self._waiting.values())))
+        new = self.path.with_suffix(".new")
+        descriptor = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        try:
+            if os.write(descriptor, content) < len(content):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(descriptor)
+            os.rename(new, self.path)
+            folder = os.open(self.path.parent, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError:
+            os.close(descriptor)
+            raise
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self._descriptor, self._size, self._is_behind = descriptor, len(content), False
+
+    def close(self) -> None:
+        """Let another process have it."""
+        for descriptor in (self._descriptor, self._lock):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._descriptor = self._lock = -1
+
+
+_CURE: Final = "move it away, and what it holds is not sent"
+
+
+def place_of(sender: str, path: str) -> Path:
+    """The file of a sender and a driver."""
+    name = f"{sender}-to-{path}".replace("/", ".")
+    if len(name.encode()) > NAME_MAX:
+        name = f"{name.encode()[: NAME_MAX - 20].decode(errors='ignore')}-{xxhash.xxh3_64_hexdigest(name.encode())}"
+    return Path(os.environ.get(FOLDER) or Path.cwd()) / f"{name}.posts"
+
+
+def _framed(record: bytes) -> bytes:
+    return len(record).to_bytes(4, "little") + xxhash.xxh3_64_digest(record) + record

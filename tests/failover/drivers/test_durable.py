@@ -1,0 +1,214 @@
+"""What a program has posted outlives it: a file holds it, and its next life sends it."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from failover.core.messaging.envelope import Envelope
+from failover.core.messaging.mailbox import Outbox
+from failover.drivers.here import Here
+from failover.drivers.lookup import lookup
+from failover.drivers.posts_file import FOLDER, NS, PostsFile
+from failover.drivers.proxy import Proxy
+from failover.errors import DriverError
+from tests.failover.drivers.devices import ENGINE, Engine
+from tests.failover.drivers.serving import LIMIT_S, serving
+
+MISSION = """
+import sys, failover
+with failover.proxy("engine", sender="mission", durable=True) as engine:
+    engine.call("set", duty=0.0)
+    print("called", flush=True)
+    sys.stdin.readline()
+    for number in range(1, 6):
+        engine.post("set", duty=number / 10)
+    print("posted", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.fixture(autouse=True)
+def kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(FOLDER, str(folder))
+    return folder
+
+
+def mission(here: Here) -> Proxy:
+    return Proxy(here, lookup(here, "engine"), sender="mission", durable=True)
+
+
+def test_what_a_killed_program_has_posted_is_carried_out_first_in_order_and_once(here: Here, kept: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", MISSION], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdin is not None and program.stdout is not None
+        with serving(Engine, here) as engine:
+            assert program.stdout.readline() == "called\n"
+            assert engine.instance.heard == [0.0]
+        program.stdin.write("\n")
+        program.stdin.flush()
+        assert program.stdout.readline() == "posted\n"
+        program.kill()
+    with serving(Engine, here) as engine:
+        with mission(here) as proxy:
+            proxy.call("set", duty=0.6, timeout=LIMIT_S)
+            assert [one.result(0) for one in proxy.left_over] == [None] * 5
+        assert engine.instance.heard == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+        with mission(here) as proxy:
+            assert proxy.left_over == ()
+    assert [*kept.glob("*.posts")] == [kept / "robot1.mission-to-Lab.Robotino.Engines.3.PWM.posts"]
+
+
+def test_a_block_ends_without_an_error_although_the_driver_is_away_for_what_was_posted_is_kept(
+    here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("failover.drivers.proxy.TIMEOUT_S", 0.01)
+    with serving(Engine, here):
+        place = lookup(here, "engine")
+    with Proxy(here, place, sender="mission", durable=True) as proxy:
+        done = proxy.post("set", duty=0.5)
+    with pytest.raises(Exception, match="it is kept, and sent when its sender runs again"):
+        done.result(0)
+    with serving(Engine, here) as engine, mission(here) as proxy:
+        assert proxy.left_over[0].result(LIMIT_S) is None and engine.instance.heard == [0.5]
+
+
+def test_two_processes_of_a_durable_sender_are_refused_and_so_is_one_without_a_name(here: Here) -> None:
+    with serving(Engine, here):
+        with mission(here) as proxy:
+            with pytest.raises(DriverError, match="another process posts as robot1/mission"):
+                mission(here)
+            proxy.call("set", duty=0.1)
+        with pytest.raises(DriverError, match="give it a sender"):
+            Proxy(here, lookup(here, "engine"), durable=True)
+
+
+@pytest.fixture
+def file() -> Iterator[PostsFile]:
+    found = opened()
+    yield found
+    found.close()
+
+
+def opened() -> PostsFile:
+    return PostsFile("robot1/mission", ENGINE, 7, 0)
+
+
+def waiting(file: PostsFile) -> list[int]:
+    return [one.envelope.seq for one in file.kept.waiting]
+
+
+def post(outbox: Outbox, file: PostsFile) -> int:
+    posted = outbox.post(Envelope(to=ENGINE, verb="set", body={"text": "x" * 100}, reliable=True), 0)
+    file.posted(posted, None, 0)
+    return posted.seq
+
+
+def test_a_file_cut_within_any_record_holds_what_was_kept_until_then(file: PostsFile) -> None:
+    dice = random.Random(1)
+    outbox, held = Outbox("robot1/mission", 7), [0]
+    sizes = {file.path.stat().st_size: ([], 0)}
+    now: list[int] = []
+    for _ in range(12):
+        if now and dice.random() < 0.4:
+            file.over(now.pop(dice.randrange(len(now))))
+        else:
+            now.append(post(outbox, file))
+            held.append(now[-1])
+        sizes[file.path.stat().st_size] = ([*now], held[-1])
+    whole = file.path.read_bytes()
+    file.close()
+    cuts = {size + more for size in sizes for more in (0, 1, 11, 12, 13, 60) if size + more <= len(whole)} | {
+        size - 1 for size in sizes if size > min(sizes)
+    }
+    for cut in sorted(cuts):
+        file.path.write_bytes(whole[:cut])
+        again = opened()
+        expected = sizes[max(size for size in sizes if size <= cut)]
+        assert (waiting(again), again.kept.seq, again.kept.boot) == (*expected, 7), f"cut at {cut}"
+        again.close()
+
+
+def test_a_file_that_is_damaged_is_refused_and_stays_as_it_is(file: PostsFile) -> None:
+    outbox = Outbox("robot1/mission", 7)
+    begun = file.path.stat().st_size
+    for _ in range(3):
+        post(outbox, file)
+    whole = bytearray(file.path.read_bytes())
+    file.close()
+    whole[begun + 40] ^= 1
+    file.path.write_bytes(whole)
+    with pytest.raises(DriverError, match=f"is damaged at byte {begun}; move it away"):
+        opened()
+    assert file.path.read_bytes() == whole
+
+
+def test_a_deadline_goes_on_by_the_calendar_also_where_the_other_clock_began_anew(file: PostsFile) -> None:
+    file.posted(Envelope(to=ENGINE, seq=1, reliable=True), 100_000 + 60 * NS, 100_000)
+    file.posted(Envelope(to=ENGINE, seq=2, reliable=True), 100_000 - 60 * NS, 100_000)
+    file.close()
+    again = PostsFile("robot1/mission", ENGINE, 7, 5)
+    first, second = (one.until_ns for one in again.kept.waiting)
+    assert first is not None and second is not None and 5 < first <= 5 + 60 * NS and second <= 5 - 60 * NS
+    again.close()
+
+
+def test_a_file_is_written_anew_when_most_of_it_is_over_and_numbers_go_on(
+    file: PostsFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("failover.drivers.posts_file.TIDY_SIZE", 4_096)
+    outbox, sizes = Outbox("robot1/mission", 7), []
+    while not sizes or file.path.stat().st_size > sizes[-1]:
+        sizes.append(file.path.stat().st_size)
+        seq = post(outbox, file)
+        outbox.committed()
+        outbox.due(0)
+        outbox.answered(Envelope(boot=7, seq=seq), 0)
+        file.over(seq)
+    assert 3_000 < sizes[-1] <= 4_096 and file.path.stat().st_size < 100
+    file.close()
+    again = opened()
+    assert (waiting(again), again.kept.seq) == ([], seq)
+    again.close()
+
+
+@contextlib.contextmanager
+def full_from(size: int) -> Iterator[None]:
+    """No file of this process grows above so many bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_that_a_message_is_over_is_in_the_file_before_the_next_one_although_the_disk_was_full(file: PostsFile) -> None:
+    outbox = Outbox("robot1/mission", 7)
+    for _ in range(2):
+        post(outbox, file)
+    with full_from(file.path.stat().st_size):
+        file.over(1)
+    post(outbox, file)
+    file.close()
+    again = opened()
+    assert waiting(again) == [2, 3]
+    again.close()
+
+
+def test_a_message_that_cannot_be_kept_is_not_taken_and_the_next_one_is(here: Here, kept: Path) -> None:
+    with serving(Engine, here) as engine, mission(here) as proxy:
+        proxy.call("set", duty=0.1)
+        size = next(kept.glob("*.posts")).stat().st_size
+        with full_from(size + 50), pytest.raises(DriverError, match="cannot keep what is posted in"):
+            proxy.post("set", duty=0.2)
+        proxy.call("set", duty=0.3)
+        assert engine.instance.heard == [0.1, 0.3]
+    with serving(Engine, here), mission(here) as proxy:
+        assert proxy.left_over == ()
