@@ -151,11 +151,11 @@ def snapshot_chain() -> Decoder:
     base, delta = history(2)
     seeds = [format._pack_runs(delta)]
     file = format.encode_bytes(delta)
-    first = chain.applied(page_set.PageTable.empty(PAGE), base)
+    first = chain.applied(page_set.PageTable.empty(PAGE), base, (base.contents,))
 
     def call(content: bytes) -> object:
         changed = format.decode(_rewritten(file, SectionKind.RUNS, content))
-        table = chain.applied(first, changed)
+        table = chain.applied(first, changed, (changed.contents,))
         return table.page_sum, chain.fold([base, changed])
 
     return Decoder(seeds, call)
