@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Final
 
 from msgspec import Struct, field
 
@@ -14,6 +15,10 @@ from checkpoint.model import Position
 from checkpoint.pages import merge, page_set
 from checkpoint.pages.merge import Copy
 from checkpoint.pages.page_set import PageMap, Words
+
+WITHIN_SIZE: Final = 8 << 20
+"""Bytes of a copy from which on its memory is used again for what is sent. Smaller ones stay as they are, for
+`checkpoint.engines.ptrace.capture.at_rest` compares with them."""
 
 
 class Unacknowledged(Struct, frozen=True):
@@ -80,7 +85,7 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
     def contents(self) -> tuple[Words, memoryview, Words]:
         """The carried pages that are to be sent, in order, their bytes, and those of anonymous memory that are all zero.
 
-        Once: the copies may be used up by it.
+        Once: it may use up copies of `WITHIN_SIZE` and more.
         """
         sources, _ = merge.newest(self.copies, abi.PAGE_SIZE).without(self.carried, NONE)
         zero = merge.are_zero(self.copies, sources, abi.PAGE_SIZE) & ~page_set.covered(self.of_files, sources.addresses)
@@ -92,8 +97,9 @@ class Taken(Struct, frozen=True, dict=True, eq=False):
         """Their bytes, in the largest copy that is not needed any more, if that can be."""
         contents = [copy.content for copy in self.copies]
         if len(contents) > 1:
-            largest = max(range(len(contents) - 1), key=lambda index: page_set.total_size(self.copies[index].pages))
-            within = merge.gathered_within(largest, contents, sent, abi.PAGE_SIZE)
+            sizes = [page_set.total_size(copy.pages) for copy in self.copies[:-1]]
+            largest = max(range(len(sizes)), key=sizes.__getitem__)
+            within = merge.gathered_within(largest, contents, sent, abi.PAGE_SIZE) if sizes[largest] >= WITHIN_SIZE else None
             if within is not None:
                 return within
         return merge.gathered(contents, sent, abi.PAGE_SIZE)

@@ -13,12 +13,14 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder, Session
-from checkpoint.engines.ptrace.capture import at_rest
+from checkpoint.engines.ptrace.capture import at_rest, memory_result
+from checkpoint.engines.ptrace.capture.session import PtraceSession
 from checkpoint.engines.ptrace.capture.snapshot_builder import SnapshotBuilder
 from checkpoint.errors import UnsupportedError
+from checkpoint.linux import abi
 from checkpoint.linux.procfs import procfs
 from checkpoint.model import Position
-from tests.checkpoint.round_trip import Program, captured_at_last, ended, protected, start
+from tests.checkpoint.round_trip import Program, captured_at_last, ended, protected, start, start_tracee
 
 pytestmark = [pytest.mark.root, pytest.mark.write_protection]
 
@@ -164,3 +166,68 @@ def test_a_look_is_believed_for_a_while_only(tmp_path: Path, monkeypatch: pytest
         time.sleep(0.05)
         assert one.session.unchanged(0) is None
     assert at_rest.REST_MAX_S <= 2.0, "docs/limits.md says so"
+
+
+class Told:
+    """A program that writes pages by letters (tests/tracees/pages_by_word.c), and waits in the same read again."""
+
+    def __init__(self, program: Program, words: int, answers: int) -> None:
+        self.program = program
+        self._words = words
+        self._answers = answers
+
+    def say(self, letters: str) -> None:
+        for letter in letters:
+            os.write(self._words, letter.encode())
+            assert os.read(self._answers, 1) == b"x"
+            while procfs.stat(self.program.pid).state != "S":
+                time.sleep(0.001)
+
+
+@pytest.mark.parametrize(
+    ("before", "during", "after"),
+    [
+        pytest.param("m", "b", "d", id="a page comes between those that were copied"),
+        pytest.param("mz", "l", "u", id="a page of zeros goes from between them"),
+    ],
+)
+def test_a_page_is_compared_with_its_own_bytes(
+    compiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, during: str, after: str
+) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    look, coming = PtraceSession._frozen_look, [during]
+
+    def looked_at(self: PtraceSession, *arguments: object, **named: object) -> object:
+        if is_delta and coming:
+            told.say(coming.pop())
+        return look(self, *arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(PtraceSession, "_frozen_look", looked_at)
+    os.mkfifo(tmp_path / "words")
+    os.mkfifo(tmp_path / "answers")
+    answers = os.open(tmp_path / "answers", os.O_RDWR)
+    words = os.open(tmp_path / "words", os.O_RDWR)
+    is_delta = False
+    try:
+        tracee = start_tracee(compiled("pages_by_word"), tmp_path, "words", "answers")
+        with ended(tracee) as program, protected(program) as session:
+            told = Told(program, words, answers)
+            one = Waiting(program, session, words)
+            one.capture(base=True)
+            told.say(before)
+            is_delta = True
+            position = one.capture()
+            assert not coming, "it wrote after most was copied, and before it stood still"
+            deadline = time.monotonic() + PATIENCE_S
+            while session.unchanged(0) != position:
+                assert time.monotonic() < deadline, "it never rests"
+                time.sleep(0.005)
+            told.say(after)
+            assert session.unchanged(0) is None, "a page has the bytes of another one now"
+    finally:
+        os.close(words)
+        os.close(answers)
+
+
+def test_no_copy_that_is_compared_is_used_for_another_thing() -> None:
+    assert at_rest.REST_PAGES * abi.PAGE_SIZE < memory_result.WITHIN_SIZE
