@@ -21,12 +21,6 @@ encoding``), which no link is slow enough to be asked for.
 WORTH_COMPRESSING = 15 / 16
 """A frame is stored compressed when that takes less than this part of its size."""
 
-SAMPLED_SIZE: Final = 1 << 19
-"""Bytes of a piece that is worth samples."""
-SAMPLES: Final = 4
-SAMPLE_SIZE: Final = 16 << 10
-"""Bytes of each of them: several pages, which may be alike."""
-
 _of_thread: Final = local()
 
 A = TypeVar("A", bound=bytes | memoryview)
@@ -50,15 +44,6 @@ def own_compressor() -> Compressor:
 def stored(raw: bytes | memoryview, compressor: Compressor) -> tuple[Codec, bytes | memoryview]:
     """Compressed where it is worth it."""
     return _better(raw, compressor.compress(raw))
-
-
-def seems_incompressible(raw: memoryview, compressor: Compressor) -> bool:
-    """Whether samples of a long piece become no smaller: they take a sixteenth of the time that all of it would."""
-    if len(raw) < SAMPLED_SIZE:
-        return False
-    step = len(raw) // SAMPLES
-    sample = b"".join(raw[begin : begin + SAMPLE_SIZE] for begin in range(0, SAMPLES * step, step))
-    return _better(sample, compressor.compress(sample))[0] is Codec.RAW
 
 
 def stored_each(raws: Sequence[memoryview], compressor: Compressor) -> list[tuple[Codec, memoryview]]:

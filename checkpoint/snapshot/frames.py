@@ -41,13 +41,9 @@ class Body(Struct, frozen=True):
 
 
 class Packer:
-    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time.
-
-    Behind a frame that did not compress there are often gigabytes more: of those it tries samples first.
-    """
+    """Makes bodies of frames, in several threads at once: each borrows a compressor, for none may be used twice at a time."""
 
     def __init__(self, threads: int) -> None:
-        self._was_raw = False
         self._compressors: SimpleQueue[Compressor] = SimpleQueue()
         for _ in range(threads):
             self._compressors.put(compression.compressor() if threads > 1 else compression.own_compressor())
@@ -55,10 +51,7 @@ class Packer:
     def __call__(self, raw: memoryview) -> Body:
         """The body of one frame."""
         with self._borrowed() as compressor:
-            if self._was_raw and compression.seems_incompressible(raw, compressor):
-                return Body(Codec.RAW, raw, len(raw), layout.digest_of(raw))
             codec, content = compression.stored(raw, compressor)
-        self._was_raw = codec is Codec.RAW
         return Body(codec, content, len(raw), layout.digest_of(content))
 
     def each(self, raws: Sequence[memoryview]) -> list[Body]:
