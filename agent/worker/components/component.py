@@ -315,7 +315,7 @@ class Component:
         if isinstance(captured, keeper_messages.Unchanged):
             return captured
         self.keeper.note(captured)
-        (snapshot,) = descriptors or self.keeper.take_spare()
+        (snapshot,) = descriptors or spare
         self._held = hold and not is_held_by_guard
         self._commits[captured.position] = captured.commit
         self._totals[captured.position] = captured.totals

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -120,15 +121,25 @@ class Following:
 
     @contextlib.contextmanager
     def lending(self) -> Iterator[tuple[int, ...]]:
-        """The spare file, if there is one, for a capture in the body. Of one that failed it may hold a part, and so it goes."""
+        """The spare file, if there is one, for a capture in the body, also if the keeper is let go meanwhile.
+
+        Afterwards it is the caller's to close where the snapshot was written to it. One that is still empty is the spare again.
+        After a capture that failed it may hold a part, and so it goes.
+        """
+        spare = self.take_spare()
         try:
-            yield self.spare
+            yield spare
         except BaseException:
-            close_all(self.take_spare())
+            close_all(spare)
             raise
+        if spare and not os.fstat(spare[0]).st_size:
+            if self.is_there and not self.spare:
+                self.spare = spare
+            else:
+                close_all(spare)
 
     def take_spare(self) -> tuple[int, ...]:
-        """The spare file, with the snapshot that was written to it; the caller's to close."""
+        """The spare file, if there is one; the caller's to close."""
         spare, self.spare = self.spare, ()
         return spare
 

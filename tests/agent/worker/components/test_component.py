@@ -562,6 +562,25 @@ def test_a_large_snapshot_goes_straight_into_a_file_of_the_store_and_a_small_one
     live(tmp_path, story)
 
 
+def test_a_keeper_that_is_let_go_as_its_answer_comes_leaves_the_snapshot(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        async with started(places, BIG) as component:
+            while not component.logs.read(1, 0, committed=False).content:
+                await asyncio.sleep(POLL_S)
+            await component.protect()
+            link = component.keeper._link
+            assert link is not None
+            component.keeper.lend(lambda: os.open(tmp_path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600))
+            link.dialogue.heard = lambda _: asyncio.get_running_loop().call_soon(component.keeper.drop) is None
+            captured = await component.capture(base=True, generation=1, sequence=9, epoch=1)
+            assert isinstance(captured, Captured)
+            assert not component.keeper.is_there
+            assert len(format.decode(captured.snapshot).contents) > 2 * LARGE_SIZE
+            os.close(captured.snapshot)
+
+    live(tmp_path, story)
+
+
 def test_logs_that_were_closed_write_into_no_other_file(tmp_path: Path) -> None:
     """The number of a closed descriptor may be another file's by then."""
     logs = OutputLogs(tmp_path)
