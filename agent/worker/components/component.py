@@ -281,6 +281,16 @@ class Component:
                 raise
             raise NothingCommittedError(f"{refusal}; it may yet say that it keeps its state") from refusal
 
+    @contextlib.contextmanager
+    def _let_go_if_it_fails(self, is_held: bool) -> Iterator[None]:
+        """A keeper that was to leave the program standing may have done so before it failed: it lets go of it as it ends."""
+        try:
+            yield
+        except BaseException:
+            if is_held:
+                self._drop_keeper()
+            raise
+
     @property
     def _awaits_commit(self) -> bool:
         """Whether there is nothing to follow yet."""
@@ -310,7 +320,7 @@ class Component:
         share, is_lent = self.keeper.share(), bool(self.keeper.spare)
         order = keeper_messages.Capture(base, generation, sequence, epoch, hold, share, lag_ns, if_changed=True, spare=is_lent)
         async with self._standing_still(is_held_by_guard):
-            with self._patience(), self.keeper.lending() as spare:
+            with self._let_go_if_it_fails(hold and not is_held_by_guard), self._patience(), self.keeper.lending() as spare:
                 captured, descriptors = await self.keeper.ask(order, spare)
         if isinstance(captured, keeper_messages.Unchanged):
             return captured

@@ -562,6 +562,36 @@ def test_a_large_snapshot_goes_straight_into_a_file_of_the_store_and_a_small_one
     live(tmp_path, story)
 
 
+BIG_TICKS: Final = (
+    f"import os, time; held = os.urandom({2 * LARGE_SIZE}); print('ready', flush=True)\n"
+    "while True: time.sleep(0.02); print('on', flush=True)"
+)
+
+
+def test_a_program_whose_last_capture_before_a_handover_fails_runs_on(tmp_path: Path) -> None:
+    """The keeper has left it standing by then, and cannot write what it holds: the disk is full."""
+
+    async def story(places: Places) -> None:
+        async with started(places, BIG_TICKS) as component:
+            log = component.logs.directory / "stdout.log"
+
+            async def runs_on() -> None:
+                before = log.stat().st_size
+                await until(lambda: log.stat().st_size > before, "a line that it writes")
+
+            await runs_on()
+            component.keeper.lend(lambda: os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+            with pytest.raises(StoreError, match="cannot write a snapshot"):
+                await component.capture(base=True, generation=1, sequence=9, epoch=1, hold=True)
+            await runs_on()
+            captures = Captures(component)
+            await captures.take()
+            await runs_on()
+            captures.close()
+
+    live(tmp_path, story)
+
+
 def test_a_keeper_that_is_let_go_as_its_answer_comes_leaves_the_snapshot(tmp_path: Path) -> None:
     async def story(places: Places) -> None:
         async with started(places, BIG) as component:
