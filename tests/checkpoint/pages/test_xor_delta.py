@@ -24,7 +24,8 @@ from checkpoint.pages import page_set, xor_delta
 from checkpoint.pages.page_set import Buffer, PageTable, Words
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.snapshot import format, layout
-from checkpoint.store import chain
+from checkpoint.snapshot.byte_sources import Source
+from checkpoint.store import chain, verify
 from checkpoint.store.base_on_disk import stored_base
 from checkpoint.store.chain import applied
 from checkpoint.store.page_lookup import pages_at
@@ -332,8 +333,8 @@ def test_a_store_proves_differences_whatever_it_remembers_and_after_a_restart(tm
     store.close()
 
 
-def test_a_store_proves_a_large_snapshot_in_little_memory(tmp_path: Path) -> None:
-    """A standby may have little memory to spare, and the pages of a snapshot may be gigabytes."""
+def large() -> list[Snapshot]:
+    """A base and a delta, half of whose pages are told as differences."""
     noise, count = np.random.default_rng(1).bytes(LARGE), LARGE // PAGE
     state = {number: noise[number * PAGE : (number + 1) * PAGE] for number in range(count)}
     base = snapshot(state, vmas=(vma(0, count),))
@@ -341,7 +342,13 @@ def test_a_store_proves_a_large_snapshot_in_little_memory(tmp_path: Path) -> Non
     delta = snapshot(after, vmas=(vma(0, count),), parent=base.position, sequence=2)
     told = as_told([base, delta], LARGE // 2)
     assert page_set.total_size(page_set.extents(told[1].differences)) == LARGE // 2
-    files, store = files_of(told, tmp_path), open_store(tmp_path / "store", budget=PageBudget(0))
+    return told
+
+
+def test_a_store_proves_a_large_snapshot_in_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A standby may have little memory to spare, and the pages of a snapshot may be gigabytes."""
+    monkeypatch.setattr(xor_delta, "HELD_SIZE", 4 << 20)  # else the delta is to be far larger
+    files, store = files_of(large(), tmp_path), open_store(tmp_path / "store", budget=PageBudget(0))
     tracemalloc.start()
     try:
         for path in files:
@@ -351,6 +358,23 @@ def test_a_store_proves_a_large_snapshot_in_little_memory(tmp_path: Path) -> Non
     finally:
         tracemalloc.stop()
         store.close()
+
+
+def test_a_store_reads_earlier_content_seldom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each time it reads what all files of the chain say of their pages: that takes longer than the pages themselves."""
+    files, store = files_of(large(), tmp_path), open_store(tmp_path / "store", budget=PageBudget(0))
+    asked: list[int] = []
+
+    def noted(chain: Sequence[Source], wanted: Words, page_size: int) -> Rows:
+        asked.append(len(wanted))
+        return pages_at(chain, wanted, page_size)
+
+    monkeypatch.setattr(verify, "pages_at", noted)
+    for path in files:
+        with path.open("rb") as file:
+            store.put(file.fileno())
+    assert asked == [LARGE // 2 // PAGE]
+    store.close()
 
 
 def test_a_store_takes_no_difference_that_leads_elsewhere(tmp_path: Path) -> None:
