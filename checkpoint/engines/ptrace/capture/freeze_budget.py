@@ -59,7 +59,7 @@ class FreezeBudget:
         return max(1, int((self._budget_ns - self._rest_ns) / self._page_ns))
 
     def begin_capture(self) -> None:
-        """A capture begins, of several freezes if need be."""
+        """A capture begins, of several freezes if need be; or goes on after a freeze in whose middle processes came and went."""
         self._begun_ns = self._clock()
 
     def waited(self, duration_s: float) -> None:

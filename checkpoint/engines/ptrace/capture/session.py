@@ -322,6 +322,7 @@ class PtraceSession:
                 self._is_single, may_stay = self._is_single and not may_stay, False
                 if is_last:
                     raise
+                self._budget.begin_capture()  # a long copy excuses one long freeze, not each of those that follow it
                 time.sleep(MOVED_PAUSE_S)
             except OverBudgetError as late:
                 let_go(late)

@@ -77,16 +77,21 @@ def test_a_process_that_is_born_during_the_wait_is_entered_before_the_freeze(
 
 
 def test_a_capture_whose_copy_took_long_is_made_again_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else gigabytes would be copied anew for a process that came in the middle of the first freeze."""
-    now, moves, copies = [0.0], [MovedError("one has come")], list[object]()
+    """Else gigabytes would be copied anew for a process that came in the middle of the first freeze.
+
+    Only one freeze may take as long as it must: the second one begins with little to copy.
+    """
+    now, moves, copies, is_long = [0.0], [MovedError("one has come")], list[object](), list[bool]()
     look, copy = PtraceSession._frozen_look, CapturedProcess.copy_running
 
     def slow(self: CapturedProcess, *, copied: RunningCopy | None = None, **named: Any) -> RunningCopy:
         copies.append(copied)
-        now[0] += MOVED_S + 1
+        if copied is None:
+            now[0] += MOVED_S + LONG_CAPTURE_NS / 1e9
         return copy(self, copied=copied, **named)
 
     def moving(self: PtraceSession, *given: Any, **named: Any) -> Frozen:
+        is_long.append(self._budget.is_long)
         if moves:
             raise moves.pop()
         return look(self, *given, **named)
@@ -96,11 +101,14 @@ def test_a_capture_whose_copy_took_long_is_made_again_all_the_same(tmp_path: Pat
     monkeypatch.setattr(CapturedProcess, "copy_running", slow)
     with ended(start([sys.executable, "-S", "-c", PARENT, tmp_path], tmp_path)) as program, protected(program) as session:
         program.wait_for_line("ready")
+        assert isinstance(session, PtraceSession)
+        monkeypatch.setattr(session._budget, "_clock", lambda: int(now[0] * 1e9))
         session.capture(CaptureOrder(sequence=1))
         program.kill()
     assert len(copies) == 2
     assert copies[0] is None
     assert copies[1] is not None, "the second freeze goes on with the copy of the first"
+    assert is_long == [True, False]
 
 
 def test_the_wait_counts_neither_as_a_capture_that_is_made_again_too_often_nor_as_a_long_one(
