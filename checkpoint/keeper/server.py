@@ -57,7 +57,7 @@ from checkpoint.store import chain
 from checkpoint.store.base_in_process import UnreadBase
 from checkpoint.store.base_on_disk import stored_base
 from checkpoint.store.digest_cache import DigestsOfFiles
-from checkpoint.store.disk import Disk, DiskFile
+from checkpoint.store.disk import Disk, DiskFile, with_cure
 from checkpoint.store.xor_cache import Sender
 
 if TYPE_CHECKING:
@@ -554,7 +554,7 @@ def _written(component: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise StoreError(f"cannot write a snapshot of {component}: {error.strerror}") from error
+        raise StoreError(f"cannot write a snapshot of {component}: {with_cure(error)}") from error
 
 
 def _has_several_processes(files: Descriptors) -> bool:

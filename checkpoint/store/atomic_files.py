@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from checkpoint.errors import StoreError
-from checkpoint.store.disk import Disk, DiskFile
+from checkpoint.store.disk import Disk, DiskFile, with_cure
 
 TEMPORARY_PREFIX: Final = "arriving-"
 """Begins the name of a file that is not whole yet; such files are removed when the store is opened."""
@@ -112,5 +111,4 @@ def disk_trouble(tried: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        cure = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        raise StoreError(f"cannot {tried}: {error.strerror}{cure}; the snapshots in the store are intact") from error
+        raise StoreError(f"cannot {tried}: {with_cure(error)}; the snapshots in the store are intact") from error

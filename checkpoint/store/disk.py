@@ -79,6 +79,11 @@ class Disk:
         path.unlink(missing_ok=True)
 
 
+def with_cure(error: OSError) -> str:
+    """What the kernel says of a failed write, and the cure of a full disk."""
+    return f"{error.strerror}; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error.strerror)
+
+
 class DiskFile:
     """An empty file that is written from its beginning: what ``format.encode`` needs of a file. From any thread, one at a time.
 

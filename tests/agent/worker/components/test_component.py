@@ -532,8 +532,8 @@ def test_a_large_snapshot_goes_straight_into_a_file_of_the_store_and_a_small_one
         made.append(os.open(tmp_path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600))
         return made[-1]
 
-    def unwritable() -> int:
-        return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+    def full() -> int:
+        return os.open("/dev/full", os.O_RDWR | os.O_CLOEXEC)
 
     async def story(places: Places) -> None:
         async with started(places, BIG) as component:
@@ -550,8 +550,8 @@ def test_a_large_snapshot_goes_straight_into_a_file_of_the_store_and_a_small_one
             assert format.decode(small.snapshot).parent == large.position
             assert keeper.spare == (made[1],) and not os.fstat(made[1]).st_size, "it waits for a large one"
             close_all(keeper.take_spare())
-            keeper.lend(unwritable)
-            with pytest.raises(StoreError, match="cannot write a snapshot"):
+            keeper.lend(full)
+            with pytest.raises(StoreError, match=f"cannot write a snapshot of {NAME}: No space left on device; free some space"):
                 await component.capture(base=True, generation=1, sequence=9, epoch=1)
             assert not keeper.spare, "it may hold a part of a snapshot"
             keeper.terms = replace(keeper.terms, owner=Owner(1000))
