@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Collection
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -56,6 +57,11 @@ BUFFER_SIZE_MIN: Final = 1 << 20
 ROOM_SIZE: Final = 64 << 10
 """Bytes that a copy has room for behind its pages: of the vdso, and of what came since. A large one has as much again: room that
 is not used takes no memory."""
+STRICT_SHARE: Final = 8
+"""On a system that counts promised memory as used, a large copy has room for one part in so many of its pages."""
+OVERCOMMIT: Final = Path("/proc/sys/vm/overcommit_memory")
+STRICT: Final = b"2"
+"""Source: proc_sys_vm(5)."""
 WORTH_COUNT: Final = 16
 """Pages that are worth the first pass of a delta while the program runs."""
 LARGE_COUNT: Final = 256
@@ -80,9 +86,12 @@ SharedPlaces = frozenset[tuple[int, int, int, int]]
 
 def _with_room(size: int) -> memoryview:
     """Memory for so many bytes of pages, and for others that will come between them."""
+    room = ROOM_SIZE
+    if size > BUFFER_SIZE:
+        room = size // STRICT_SHARE if OVERCOMMIT.read_bytes().strip() == STRICT else size
     try:
-        return np.empty(size + max(ROOM_SIZE, size if size > BUFFER_SIZE else 0), dtype=np.uint8).data
-    except MemoryError:  # a strict system promises no more than it has
+        return np.empty(size + room, dtype=np.uint8).data
+    except MemoryError:  # there is less than that
         return np.empty(size + ROOM_SIZE, dtype=np.uint8).data
 
 
