@@ -34,6 +34,8 @@ MEMFD_LIMIT: Final = 64 << 20
 """Bytes of a message in a memfd; larger things (pages, streams) travel as descriptors of its own."""
 DESCRIPTOR_LIMIT: Final = 250
 """Descriptors in one message: SCM_MAX_FD is 253; a chain of more files is folded by its sender first."""
+LARGE_SIZE: Final = 16 << 20
+"""Bytes of pages of a snapshot that is encoded into a spare file, where there is one: else memory holds it once more."""
 
 M = TypeVar("M")
 
@@ -230,7 +232,7 @@ class Capture(msgspec.Struct, frozen=True, tag=True):
     With a descriptor, of an empty file: it is encoded there, and the answer brings none.
 
     Attributes:
-        spare: that file is for a large snapshot alone; a small one comes in a memfd, and leaves the file empty.
+        spare: that file is for a large snapshot (`LARGE_SIZE`) alone; a small one comes in a memfd, and leaves the file empty.
         hold: leave the program standing still afterwards, until `Release`: an end now ends it in exactly this state.
         xor_cache: bytes in which the keeper may remember pages, to tell deltas as differences from them; 0: not at all.
         lag_ns: how long it may wait for a moment between two activations of the program's tasks; 0: it does not wait.

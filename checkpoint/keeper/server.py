@@ -73,9 +73,6 @@ FILES: Final = 65536
 COLLECTED_AFTER: Final = 128
 """Requests after which we collect objects that refer to each other, and give free memory back: 4 ms, every few seconds."""
 
-LARGE_SIZE: Final = 16 << 20
-"""Bytes of pages of a snapshot that is encoded into a spare file, where there is one: else memory holds it once more."""
-
 STREAM_DESCRIPTORS: Final = 5
 """Counters, two outputs, two logs: what a message brings along for streams."""
 
@@ -89,7 +86,7 @@ class _Encoded(msgspec.Struct, frozen=True):
     Attributes:
         snapshot: its pages are not used any more.
         size: bytes of the file; ``dirty_bytes``: of the pages in it; ``known_bytes``: of those told as differences.
-        descriptors: the file, where the request brought none.
+        descriptors: a memory file with it, where it is not in the file that the request brought.
     """
 
     snapshot: Snapshot
@@ -273,7 +270,7 @@ class Keeper:
         told, known_bytes = self._sender.told(captured, request.xor_cache)
         if target is not None and not request.spare:
             return _Encoded(captured, encoded_in(target, told, threads), len(captured.contents), known_bytes)
-        if target is not None and len(captured.contents) >= LARGE_SIZE:
+        if target is not None and len(captured.contents) >= messages.LARGE_SIZE:
             with _written(captured.component):
                 size = format.encode(told, DiskFile(Disk(), target), threads=threads)
             return _Encoded(captured, size, len(captured.contents), known_bytes)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from agent.errors import KeeperLostError
+from agent.system.threads import to_its_end
 from agent.worker.components.paths import Places
 from agent.worker.components.process_pool import KeeperLink
 from checkpoint import errors
@@ -35,6 +36,7 @@ class Following:
         self._places = places
         self._link: KeeperLink | None = None
         self._wanted = self._remembered = 0
+        self._is_large = True  # as long as nothing is known
         self.spare: tuple[int, ...] = ()
 
     @property
@@ -109,15 +111,20 @@ class Following:
         if link is not None:
             link.end()
 
-    def lend(self, unnamed: Callable[[], int]) -> None:
-        """Have a spare file. A keeper with the rights of a user gets none: it could write to what is stored.
+    async def lend(self, unnamed: Callable[[], int]) -> None:
+        """Have a spare file, unless its last base was small. A keeper with the rights of a user gets none: it could write to what
+        is stored.
 
         Args:
-            unnamed: makes one; raises StoreError.
+            unnamed: makes one, in a thread; raises StoreError.
         """
-        if not self.spare and self.terms.owner is None:
+
+        def make() -> None:
+            self.spare = (unnamed(),)
+
+        if not self.spare and self._is_large and self.terms.owner is None:
             with contextlib.suppress(StoreError):  # memory will do
-                self.spare = (unnamed(),)
+                await to_its_end(make)
 
     @contextlib.contextmanager
     def lending(self) -> Iterator[tuple[int, ...]]:
@@ -148,7 +155,9 @@ class Following:
         return self._places.budget.share(self._name, self._wanted, self._remembered)
 
     def note(self, captured: messages.Captured) -> None:
-        """Note how much it remembers after a capture."""
+        """Note how much it remembers after a capture, and whether the next base may be large."""
+        if captured.parent is None or captured.dirty_bytes >= messages.LARGE_SIZE:
+            self._is_large = captured.dirty_bytes >= messages.LARGE_SIZE
         self._wanted, self._remembered = captured.wanted_bytes, captured.remembered_bytes
 
     def _remembers_nothing(self) -> None:

@@ -38,7 +38,7 @@ class Snapshots(Struct, frozen=True):
         Raises:
             CheckpointError, AgentError, OSError: there is none, or it could not be stored; the program runs on.
         """
-        component.keeper.lend(self.around.store.unnamed)
+        await component.keeper.lend(self.around.store.unnamed)
         captured = await component.capture(
             base=act.base, generation=act.generation, sequence=act.sequence, epoch=act.epoch, hold=act.hold, lag_ns=act.lag_ns
         )

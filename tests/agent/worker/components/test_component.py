@@ -9,6 +9,7 @@ import fcntl
 import os
 import signal
 import termios
+import threading
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -29,8 +30,7 @@ from agent.worker.components.paths import Places, guard_sockets
 from agent.worker.components.process_pool import ProcessPool, connect
 from checkpoint.engine import NO_TERMS
 from checkpoint.errors import CaptureError, CheckpointError, FormatError, NothingCommittedError, ProcessGoneError, StoreError
-from checkpoint.keeper.messages import close_all
-from checkpoint.keeper.server import LARGE_SIZE
+from checkpoint.keeper.messages import LARGE_SIZE, close_all
 from checkpoint.model import OutputPiece
 from checkpoint.segment.output_counters import StreamCounts
 from checkpoint.snapshot import format
@@ -540,26 +540,49 @@ def test_a_large_snapshot_goes_straight_into_a_file_of_the_store_and_a_small_one
             keeper, captures = component.keeper, Captures(component)
             while not component.logs.read(1, 0, committed=False).content:
                 await asyncio.sleep(POLL_S)
-            keeper.lend(unnamed)
+            await keeper.lend(unnamed)
             large = await captures.take()
             assert (large.snapshot, keeper.spare) == (made[0], ())
             assert len(format.decode(large.snapshot).contents) > 2 * LARGE_SIZE
-            keeper.lend(unnamed)
-            keeper.lend(unnamed)
+            await keeper.lend(unnamed)
+            await keeper.lend(unnamed)
             small = await captures.take()
             assert format.decode(small.snapshot).parent == large.position
             assert keeper.spare == (made[1],) and not os.fstat(made[1]).st_size, "it waits for a large one"
             close_all(keeper.take_spare())
-            keeper.lend(full)
+            await keeper.lend(full)
             with pytest.raises(StoreError, match=f"cannot write a snapshot of {NAME}: No space left on device; free some space"):
                 await component.capture(base=True, generation=1, sequence=9, epoch=1)
             assert not keeper.spare, "it may hold a part of a snapshot"
             keeper.terms = replace(keeper.terms, owner=Owner(1000))
-            keeper.lend(unnamed)
+            await keeper.lend(unnamed)
             assert not keeper.spare, "that keeper has the rights of a user, who could write to what is stored"
             captures.close()
 
     live(tmp_path, story)
+
+
+def test_a_program_with_a_small_base_has_no_file_made_for_each_capture(tmp_path: Path) -> None:
+    threads: list[int] = []
+
+    def unnamed() -> int:
+        threads.append(threading.get_ident())
+        return os.open(tmp_path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+
+    async def story(places: Places) -> None:
+        async with started(places, COUNT) as component:
+            keeper, captures = component.keeper, Captures(component)
+            await keeper.lend(unnamed)
+            assert keeper.spare, "no base is known yet"
+            await captures.take()
+            close_all(keeper.take_spare())
+            await keeper.lend(unnamed)
+            assert not keeper.spare
+            captures.close()
+
+    live(tmp_path, story)
+    assert len(threads) == 1
+    assert threads[0] != threading.get_ident(), "a slow disk would hold all components up"
 
 
 BIG_TICKS: Final = (
@@ -580,7 +603,7 @@ def test_a_program_whose_last_capture_before_a_handover_fails_runs_on(tmp_path: 
                 await until(lambda: log.stat().st_size > before, "a line that it writes")
 
             await runs_on()
-            component.keeper.lend(lambda: os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+            await component.keeper.lend(lambda: os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
             with pytest.raises(StoreError, match="cannot write a snapshot"):
                 await component.capture(base=True, generation=1, sequence=9, epoch=1, hold=True)
             await runs_on()
@@ -600,7 +623,7 @@ def test_a_keeper_that_is_let_go_as_its_answer_comes_leaves_the_snapshot(tmp_pat
             await component.protect()
             link = component.keeper._link
             assert link is not None
-            component.keeper.lend(lambda: os.open(tmp_path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600))
+            await component.keeper.lend(lambda: os.open(tmp_path, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600))
             link.dialogue.heard = lambda _: asyncio.get_running_loop().call_soon(component.keeper.drop) is None
             captured = await component.capture(base=True, generation=1, sequence=9, epoch=1)
             assert isinstance(captured, Captured)
