@@ -305,7 +305,7 @@ def _digest_each(
         if places is not None:
             here = np.flatnonzero((places >= first) & (places < last))
             digests[len(addresses) + here] = digest_pages(piece, copied[here], page_size, places[here] - first)
-    assert last == len(addresses), "each page has its bytes"
+    assert last == len(addresses), "each page has its bytes: a decoded outline's runs are as long as its frames"
     return digests
 
 

@@ -274,7 +274,7 @@ session.MOVED_S = -1.0
 from failover.__main__ import main
 sys.exit(main())
 """
-"""The command, whose keeper gives up after one try, as after a try that takes two seconds on a busy machine."""
+"""The command, whose keeper makes a freeze again only once, as where those after the first fail for two seconds."""
 FORKS = {
     "a shell": ["sh", "-c", "n=0; while :; do n=$((n + 1)); /bin/true; echo $n; done"],
     "forks": [
