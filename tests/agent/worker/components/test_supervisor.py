@@ -23,6 +23,7 @@ from agent.worker.components.run_records import Records
 from agent.worker.components.supervisor import Supervisor
 from agent.worker.components.warm_program import Standby
 from agent.worker.control.verbs import Verbs
+from checkpoint.errors import StoreError
 from checkpoint.model import Position
 from failover.core import acts
 
@@ -61,13 +62,21 @@ class Told:
         self.runs = True
 
 
+class FullStore:
+    """Stands for a store whose disk has no room for a file more."""
+
+    def unnamed(self) -> int:
+        raise StoreError("cannot make a file: No space left on device")
+
+
 def carried_out(orders: Callable[[Supervisor, Told], Any], directory: Path) -> Told:
     """What the guard was told in the end."""
     guard = Told()
 
     async def run() -> None:
         none = cast(Any, None)
-        around = Surroundings(none, none, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
+        store = cast(Any, FullStore())
+        around = Surroundings(none, store, Records(directory), lambda _: None, none, none, lambda _: ComponentConfig())
         supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
         orders(supervisor, guard)
         supervisor.begin()
