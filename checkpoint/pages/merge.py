@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, TypeAlias
+from typing import Final
 
 from msgspec import Struct
 
 from checkpoint.pages import page_set
 from checkpoint.pages.page_set import Buffer, Flags, PageMap, Words
 from checkpoint.runtime.lazy_numpy import NDArray, np
-
-Places: TypeAlias = "NDArray[np.intp]"
 
 LONG_COPY: Final = 1 << 18
 """Bytes that are copied by numpy, which lets other threads run meanwhile: this is also done inside programs."""
@@ -46,8 +44,7 @@ def are_zero(copies: Sequence[Copy], sources: PageMap, page_size: int) -> Flags:
     for index, copy in enumerate(copies):
         if len(copy.pages):
             from_here = sources.words[:, 0] == np.uint64(index)
-            content = memoryview(copy.content)[: page_set.total_size(copy.pages)]  # not the room behind it, which may be large
-            zero[from_here] = page_set.zero_pages(content, page_size)[sources.words[from_here, 1]]
+            zero[from_here] = page_set.zero_pages(copy.content, page_size)[sources.words[from_here, 1]]
     return zero
 
 
@@ -60,37 +57,17 @@ def gathered_within(host: int, contents: Sequence[Buffer], sources: PageMap, pag
     """As `gathered`, in the memory of the copy ``host``, which is overwritten: half of the memory for a large program.
 
     Returns:
-        None where it has no room for all of them, and nothing was changed.
+        None where it cannot be, and nothing was changed: pages that are not there would have to come between those that are.
     """
-    count, target = len(sources.addresses), memoryview(contents[host]).cast("B")
-    if count * page_size > len(target):
+    count = len(sources.addresses)
+    if count * page_size > memoryview(contents[host]).nbytes:
         return None
-    is_own = sources.words[:, 0] == np.uint64(host)
-    places, own = np.flatnonzero(is_own), sources.words[is_own, 1].astype(np.intp)
-    if (own < places).any():  # others come between them: all move down, and from there the last ones up first
-        order = np.arange(len(own))
-        _move(target, own, order, page_size)
-        _move(target, order, places, page_size, is_up=True)
-    else:
-        _move(target, own, places, page_size)
-    for first, (index, page), size in _stretches(sources.words):
-        if index != host:
-            part = np.frombuffer(contents[index], dtype=np.uint8, count=size * page_size, offset=page * page_size)
-            np.frombuffer(target, dtype=np.uint8)[first * page_size :][: len(part)] = part
-    return target[: count * page_size].toreadonly()
-
-
-def _move(target: memoryview, sources: Places, places: Places, page_size: int, *, is_up: bool = False) -> None:
-    """Pages of a buffer from their places, which are in order, to other ones in the same order: all of them down, or all up."""
-    if not len(sources):
-        return
-    firsts = np.concatenate(([0], np.flatnonzero((np.diff(sources) != 1) | (np.diff(places) != 1)) + 1))
-    sizes = np.diff(np.append(firsts, len(sources))) * page_size
-    starts, begins = (sources[firsts] * page_size).tolist(), (places[firsts] * page_size).tolist()
-    stretches = list(zip(starts, begins, sizes.tolist(), strict=True))
-    for start, begin, size in reversed(stretches) if is_up else stretches:
-        if start != begin:
-            target[begin : begin + size] = target[start : start + size]  # which may overlap: numpy would copy it for that
+    from_here = sources.words[:, 0] == np.uint64(host)
+    if (sources.words[from_here, 1] < np.flatnonzero(from_here)).any():
+        return None
+    target = np.frombuffer(contents[host], dtype=np.uint8)  # as no page moves up, none is overwritten before it was moved
+    _copy_stretches(contents, sources.words, target, page_size)
+    return target[: count * page_size].data.toreadonly()
 
 
 def gathered_bytes(contents: Sequence[Buffer], sources: PageMap, page_size: int) -> NDArray[np.uint8]:
@@ -107,6 +84,8 @@ def _copy_stretches(contents: Sequence[Buffer], places: Words, buffer: NDArray[n
     target = buffer.data
     for first, (index, page), count in _stretches(places):
         begin, start, size = first * page_size, page * page_size, count * page_size
+        if begin == start and arrays[index].ctypes.data == buffer.ctypes.data:
+            continue
         if size < LONG_COPY:
             target[begin : begin + size] = carried[index][start : start + size]
         else:

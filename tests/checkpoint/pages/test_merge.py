@@ -43,7 +43,8 @@ def test_what_is_gathered_within_a_copy_is_what_is_gathered_elsewhere(seed: int)
     found = merge.gathered_within(0, contents, sources, PAGE)
     if found is None:
         assert bytes(contents[0]) == before
-        assert len(sources.addresses) > len(first) + ROOM
+        moves_up = any(words[0] == 0 and words[1] < at for at, words in enumerate(sources.words.tolist()))
+        assert moves_up or len(sources.addresses) > len(first) + ROOM
     else:
         assert bytes(found) == expected
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Collection
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -55,13 +54,7 @@ BUFFER_SIZE: Final = 8 << 20
 """Bytes that a freeze may copy without asking for memory first, where earlier ones copied as much."""
 BUFFER_SIZE_MIN: Final = 1 << 20
 ROOM_SIZE: Final = 64 << 10
-"""Bytes that a copy has room for behind its pages: of the vdso, and of what came since. A large one has as much again: room that
-is not used takes no memory."""
-STRICT_SHARE: Final = 8
-"""On a system that counts promised memory as used, a large copy has room for one part in so many of its pages."""
-OVERCOMMIT: Final = Path("/proc/sys/vm/overcommit_memory")
-STRICT: Final = b"2"
-"""Source: proc_sys_vm(5)."""
+"""Bytes that a copy has room for behind its pages: of the vdso, and of what came since."""
 WORTH_COUNT: Final = 16
 """Pages that are worth the first pass of a delta while the program runs."""
 LARGE_COUNT: Final = 256
@@ -82,17 +75,6 @@ standby whose disk is full for a week must not make every freeze longer."""
 
 SharedPlaces = frozenset[tuple[int, int, int, int]]
 """Parts of shared memory: device and inode number of the object, first and last offset of the part."""
-
-
-def _with_room(size: int) -> memoryview:
-    """Memory for so many bytes of pages, and for others that will come between them."""
-    room = ROOM_SIZE
-    if size > BUFFER_SIZE:
-        room = size // STRICT_SHARE if OVERCOMMIT.read_bytes().strip() == STRICT else size
-    try:
-        return np.empty(size + room, dtype=np.uint8).data
-    except MemoryError:  # there is less than that
-        return np.empty(size + ROOM_SIZE, dtype=np.uint8).data
 
 
 def _part_of(copy: Copy, wanted: Words) -> Copy:
@@ -360,7 +342,7 @@ class MemoryCapture:
 
     def _read_into(self, copied: RunningCopy, wanted: Words) -> None:
         """Read a set as far as it is there."""
-        buffer = _with_room(page_set.total_size(wanted))
+        buffer = np.empty(page_set.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
         found, filled = [], 0
         chunks = page_set.cut(wanted, READ_CHUNK)
         bounds = itertools.pairwise(itertools.accumulate(map(page_set.total_size, chunks), initial=0))
@@ -378,7 +360,7 @@ class MemoryCapture:
             found.append(readable)
             filled += size
         if found:
-            copied.add(Copy(pagemap.pages_joined(np.concatenate(found)), buffer))
+            copied.add(Copy(pagemap.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
 
     def rehearse(self) -> None:
         """See ``checkpoint.engines.ptrace.capture.process``."""

@@ -28,7 +28,6 @@ from checkpoint.linux.memory.pagemap import PageScanner
 from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.memory.write_protect import PagemapTracker
 from checkpoint.model import Snapshot
-from checkpoint.pages import page_set
 from tests.checkpoint.round_trip import (
     Program,
     captured_at_last,
@@ -312,7 +311,7 @@ def test_a_capture_that_waits_long_keeps_one_copy_of_a_page(tmp_path: Path, monk
         program.wait_for_line(str(told))
 
     def measured(self: MemoryCapture, copied: RunningCopy, **named: Any) -> Any:
-        sizes.append(sum(page_set.total_size(copy.pages) for copy in copied.copies))
+        sizes.append(sum(len(copy.content) for copy in copied.copies))
         return take(self, copied, **named)
 
     monkeypatch.setattr(MemoryCapture, "take", measured)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from checkpoint.engines.ptrace.capture import memory
 from checkpoint.engines.ptrace.capture.memory import SHED_SHARE, RunningCopy
 from checkpoint.linux.memory.tracker import Scan
 from checkpoint.pages import merge, page_set
@@ -42,12 +38,3 @@ def test_shedding_bounds_the_memory_and_changes_no_content(passes: list[tuple[Wo
         copied.shed()
         assert told(copied) == before
         assert sum(page_set.total_size(copy.pages) for copy in copied.copies) <= SHED_SHARE * page_set.total_size(copied.valid)
-
-
-@pytest.mark.parametrize(("told", "room"), [("0", 32 << 20), ("1", 32 << 20), ("2", 4 << 20)])
-def test_room_that_may_stay_unused_is_small_where_it_counts_as_used(
-    told: str, room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "overcommit_memory").write_text(f"{told}\n")
-    monkeypatch.setattr(memory, "OVERCOMMIT", tmp_path / "overcommit_memory")
-    assert len(memory._with_room(32 << 20)) == (32 << 20) + room
