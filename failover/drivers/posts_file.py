@@ -167,6 +167,9 @@ class PostsFile:
         except OSError as error:
             self._take_back()
             raise self._refused(error) from error
+        except BaseException:  # Ctrl-C: the caller hears that it was not taken
+            self._take_back()
+            raise
         self._waiting[message.seq], self._seq = record, message.seq
         self._size += _HEAD + len(record)
 
@@ -209,7 +212,7 @@ class PostsFile:
                 os.fsync(folder)
             finally:
                 os.close(folder)
-        except OSError:
+        except BaseException:
             os.close(descriptor)
             raise
         if self._descriptor >= 0:

@@ -116,8 +116,9 @@ class Sending:
                 until_ns = None if posted.deadline_ms is None else now_ns + round(posted.deadline_ms * MS)
                 try:
                     self._file.posted(posted, until_ns, now_ns)
-                except DriverError:
+                except BaseException:  # also Ctrl-C while it waits for the disk
                     self._outbox.withdrawn()
+                    self._file.over(posted.seq)
                     raise
                 self._outbox.committed()
             return posted

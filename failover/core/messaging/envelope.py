@@ -360,6 +360,8 @@ def check(fields: object) -> None:
                 for key in one:
                     if not isinstance(key, str):
                         raise EnvelopeError("the message has a field whose name is no text")
+                    if not key.isascii():
+                        _check_text(key)
                 inner.extend(one.values())
             elif isinstance(one, list):
                 inner.extend(one)
@@ -382,8 +384,10 @@ def _check_text(text: str) -> None:
 
 
 def _check_head(envelope: Envelope) -> None:
-    size = len(envelope.to) + len(envelope.verb) + len(envelope.id) + len(envelope.sender) + len(envelope.by) + len(envelope.re)
-    if size > TEXT_MAX:  # seldom: then each by itself
+    names = envelope.to + envelope.verb + envelope.id + envelope.sender + envelope.by + envelope.re
+    if not names.isascii():
+        _check_text(names)
+    if len(names) > TEXT_MAX:  # seldom: then each by itself
         for text in (envelope.to, envelope.verb, envelope.id, envelope.sender, envelope.by, envelope.re):
             if len(text) > TEXT_MAX:
                 raise EnvelopeError(f"the message has the name {text[:40]!r}… of {len(text)} characters; {TEXT_MAX} are the most")

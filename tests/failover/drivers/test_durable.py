@@ -212,3 +212,19 @@ def test_a_message_that_cannot_be_kept_is_not_taken_and_the_next_one_is(here: He
         assert engine.instance.heard == [0.1, 0.3]
     with serving(Engine, here), mission(here) as proxy:
         assert proxy.left_over == ()
+
+
+def test_a_message_that_ctrl_c_keeps_from_the_disk_is_not_taken(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: int) -> None:
+        raise KeyboardInterrupt
+
+    with serving(Engine, here) as engine, mission(here) as proxy:
+        proxy.call("set", duty=0.1)
+        with monkeypatch.context() as patched:
+            patched.setattr("os.fdatasync", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                proxy.post("set", duty=0.2)
+        proxy.call("set", duty=0.3)
+        assert engine.instance.heard == [0.1, 0.3]
+    with serving(Engine, here), mission(here) as proxy:
+        assert proxy.left_over == ()

@@ -180,6 +180,16 @@ def test_an_answer_that_no_message_can_carry_is_refused_once_and_the_next_goes_o
             next(proxy.stream("film"))
 
 
+def test_a_verb_or_a_field_that_is_not_utf_8_is_not_taken_and_the_next_goes_on(here: Here) -> None:
+    with serving(Engine, here) as engine, called(here, "engine") as proxy:
+        for ask in (proxy.call, proxy.post, proxy.call):
+            for verb, body in (("\ud800", None), ("set", {"\ud800": 1})):
+                with pytest.raises(EnvelopeError, match="half of a character"):
+                    ask(verb, body)
+            proxy.call("set", duty=0.1, timeout=LIMIT_S)
+        assert engine.instance.heard == [0.1] * 3
+
+
 @pytest.mark.parametrize("is_posting", [False, True])
 def test_a_body_that_no_message_can_carry_is_not_taken(here: Here, is_posting: bool) -> None:
     with serving(Engine, here), called(here, "engine") as proxy:
