@@ -2,7 +2,11 @@
 
 A record is written for each message that is posted, before `failover.proxy`'s ``post`` returns, and for each that is over. The
 file is written anew when it is opened, and when most of it is over. Each record: the size of its content (four bytes,
-little-endian); the XXH3 of that, eight bytes; the content in msgpack, a `Begun` first.
+little-endian); how many bytes of the file are safe on the disk once it is written (eight); the XXH3 of these twelve bytes and the
+content, eight; the content in msgpack, a `Begun` first.
+
+A power cut leaves what was not safe in any form: cut, zeros, some of its blocks. What cannot be read there is left out, and what
+follows it: no `post` has returned for a message in it. Where it was safe, the file is damaged.
 
 Source: rename(2), fdatasync(2); doc/xxhash_spec.md of xxHash.
 """
@@ -12,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +41,11 @@ TIDY_SIZE: Final = 256 << 10
 NAME_MAX: Final = 200
 """Bytes of a file's name, with room for an ending. Source: a file system's 255."""
 
-_HEAD: Final = 12
+_NUMBERS: Final = struct.Struct("<IQ")
+_HEAD: Final = _NUMBERS.size + 8
+_BEGINS: Final = b"\xa4type"
+"""How the content of each record begins, after the byte of its map. Source: the msgpack specification."""
+
 _LOCK_AT: Final = 0
 NS: Final = 1_000_000_000
 
@@ -81,6 +90,8 @@ class PostsFile:
         self._waiting: dict[int, bytes] = {}
         self._descriptor = -1
         self._size = 0
+        self._safe = 0
+        """Bytes that outlive a power cut."""
         self._is_behind = False
         """Whether the file lacks that a message is over."""
         try:
@@ -138,16 +149,16 @@ class PostsFile:
         return Outgoing(begun.boot, seq, list(found.values())) if begun is not None else Outgoing(boot)
 
     def _records(self, content: bytes) -> Iterator[bytes]:
-        at = 0
-        while at + _HEAD <= len(content):
-            end = at + _HEAD + int.from_bytes(content[at : at + 4], "little")
-            record = content[at + _HEAD : end]
-            if end > len(content) or xxhash.xxh3_64_digest(record) != content[at + 4 : at + _HEAD]:
-                if end < len(content):
+        at = safe = 0
+        while at < len(content):
+            found = _record_at(content, at)
+            if found is None:
+                if at < max(safe, *_safe_behind(content, at), 0):
                     raise DriverError(f"{self.path} is damaged at byte {at}; {_CURE}")
                 return
+            record, safe = found[0], max(safe, found[1])
             yield record
-            at = end
+            at += _HEAD + len(record)
 
     # --- Write --------------------------------------------------------------------------------------------------------------
 
@@ -171,7 +182,7 @@ class PostsFile:
             self._take_back()
             raise
         self._waiting[message.seq], self._seq = record, message.seq
-        self._size += _HEAD + len(record)
+        self._safe = self._size = self._size + _HEAD + len(record)
 
     def over(self, seq: int) -> None:
         """A message needs to be sent no more. If this cannot be written now, it is before the next message."""
@@ -193,13 +204,15 @@ class PostsFile:
             os.ftruncate(self._descriptor, self._size)
 
     def _append(self, record: bytes) -> None:
-        whole = _framed(record)
+        whole = _framed(record, self._safe)
         if os.pwrite(self._descriptor, whole, self._size) < len(whole):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _write_anew(self) -> None:
         """With what waits, and nothing else."""
-        content = b"".join(map(_framed, (_written(Begun(self.kept.boot, self._seq)), *self._waiting.values())))
+        records = [_written(Begun(self.kept.boot, self._seq)), *self._waiting.values()]
+        size = sum(_HEAD + len(one) for one in records)
+        content = b"".join(_framed(one, size) for one in records)
         new = self.path.with_suffix(".new")
         descriptor = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
         try:
@@ -217,7 +230,7 @@ class PostsFile:
             raise
         if self._descriptor >= 0:
             os.close(self._descriptor)
-        self._descriptor, self._size, self._is_behind = descriptor, len(content), False
+        self._descriptor, self._size, self._safe, self._is_behind = descriptor, size, size, False
 
     def close(self) -> None:
         """Let another process have it."""
@@ -238,5 +251,23 @@ def place_of(sender: str, path: str) -> Path:
     return Path(os.environ.get(FOLDER) or Path.cwd()) / f"{name}.posts"
 
 
-def _framed(record: bytes) -> bytes:
-    return len(record).to_bytes(4, "little") + xxhash.xxh3_64_digest(record) + record
+def _framed(record: bytes, safe: int) -> bytes:
+    numbers = _NUMBERS.pack(len(record), safe)
+    return numbers + xxhash.xxh3_64_digest(numbers + record) + record
+
+
+def _record_at(content: bytes, at: int) -> tuple[bytes, int] | None:
+    """The record there, and how many bytes of the file are safe, as it says; None: there is no whole one."""
+    if at < 0 or at + _HEAD > len(content):
+        return None
+    size, safe = _NUMBERS.unpack_from(content, at)
+    record = content[at + _HEAD : at + _HEAD + size]
+    numbers, digest = content[at : at + _NUMBERS.size], content[at + _NUMBERS.size : at + _HEAD]
+    return (record, safe) if len(record) == size and xxhash.xxh3_64_digest(numbers + record) == digest else None
+
+
+def _safe_behind(content: bytes, at: int) -> Iterator[int]:
+    """How much was safe by what each record says that is whole behind a place where none is."""
+    while (at := content.find(_BEGINS, at + 1)) >= 0:
+        if (found := _record_at(content, at - 1 - _HEAD)) is not None:
+            yield found[1]

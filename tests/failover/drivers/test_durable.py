@@ -124,7 +124,7 @@ def test_a_file_cut_within_any_record_holds_what_was_kept_until_then(file: Posts
         sizes[file.path.stat().st_size] = ([*now], held[-1])
     whole = file.path.read_bytes()
     file.close()
-    cuts = {size + more for size in sizes for more in (0, 1, 11, 12, 13, 60) if size + more <= len(whole)} | {
+    cuts = {size + more for size in sizes for more in (0, 1, 19, 20, 21, 60) if size + more <= len(whole)} | {
         size - 1 for size in sizes if size > min(sizes)
     }
     for cut in sorted(cuts):
@@ -135,16 +135,45 @@ def test_a_file_cut_within_any_record_holds_what_was_kept_until_then(file: Posts
         again.close()
 
 
-def test_a_file_that_is_damaged_is_refused_and_stays_as_it_is(file: PostsFile) -> None:
+def test_a_power_cut_may_leave_anything_where_the_disk_was_not_waited_for(file: PostsFile) -> None:
     outbox = Outbox("robot1/mission", 7)
-    begun = file.path.stat().st_size
-    for _ in range(3):
+    for _ in range(4):
         post(outbox, file)
+    safe = file.path.stat().st_size
+    for seq in (1, 2):
+        file.over(seq)
+    whole = file.path.read_bytes()
+    file.close()
+    over = (len(whole) - safe) // 2
+    for torn in (bytes(2 * over), b"\xff" * over, random.Random(1).randbytes(3 * over), bytes(over) + whole[safe + over :]):
+        file.path.write_bytes(whole[:safe] + torn)
+        again = opened()
+        assert (waiting(again), again.kept.seq) == ([1, 2, 3, 4], 4)
+        again.close()
+
+
+@pytest.mark.parametrize(
+    ("place", "is_anew", "is_behind"), [(0, False, False), (1, False, False), (2, False, True), (2, True, False), (0, True, True)]
+)
+def test_a_file_that_is_damaged_is_refused_and_stays_as_it_is(
+    file: PostsFile, place: int, is_anew: bool, is_behind: bool
+) -> None:
+    """Also its last message, once the file says behind it, or was written anew, with it: it was safe."""
+    outbox = Outbox("robot1/mission", 7)
+    begins = []
+    for _ in range(3):
+        begins.append(file.path.stat().st_size)
+        post(outbox, file)
+    if is_anew:
+        file.close()
+        file = opened()
+    if is_behind:
+        file.over(1)
     whole = bytearray(file.path.read_bytes())
     file.close()
-    whole[begun + 40] ^= 1
+    whole[begins[place] + 40] ^= 1
     file.path.write_bytes(whole)
-    with pytest.raises(DriverError, match=f"is damaged at byte {begun}; move it away"):
+    with pytest.raises(DriverError, match=f"is damaged at byte {begins[place]}; move it away"):
         opened()
     assert file.path.read_bytes() == whole
 
