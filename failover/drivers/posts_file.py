@@ -26,11 +26,11 @@ import msgspec
 import xxhash
 from msgspec import Struct
 
+from checkpoint.errors import UNDECODABLE
 from failover.boards import locks
-from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Envelope, Hop
 from failover.core.messaging.mailbox import Outgoing, Waiting
-from failover.errors import DriverError, EnvelopeError
+from failover.errors import DriverError
 
 FOLDER: Final = "FAILOVER_STATE"
 """The variable that names the folder, as for a kept state without an agent; else it is the working directory."""
@@ -60,7 +60,7 @@ class Begun(Struct, frozen=True, tag="begun"):
 class Posted(Struct, frozen=True, tag="posted"):
     """A message. ``until_s``: its deadline in seconds since 1970: no other clock outlives a machine's boot; None: it has none."""
 
-    message: bytes
+    message: Envelope
     until_s: float | None
 
 
@@ -138,13 +138,12 @@ class PostsFile:
                     found.pop(one.seq, None)
                     self._waiting.pop(one.seq, None)
                 else:
-                    message = envelopes.decode(one.message)
-                    hops = (Hop(message.sender, now_ns),)  # the clock of the stamps there may have begun anew
-                    message = msgspec.structs.replace(message, hops=hops)
+                    hops = (Hop(one.message.sender, now_ns),)  # the clock of the stamps there may have begun anew
+                    message = msgspec.structs.replace(one.message, hops=hops)
                     until_ns = None if one.until_s is None else now_ns + round((one.until_s - time.time()) * NS)
                     found[message.seq], self._waiting[message.seq] = Waiting(message, until_ns), record
                     seq = max(seq, message.seq)
-        except (msgspec.DecodeError, EnvelopeError) as error:
+        except UNDECODABLE as error:
             raise DriverError(f"{self.path} is damaged: {error}; {_CURE}") from error
         return Outgoing(begun.boot, seq, list(found.values())) if begun is not None else Outgoing(boot)
 
@@ -169,7 +168,11 @@ class PostsFile:
             DriverError: it cannot be kept.
         """
         until_s = None if until_ns is None else time.time() + (until_ns - now_ns) / NS
-        record = _written(Posted(envelopes.encode(message, "msgpack"), until_s))
+        try:
+            record = _written(Posted(message, until_s))
+            _read(record)
+        except (TypeError, *UNDECODABLE) as error:
+            raise DriverError(f"cannot keep the message {message.id} in {self.path}: {error}") from error
         try:
             if self._is_behind:
                 self._write_anew()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -176,6 +177,36 @@ def test_a_file_that_is_damaged_is_refused_and_stays_as_it_is(
     with pytest.raises(DriverError, match=f"is damaged at byte {begins[place]}; move it away"):
         opened()
     assert file.path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("body", [{"v": [0.5] * 60_000, "t": "x" * 780_000}, {"v": [0.5] * 65_530}])
+def test_the_largest_messages_are_kept_as_any(here: Here, monkeypatch: pytest.MonkeyPatch, body: dict[str, Any]) -> None:
+    monkeypatch.setattr("failover.drivers.proxy.TIMEOUT_S", 0.01)
+    with serving(Engine, here):
+        place = lookup(here, "engine")
+    with Proxy(here, place, sender="mission", durable=True) as proxy:
+        for one in ({"duty": 0.1}, body, {"duty": 0.2}):
+            proxy.post("set", one)
+    with Proxy(here, place, sender="mission", durable=True) as proxy:
+        assert len(proxy.left_over) == 3
+
+
+def test_a_message_that_the_file_could_not_give_back_is_not_written(file: PostsFile) -> None:
+    for body in ({"v": object()}, {"v": "\ud800"}, _deep(2_000)):
+        with pytest.raises(DriverError, match="cannot keep the message robot1-7-1 in"):
+            file.posted(Envelope(to=ENGINE, id="robot1-7-1", seq=1, body=body), None, 0)
+    file.posted(Envelope(to=ENGINE, seq=1), None, 0)
+    file.close()
+    again = opened()
+    assert waiting(again) == [1]
+    again.close()
+
+
+def _deep(levels: int) -> list[Any]:
+    found: list[Any] = []
+    for _ in range(levels):
+        found = [found]
+    return found
 
 
 def test_a_deadline_goes_on_by_the_calendar_also_where_the_other_clock_began_anew(file: PostsFile) -> None:
