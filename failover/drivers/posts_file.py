@@ -140,8 +140,7 @@ class PostsFile:
                 else:
                     hops = (Hop(one.message.sender, now_ns),)  # the clock of the stamps there may have begun anew
                     message = msgspec.structs.replace(one.message, hops=hops)
-                    until_ns = None if one.until_s is None else now_ns + round((one.until_s - time.time()) * NS)
-                    found[message.seq], self._waiting[message.seq] = Waiting(message, until_ns), record
+                    found[message.seq], self._waiting[message.seq] = Waiting(message, _until_ns(one, now_ns)), record
                     seq = max(seq, message.seq)
         except UNDECODABLE as error:
             raise DriverError(f"{self.path} is damaged: {error}; {_CURE}") from error
@@ -252,6 +251,16 @@ def place_of(sender: str, path: str) -> Path:
     if len(name.encode()) > NAME_MAX:
         name = f"{name.encode()[: NAME_MAX - 20].decode(errors='ignore')}-{xxhash.xxh3_64_hexdigest(name.encode())}"
     return Path(os.environ.get(FOLDER) or Path.cwd()) / f"{name}.posts"
+
+
+def _until_ns(one: Posted, now_ns: int) -> int | None:
+    """A kept message's deadline. Its time does not grow when the calendar is set back."""
+    if one.until_s is None:
+        return None
+    left_s = one.until_s - time.time()
+    if one.message.deadline_ms is not None:
+        left_s = min(left_s, one.message.deadline_ms / 1_000)
+    return now_ns + round(left_s * NS)
 
 
 def _framed(record: bytes, safe: int) -> bytes:

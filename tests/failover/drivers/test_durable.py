@@ -7,6 +7,7 @@ import random
 import resource
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -216,6 +217,16 @@ def test_a_deadline_goes_on_by_the_calendar_also_where_the_other_clock_began_ane
     again = PostsFile("robot1/mission", ENGINE, 7, 5)
     first, second = (one.until_ns for one in again.kept.waiting)
     assert first is not None and second is not None and 5 < first <= 5 + 60 * NS and second <= 5 - 60 * NS
+    again.close()
+
+
+def test_a_deadline_does_not_grow_when_the_calendar_is_set_back(file: PostsFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    file.posted(Envelope(to=ENGINE, seq=1, reliable=True, deadline_ms=10_000), 10 * NS, 0)
+    file.close()
+    yesterday = time.time() - 86_400
+    monkeypatch.setattr("time.time", lambda: yesterday)
+    again = opened()
+    assert again.kept.waiting[0].until_ns == 10 * NS
     again.close()
 
 
