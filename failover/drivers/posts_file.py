@@ -80,7 +80,7 @@ class PostsFile:
     def __init__(self, sender: str, path: str, boot: int, now_ns: int) -> None:
         """
         Args:
-            boot: of a sender that has no file.
+            boot: of a sender that has no file, or one in which nothing waits.
             now_ns: by the clock of the outbox's deadlines.
 
         Raises:
@@ -144,7 +144,11 @@ class PostsFile:
                     seq = max(seq, message.seq)
         except UNDECODABLE as error:
             raise DriverError(f"{self.path} is damaged: {error}; {_CURE}") from error
-        return Outgoing(begun.boot, seq, list(found.values())) if begun is not None else Outgoing(boot)
+        if begun is None:
+            return Outgoing(boot)
+        if not found:  # a new life: the driver may have heard a later one than this file tells
+            return Outgoing(max(boot, begun.boot + 1))
+        return Outgoing(begun.boot, seq, list(found.values()))
 
     def _records(self, content: bytes) -> Iterator[bytes]:
         at = safe = 0

@@ -40,6 +40,9 @@ IDLE_NS: Final = 3_600 * SECOND_NS
 
 EXPIRED: Final = "expired"
 
+OUTLIVED: Final = "outlived"
+"""Kind of the error of a driver that has heard a later life of the sender."""
+
 log = logging.getLogger("failover.drivers")
 
 
@@ -176,8 +179,19 @@ class Sending:
         with self._lock:
             is_final = self._outbox.answered(answer, self._heard_ns)
             if is_final and self._file is not None:
-                self._file.over(answer.seq)
+                answer = self._over_or_kept(self._file, answer, kind)
         return [answer] if is_final or kind == "busy" else []
+
+    def _over_or_kept(self, file: PostsFile, answer: Envelope, kind: str) -> Envelope:
+        """The final answer. A message that was refused for its sender's life alone stays in the file, and the answer says so."""
+        if kind != OUTLIVED or answer.error is UNSET:
+            file.over(answer.seq)
+            return answer
+        sentence = (
+            f"{answer.error.sentence}; the message stays in {file.path}, without which its sender has run since: "
+            "move it away, and what it holds is not sent"
+        )
+        return msgspec.structs.replace(answer, error=msgspec.structs.replace(answer.error, sentence=sentence))
 
     def _moved(self) -> None:
         """The driver is elsewhere: all that has no answer is sent there, in order."""

@@ -20,7 +20,7 @@ from failover.drivers.here import Here
 from failover.drivers.lookup import lookup
 from failover.drivers.posts_file import FOLDER, NS, PostsFile
 from failover.drivers.proxy import Proxy
-from failover.errors import DriverError
+from failover.errors import CallRefusedError, DriverError
 from tests.failover.drivers.devices import ENGINE, Engine
 from tests.failover.drivers.serving import LIMIT_S, serving
 
@@ -81,6 +81,40 @@ def test_a_block_ends_without_an_error_although_the_driver_is_away_for_what_was_
         assert proxy.left_over[0].result(LIMIT_S) is None and engine.instance.heard == [0.5]
 
 
+def test_a_sender_that_was_not_durable_or_in_another_folder_meanwhile_is_heard_again(
+    here: Here, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = kept / "other"
+    other.mkdir()
+    with serving(Engine, here) as engine:
+        for number, (folder, durable) in enumerate([(kept, True), (kept, False), (kept, True), (other, True), (kept, True)]):
+            monkeypatch.setenv(FOLDER, str(folder))
+            with Proxy(here, lookup(here, "engine"), sender="mission", durable=durable) as proxy:
+                proxy.call("set", duty=number / 10)
+        assert engine.instance.heard == [0.0, 0.1, 0.2, 0.3, 0.4]
+
+
+def test_what_a_later_life_of_its_sender_keeps_from_the_driver_stays_in_the_file(
+    here: Here, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("failover.drivers.proxy.TIMEOUT_S", 0.01)
+    with serving(Engine, here):
+        place = lookup(here, "engine")
+    with Proxy(here, place, sender="mission", durable=True) as proxy:
+        proxy.post("set", duty=0.1)
+    with serving(Engine, here) as engine:
+        with Proxy(here, lookup(here, "engine"), sender="mission") as proxy:
+            proxy.call("set", duty=0.2, timeout=LIMIT_S)
+        for _ in range(2):
+            with mission(here) as proxy, pytest.raises(CallRefusedError, match="since: move it away") as caught:
+                proxy.left_over[0].result(LIMIT_S)
+            assert caught.value.kind == "outlived"
+        next(kept.glob("*.posts")).unlink()
+        with mission(here) as proxy:
+            proxy.call("set", duty=0.3, timeout=LIMIT_S)
+        assert engine.instance.heard == [0.2, 0.3]
+
+
 def test_two_processes_of_a_durable_sender_are_refused_and_so_is_one_without_a_name(here: Here) -> None:
     with serving(Engine, here):
         with mission(here) as proxy:
@@ -132,8 +166,9 @@ def test_a_file_cut_within_any_record_holds_what_was_kept_until_then(file: Posts
     for cut in sorted(cuts):
         file.path.write_bytes(whole[:cut])
         again = opened()
-        expected = sizes[max(size for size in sizes if size <= cut)]
-        assert (waiting(again), again.kept.seq, again.kept.boot) == (*expected, 7), f"cut at {cut}"
+        left, last = sizes[max(size for size in sizes if size <= cut)]
+        expected = (left, last, 7) if left else ([], 0, 8)
+        assert (waiting(again), again.kept.seq, again.kept.boot) == expected, f"cut at {cut}"
         again.close()
 
 
@@ -230,9 +265,7 @@ def test_a_deadline_does_not_grow_when_the_calendar_is_set_back(file: PostsFile,
     again.close()
 
 
-def test_a_file_is_written_anew_when_most_of_it_is_over_and_numbers_go_on(
-    file: PostsFile, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_written_anew_when_most_of_it_is_over(file: PostsFile, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("failover.drivers.posts_file.TIDY_SIZE", 4_096)
     outbox, sizes = Outbox("robot1/mission", 7), []
     while not sizes or file.path.stat().st_size > sizes[-1]:
@@ -245,7 +278,7 @@ def test_a_file_is_written_anew_when_most_of_it_is_over_and_numbers_go_on(
     assert 3_000 < sizes[-1] <= 4_096 and file.path.stat().st_size < 100
     file.close()
     again = opened()
-    assert (waiting(again), again.kept.seq) == ([], seq)
+    assert (waiting(again), again.kept.boot) == ([], 8), "a new life"
     again.close()
 
 
