@@ -18,9 +18,10 @@ import errno
 import os
 import struct
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import xxhash
@@ -28,9 +29,10 @@ from msgspec import Struct
 
 from checkpoint.errors import UNDECODABLE
 from failover.boards import locks
-from failover.core.messaging.envelope import Envelope, Hop
+from failover.core.messaging import envelope as envelopes
+from failover.core.messaging.envelope import INTEGER_MAX, Envelope, Hop
 from failover.core.messaging.mailbox import Outgoing, Waiting
-from failover.errors import DriverError
+from failover.errors import DriverError, EnvelopeError
 
 FOLDER: Final = "FAILOVER_STATE"
 """The variable that names the folder, as for a kept state without an agent; else it is the working directory."""
@@ -50,11 +52,16 @@ _LOCK_AT: Final = 0
 NS: Final = 1_000_000_000
 
 
-class Begun(Struct, frozen=True, tag="begun"):
-    """The sender's life, and how many messages it had posted when the file was written."""
+Number = Annotated[int, msgspec.Meta(ge=0, lt=INTEGER_MAX)]
 
-    boot: int
-    seq: int
+
+class Begun(Struct, frozen=True, tag="begun"):
+    """The sender's life, and how many messages it had posted when the file was written. ``path``: of the driver."""
+
+    sender: str
+    path: str
+    boot: Number
+    seq: Number
 
 
 class Posted(Struct, frozen=True, tag="posted"):
@@ -67,7 +74,7 @@ class Posted(Struct, frozen=True, tag="posted"):
 class Over(Struct, frozen=True, tag="over"):
     """The message of this number has its answer, or has expired."""
 
-    seq: int
+    seq: Number
 
 
 _read: Final = msgspec.msgpack.Decoder(Begun | Posted | Over).decode
@@ -86,14 +93,21 @@ class PostsFile:
         Raises:
             DriverError: it cannot be read or written, is damaged, or another process has it.
         """
-        self.path = place_of(sender, path)
+        self._descriptor = self._lock = -1
+        self._whose = sender, path
         self._waiting: dict[int, bytes] = {}
-        self._descriptor = -1
         self._size = 0
         self._safe = 0
         """Bytes that outlive a power cut."""
         self._is_behind = False
         """Whether the file lacks that a message is over."""
+        try:
+            self.path = place_of(sender, path)
+        except OSError as error:
+            raise DriverError(
+                f"cannot keep what is posted in the working directory: {error.strerror}; {FOLDER} names another folder"
+            ) from error
+        _OPEN.add(self)
         try:
             self._lock = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
@@ -133,6 +147,11 @@ class PostsFile:
                 if isinstance(one, Begun) is not (number == 0):
                     raise DriverError(f"{self.path} is damaged: its record {number} is in the wrong place; {_CURE}")
                 if isinstance(one, Begun):
+                    if (one.sender, one.path) != self._whose:
+                        raise DriverError(
+                            f"{self.path} holds what {one.sender} has posted to {one.path}: use another sender, "
+                            f"or another folder, which {FOLDER} names"
+                        )
                     begun, seq = one, one.seq
                 elif isinstance(one, Over):
                     found.pop(one.seq, None)
@@ -140,9 +159,10 @@ class PostsFile:
                 else:
                     hops = (Hop(one.message.sender, now_ns),)  # the clock of the stamps there may have begun anew
                     message = msgspec.structs.replace(one.message, hops=hops)
+                    envelopes.check_head(message)
                     found[message.seq], self._waiting[message.seq] = Waiting(message, _until_ns(one, now_ns)), record
                     seq = max(seq, message.seq)
-        except UNDECODABLE as error:
+        except (EnvelopeError, *UNDECODABLE) as error:
             raise DriverError(f"{self.path} is damaged: {error}; {_CURE}") from error
         if begun is None:
             return Outgoing(boot)
@@ -170,6 +190,10 @@ class PostsFile:
         Raises:
             DriverError: it cannot be kept.
         """
+        if self._lock < 0:
+            raise DriverError(
+                f"cannot keep what is posted in {self.path}: it is closed, or is the file of the parent process; make a new proxy"
+            )
         until_s = None if until_ns is None else time.time() + (until_ns - now_ns) / NS
         try:
             record = _written(Posted(message, until_s))
@@ -192,7 +216,7 @@ class PostsFile:
 
     def over(self, seq: int) -> None:
         """A message needs to be sent no more. If this cannot be written now, it is before the next message."""
-        if self._waiting.pop(seq, None) is None:
+        if self._waiting.pop(seq, None) is None or self._lock < 0:
             return
         record = _written(Over(seq))
         try:
@@ -216,7 +240,7 @@ class PostsFile:
 
     def _write_anew(self) -> None:
         """With what waits, and nothing else."""
-        records = [_written(Begun(self.kept.boot, self._seq)), *self._waiting.values()]
+        records = [_written(Begun(*self._whose, self.kept.boot, self._seq)), *self._waiting.values()]
         size = sum(_HEAD + len(one) for one in records)
         content = b"".join(_framed(one, size) for one in records)
         new = self.path.with_suffix(".new")
@@ -245,6 +269,20 @@ class PostsFile:
                 os.close(descriptor)
         self._descriptor = self._lock = -1
 
+    __del__ = close
+    """A proxy that was not closed, and that is garbage, holds the file no longer."""
+
+
+_OPEN: Final = weakref.WeakSet[PostsFile]()
+
+
+def _left_to_the_parent() -> None:
+    """In a process that was forked: a lock would stay as long as either process has it open."""
+    for file in list(_OPEN):
+        file.close()
+
+
+os.register_at_fork(after_in_child=_left_to_the_parent)
 
 _CURE: Final = "move it away, and what it holds is not sent"
 
@@ -264,6 +302,8 @@ def _until_ns(one: Posted, now_ns: int) -> int | None:
     left_s = one.until_s - time.time()
     if one.message.deadline_ms is not None:
         left_s = min(left_s, one.message.deadline_ms / 1_000)
+    if not abs(left_s) < INTEGER_MAX:
+        raise ValueError(f"it holds the deadline {one.until_s}")
     return now_ns + round(left_s * NS)
 
 

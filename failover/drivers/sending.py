@@ -84,7 +84,7 @@ class Sending:
 
         try:
             return PostsFile(sender, self.path, new_boot(), self.now_ns())
-        except DriverError:
+        except BaseException:
             self.route.close()
             raise
 

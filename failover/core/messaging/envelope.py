@@ -160,7 +160,7 @@ def _own(content: bytes) -> Envelope | None:
         check([envelope.body])
     if envelope.ok is not UNSET and not _is_flat(envelope.ok):
         check([envelope.ok])
-    _check_head(envelope)
+    check_head(envelope)
     return envelope
 
 
@@ -176,7 +176,7 @@ def _any(content: bytes) -> Envelope:
         envelope = msgspec.convert(fields, Envelope)
     except msgspec.ValidationError as error:
         raise EnvelopeError(f"the message has a field of another kind than documented: {error}") from error
-    _check_head(envelope)
+    check_head(envelope)
     if not unknown:
         return envelope
     return msgspec.structs.replace(envelope, rest={key: value for key, value in fields.items() if key in unknown})
@@ -383,7 +383,8 @@ def _check_text(text: str) -> None:
         raise EnvelopeError("the message holds half of a character (a lone surrogate)") from error
 
 
-def _check_head(envelope: Envelope) -> None:
+def check_head(envelope: Envelope) -> None:
+    """Raises EnvelopeError: a name, number or hop of it is none that a message may have."""
     names = envelope.to + envelope.verb + envelope.id + envelope.sender + envelope.by + envelope.re
     if not names.isascii():
         _check_text(names)
@@ -432,7 +433,7 @@ def check_size(envelope: Envelope, room: int, encoding: Encoding = "json") -> No
     Raises:
         EnvelopeError: it is too large, or a name in it is.
     """
-    _check_head(envelope)
+    check_head(envelope)
     if _is_small(envelope):
         return
     if (size := max(len(encode(envelope, one)) for one in {"json", encoding}) + room) > MESSAGE_SIZE_MAX:

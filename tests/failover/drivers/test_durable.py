@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import os
 import random
 import resource
 import subprocess
@@ -18,7 +20,7 @@ from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.mailbox import Outbox
 from failover.drivers.here import Here
 from failover.drivers.lookup import lookup
-from failover.drivers.posts_file import FOLDER, NS, PostsFile
+from failover.drivers.posts_file import FOLDER, NS, PostsFile, place_of
 from failover.drivers.proxy import Proxy
 from failover.errors import CallRefusedError, DriverError
 from tests.failover.drivers.devices import ENGINE, Engine
@@ -106,7 +108,10 @@ def test_what_a_later_life_of_its_sender_keeps_from_the_driver_stays_in_the_file
         with Proxy(here, lookup(here, "engine"), sender="mission") as proxy:
             proxy.call("set", duty=0.2, timeout=LIMIT_S)
         for _ in range(2):
-            with mission(here) as proxy, pytest.raises(CallRefusedError, match="since: move it away") as caught:
+            with (
+                mission(here) as proxy,
+                pytest.raises(CallRefusedError, match="since: move it away") as caught,
+            ):
                 proxy.left_over[0].result(LIMIT_S)
             assert caught.value.kind == "outlived"
         next(kept.glob("*.posts")).unlink()
@@ -123,6 +128,66 @@ def test_two_processes_of_a_durable_sender_are_refused_and_so_is_one_without_a_n
             proxy.call("set", duty=0.1)
         with pytest.raises(DriverError, match="give it a sender"):
             Proxy(here, lookup(here, "engine"), durable=True)
+
+
+def test_a_proxy_that_is_garbage_or_a_process_that_was_forked_holds_no_file(here: Here) -> None:
+    with serving(Engine, here) as engine:
+        proxy = mission(here)
+        proxy.call("set", duty=0.1)
+        del proxy
+        gc.collect()
+        proxy = mission(here)
+        ends, wakes = os.pipe()
+        child = os.fork()
+        if not child:
+            os.close(wakes)
+            os.read(ends, 1)
+            os._exit(0)
+        try:
+            proxy.close()
+            with mission(here) as proxy:
+                proxy.call("set", duty=0.2)
+        finally:
+            os.close(wakes)
+            os.close(ends)
+            assert os.waitpid(child, 0)[1] == 0
+        assert engine.instance.heard == [0.1, 0.2]
+
+
+def test_a_process_that_was_forked_does_not_write_what_its_parent_keeps(file: PostsFile) -> None:
+    outbox = Outbox("robot1/mission", 7)
+    post(outbox, file)
+    before = file.path.read_bytes()
+    child = os.fork()
+    if not child:
+        file.over(1)
+        try:
+            post(outbox, file)
+        except DriverError:
+            os._exit(0)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0 and file.path.read_bytes() == before
+    post(outbox, file)
+
+
+def test_without_a_working_directory_a_durable_sender_is_refused(
+    here: Here, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(FOLDER)
+    gone = folder / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with serving(Engine, here), pytest.raises(DriverError, match="working directory: No such file or directory; FAILOVER_STATE"):
+        mission(here)
+
+
+def test_a_file_of_another_driver_whose_name_is_written_alike_is_refused(file: PostsFile) -> None:
+    file.close()
+    alike = ENGINE.replace("/", ".")
+    assert place_of("robot1/mission", alike) == file.path
+    with pytest.raises(DriverError, match=f"holds what robot1/mission has posted to {ENGINE}: use another sender"):
+        PostsFile("robot1/mission", alike, 7, 0)
 
 
 @pytest.fixture

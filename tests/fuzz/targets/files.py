@@ -218,6 +218,46 @@ def kept_state() -> Decoder:
     return Decoder([bytes(encoded.data)], call)
 
 
+def _posts(framed: Callable[[bytes], bytes], seeds: Callable[[list[bytes]], list[bytes]]) -> Decoder:
+    """The file of a durable sender, opened with these bytes in it; the seeds are made of its records."""
+    import msgspec
+
+    from failover.core.messaging.envelope import Envelope
+    from failover.drivers.posts_file import FOLDER, Begun, Over, Posted, PostsFile, place_of
+
+    folder, whose = scratch(), ("robot1/mission", "Lab/Engine")
+    message = Envelope("Lab/Engine", "set", {"duty": 0.5}, sender=whose[0], boot=7, seq=1, reliable=True, deadline_ms=9.5)
+    made = [msgspec.msgpack.encode(one) for one in (Begun(*whose, 7, 0), Posted(message, 1e9), Over(1))]
+
+    def call(content: bytes) -> object:
+        os.environ[FOLDER] = str(folder)
+        place_of(*whose).write_bytes(framed(content))
+        file = PostsFile(*whose, 7, 0)
+        try:
+            return file.kept
+        finally:
+            file.close()
+
+    return Decoder(seeds(made), call)
+
+
+@target("who writes to the folder of a program that posts: its messages that wait")
+def posts_file() -> Decoder:
+    from failover.drivers.posts_file import _framed
+
+    return _posts(lambda content: content, lambda made: [b"".join(_framed(one, safe) for one in made) for safe in (0, 100)])
+
+
+@target("who writes to the folder of a program that posts: one record, with a right digest", "msgpack")
+def posts_record() -> Decoder:
+    import msgspec
+
+    from failover.drivers.posts_file import Begun, _framed
+
+    begun = _framed(msgspec.msgpack.encode(Begun("robot1/mission", "Lab/Engine", 7, 0)), 0)
+    return _posts(lambda content: begun + _framed(content, 0), lambda made: made[1:])
+
+
 # --- Configuration ----------------------------------------------------------------------------------------------------
 
 
