@@ -11,6 +11,8 @@ import subprocess
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from checkpoint.linux.procfs.descendants import ancestors
+
 ASK_S: Final = 2.5
 """How long systemd may take to answer; without an answer nothing is said."""
 
@@ -30,7 +32,10 @@ def own_service(cgroups: str) -> str:
 
 
 def restarted_service(pid: int) -> Service | None:
-    """The service of a process, if systemd starts it again by itself, in whatever cases; None where that is not known, too."""
+    """The service that ends with a process or one below it, if systemd starts it again, in whatever cases.
+
+    None where that is not known, too; and where its main process is none of these: a job of cron, the shell of an editor.
+    """
     try:
         cgroups = Path(f"/proc/{pid}/cgroup").read_text(encoding="utf-8", errors="surrogateescape")
     except OSError:
@@ -39,13 +44,16 @@ def restarted_service(pid: int) -> Service | None:
     systemctl = shutil.which("systemctl")
     if not unit or systemctl is None or user not in ("", str(os.geteuid())):
         return None
-    asked = [systemctl, *(["--user"] if user else []), "show", "--property=Restart", "--value", "--", unit]
+    asked = [systemctl, *(["--user"] if user else []), "show", "--property=Restart,MainPID", "--", unit]
     try:
         found = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=ASK_S, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    restart = found.stdout.strip()
-    return None if found.returncode or restart in NEVER else Service(unit, restart)
+    said = dict(line.split("=", 1) for line in found.stdout.splitlines() if "=" in line)
+    restart, main = said.get("Restart", ""), said.get("MainPID", "")
+    if found.returncode or restart in NEVER or not main.isdecimal():
+        return None
+    return Service(unit, restart) if pid in (int(main), *ancestors(int(main))) else None
 
 
 def _service_and_user(cgroups: str) -> tuple[str, str]:

@@ -118,6 +118,22 @@ def test_a_service_that_systemd_would_start_again_is_told_of(machine: Machine) -
         machine.run("systemctl", "stop", f"{unit}.service")
 
 
+def test_a_job_of_a_service_that_systemd_would_start_again_is_not_told_of(machine: Machine) -> None:
+    jobs = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import time; time.sleep(1000)'])"
+    machine.run("systemd-run", "--unit=jobs", "--property=Restart=always", "python3", "-c", jobs)
+
+    def pids() -> list[str]:
+        cgroup = machine.property("jobs.service", "ControlGroup")
+        return machine.run("cat", f"/sys/fs/cgroup{cgroup}/cgroup.procs", check=False).stdout.split() if cgroup else []
+
+    robots.until(lambda: len(pids()) == 2, "the job to run")
+    main = machine.property("jobs.service", "MainPID")
+    for pid in pids():
+        checked = machine.run("failover", "check", pid, check=False)
+        assert ("belongs to jobs.service, which says Restart=always" in checked.stderr) is (pid == main)
+    machine.run("systemctl", "stop", "jobs.service")
+
+
 def test_a_component_lives_outside_the_service(machine: Machine) -> None:
     pid = started(machine, "outside")
     cgroup = Path(f"/proc/{machine.outer(pid)}/cgroup").read_text()
