@@ -18,9 +18,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import psutil
 
@@ -57,11 +57,11 @@ def simulated(count: int, span_s: float, directory: Path) -> Findings:
         stack.enter_context(_watching(url))
         began, used, memory = time.monotonic(), _processor_s(page), 0.0
         while simulation.poll() is None:
-            memory = max(memory, sum(pss_mb(one.pid) for one in _family(page)))
+            memory = max(memory, _memory_mb(page))
             time.sleep(LOOK_S)
         share = (_processor_s(page) - used) / (time.monotonic() - began) * 100
         assert simulation.stdout is not None
-        said = json.loads(simulation.stdout.read())
+        said = _told(simulation.stdout.read(), simulation.returncode)
     case = f"{count} robots in {LABS} labs, {span_s:.0f} s"
     figures = [
         Figure("activations of controllers", case, "", (float(said["activations"]),)),
@@ -74,6 +74,14 @@ def simulated(count: int, span_s: float, directory: Path) -> Findings:
     ]
     story = "Each controller is due every 50 ms and is to end 50 ms later. A browser shows the sensors of one robot, live."
     return Findings("Simulated robots with the page open", story, tuple(figures))
+
+
+def _told(said: str, status: int) -> dict[str, Any]:
+    """What the simulation has counted."""
+    try:
+        return dict(json.loads(said))
+    except ValueError as error:
+        raise BenchmarkError(f"the simulation failed with status {status}, and said {said[-500:]!r}") from error
 
 
 @contextmanager
@@ -122,11 +130,33 @@ def _watching(url: str) -> Iterator[None]:
 
 
 def _family(process: psutil.Process) -> list[psutil.Process]:
-    return [process, *process.children(recursive=True)]
+    """The page and its processes.
+
+    Raises:
+        BenchmarkError: it has ended.
+    """
+    try:
+        if process.status() != psutil.STATUS_ZOMBIE:
+            return [process, *process.children(recursive=True)]
+    except psutil.NoSuchProcess:
+        pass
+    raise BenchmarkError(f"the page (pid {process.pid}) has ended: without it there is nothing to measure")
+
+
+def _memory_mb(process: psutil.Process) -> float:
+    found = 0.0
+    for one in _family(process):
+        with suppress(OSError, StopIteration):  # it has ended meanwhile
+            found += pss_mb(one.pid)
+    return found
 
 
 def _processor_s(process: psutil.Process) -> float:
-    return sum(sum(one.cpu_times()[:2]) for one in _family(process))
+    found = 0.0
+    for one in _family(process):
+        with suppress(psutil.NoSuchProcess):
+            found += sum(one.cpu_times()[:2])
+    return found
 
 
 def main() -> int:
@@ -137,8 +167,12 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1.0, help="default 1")
     parser.add_argument("--robots", type=int, default=80, help="default 80")
     wanted = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="failover-benchmark-") as directory:
-        found = simulated(wanted.robots, wanted.minutes * 60, Path(directory))
+    try:
+        with tempfile.TemporaryDirectory(prefix="failover-benchmark-") as directory:
+            found = simulated(wanted.robots, wanted.minutes * 60, Path(directory))
+    except BenchmarkError as error:
+        print(f"simulated: {error}", file=sys.stderr)
+        return 2
     print(found.story, table(found.figures), sep="\n\n")
     return 1 if any(figure.benchmark == MISSED and figure.median for figure in found.figures) else 0
 
