@@ -112,6 +112,26 @@ def test_run_explains_itself_when_it_is_asked(words: list[str]) -> None:
     assert all(f"./run {verb}" in ran.stdout for verb in ("demo", "test", "setup", "table", "fuzz", "audit"))
 
 
+def test_run_tries_once_for_each_list_to_install_the_tools_of_the_audit_for_the_tests(tmp_path: Path) -> None:
+    (tmp_path / "venv").mkdir()
+    python = tmp_path / "python"
+    python.write_text(f"#!/bin/sh\necho tried >>{tmp_path}/tries\nexit 1\n")
+    python.chmod(0o755)
+    functions, _, _ = RUN.read_text().partition("\n# --- The commands")
+    places = f"venv={tmp_path}/venv python={python} log={tmp_path}/log"
+
+    def tries(do: str) -> int:
+        ran = subprocess.run(
+            ["sh", "-c", f"{functions}\n{places}\n{do}"], cwd=RUN.parent, capture_output=True, text=True, check=False
+        )
+        assert ran.returncode == 0, ran.stderr
+        return (tmp_path / "tries").read_text().count("tried")
+
+    assert [tries(do) for do in ("make_audit_once why", "make_audit_once why", "make_audit why")] == [1, 1, 2]
+    (tmp_path / "venv/audit").mkdir()
+    assert tries("cksum requirements-audit.txt >$venv/audit/made; make_audit why") == 3, "its Python is missing"
+
+
 @pytest.mark.parametrize(
     ("words", "mistake"),
     [([], "no command is given"), (["deom"], "there is no command deom"), (["setup", "--quick"], "setup takes no options")],
