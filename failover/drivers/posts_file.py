@@ -2,7 +2,7 @@
 
 A record is written for each message that is posted, before `failover.proxy`'s ``post`` returns, and for each that is over. The
 file is written anew when it is opened, and when most of it is over. Each record: the size of its content (four bytes,
-little-endian); how many bytes of the file are safe on the disk once it is written (eight); the XXH3 of these twelve bytes and the
+little-endian); how many bytes of the file were safe on the disk by then (eight); the XXH3 of these twelve bytes and the
 content, eight; the content in msgpack, a `Begun` first.
 
 A power cut leaves what was not safe in any form: cut, zeros, some of its blocks. What cannot be read there is left out, and what
@@ -256,6 +256,7 @@ class PostsFile:
             finally:
                 os.close(folder)
         except BaseException:
+            self._is_behind = True  # the file may be the new one already, which this process has not open
             os.close(descriptor)
             raise
         if self._descriptor >= 0:

@@ -397,3 +397,24 @@ def test_a_message_that_ctrl_c_keeps_from_the_disk_is_not_taken(here: Here, monk
         assert engine.instance.heard == [0.1, 0.3]
     with serving(Engine, here), mission(here) as proxy:
         assert proxy.left_over == ()
+
+
+def test_a_file_that_was_written_anew_and_interrupted_then_is_written_anew_again(
+    file: PostsFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outbox, rename = Outbox("robot1/mission", 7), os.rename
+
+    def interrupted(old: Path, new: Path) -> None:
+        rename(old, new)
+        raise KeyboardInterrupt
+
+    post(outbox, file)
+    with monkeypatch.context() as patched:
+        patched.setattr("os.rename", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            file._write_anew()
+    post(outbox, file)
+    file.close()
+    again = opened()
+    assert waiting(again) == [1, 2]
+    again.close()
