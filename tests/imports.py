@@ -91,10 +91,14 @@ def circles(edges: Graph) -> list[list[str]]:
             if len(group) > 1:
                 found.append(sorted(group))
 
+    before = sys.getrecursionlimit()
     sys.setrecursionlimit(10_000)
-    for name in edges:
-        if name not in order:
-            visit(name)
+    try:
+        for name in edges:
+            if name not in order:
+                visit(name)
+    finally:
+        sys.setrecursionlimit(before)
     return found
 
 

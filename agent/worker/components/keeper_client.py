@@ -158,6 +158,8 @@ class Following:
         """Note how much it remembers after a capture, and whether the next base may be large."""
         if captured.parent is None or captured.dirty_bytes >= messages.LARGE_SIZE:
             self._is_large = captured.dirty_bytes >= messages.LARGE_SIZE
+        if not self._is_large:
+            close_all(self.take_spare())
         self._wanted, self._remembered = captured.wanted_bytes, captured.remembered_bytes
 
     def _remembers_nothing(self) -> None:
