@@ -51,14 +51,14 @@ def worker_of(robot: RobotMachine) -> int:
 
 
 def arriving(robot: RobotMachine) -> list[int]:
-    """Sizes of the unnamed files in the robot's store: what is coming in."""
+    """Sizes of the unnamed files in the robot's store: what is coming in. An empty one is the spare file of a keeper."""
     found = []
     for descriptor in Path(f"/proc/{worker_of(robot)}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):
             path = os.readlink(descriptor)
             if path.startswith(str(robot.directory / "state" / "store")) and path.endswith(" (deleted)"):
                 found.append(descriptor.stat().st_size)
-    return found
+    return [size for size in found if size]
 
 
 def left_over(robot: RobotMachine) -> list[str]:
