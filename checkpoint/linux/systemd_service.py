@@ -11,8 +11,6 @@ import subprocess
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from checkpoint.linux.procfs.descendants import ancestors
-
 ASK_S: Final = 2.5
 """How long systemd may take to answer; without an answer nothing is said."""
 
@@ -53,6 +51,8 @@ def restarted_service(pid: int) -> Service | None:
     restart, main = said.get("Restart", ""), said.get("MainPID", "")
     if found.returncode or restart in NEVER or not main.isdecimal():
         return None
+    from checkpoint.linux.procfs.descendants import ancestors  # here: a witness, which asks only for its own, needs no registers
+
     return Service(unit, restart) if pid in (int(main), *ancestors(int(main))) else None
 
 
