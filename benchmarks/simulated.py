@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -29,9 +28,9 @@ from benchmarks.figures import Figure, Findings, table
 from benchmarks.main_loop import TeamStage
 from benchmarks.running import BenchmarkError
 from failover.drivers.here import DIRECTORY, ROBOT
+from tests.e2e import pages
 
 LABS: Final = 4
-BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome")
 BROWSER_PATIENCE_MS: Final = 120_000
 LOOK_S: Final = 5.0
 SHOWN: Final = ("Simulated", "University", "Lab1", "Robotino1", "US")
@@ -44,17 +43,21 @@ def simulated(count: int, span_s: float, directory: Path) -> Findings:
     """Measure so many robots for so long."""
     drivers, board = directory / "drivers", directory / "board"
     drivers.mkdir(mode=0o700)
-    environment = {**os.environ, DIRECTORY: str(drivers), ROBOT: "robot1"}
+    environment = {DIRECTORY: str(drivers), ROBOT: "robot1"}
     with ExitStack() as stack:
         stage = stack.enter_context(TeamStage(directory / "robots", 2, ""))
         stage.start()
-        page, url = stack.enter_context(_page(stage.robots[0].socket, directory, environment))
+        served = stack.enter_context(pages.served(stage.robots[0], directory / "page", **environment))
+        page = psutil.Process(served.process.pid)
         words = ("--robots", str(count), "--labs", str(LABS), "--for", f"{span_s:.0f}s", "--json", "--board", str(board))
         simulation = subprocess.Popen(
-            [sys.executable, "-m", "failover", "simulate", *words], env=environment, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-m", "failover", "simulate", *words],
+            env={**os.environ, **environment},
+            stdout=subprocess.PIPE,
+            text=True,
         )
         stack.callback(simulation.kill)
-        stack.enter_context(_watching(url))
+        stack.enter_context(_watching(served.url))
         began, used, memory = time.monotonic(), _processor_s(page), 0.0
         while simulation.poll() is None:
             memory = max(memory, _memory_mb(page))
@@ -85,36 +88,13 @@ def _told(said: str, status: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _page(socket: Path, directory: Path, environment: dict[str, str]) -> Iterator[tuple[psutil.Process, str]]:
-    """The page of a robot, at a free port of the loopback."""
-    config, log = directory / "page.toml", directory / "page.log"
-    config.touch()
-    options = ("--config", str(config), "--listen", "127.0.0.1:0", "--socket", str(socket), "--json")
-    with log.open("w") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "failover", "page", *options], env=environment, stdout=subprocess.PIPE, stderr=said, text=True
-        )
-    try:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        if not line:
-            raise BenchmarkError(f"the page did not start: {log.read_text()[-500:]}")
-        yield psutil.Process(process.pid), json.loads(line)["url"]
-    finally:
-        process.terminate()
-        process.wait()
-
-
-@contextmanager
 def _watching(url: str) -> Iterator[None]:
     """A browser that shows the sensors of one simulated robot, live."""
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), "")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        path = ""
+    path = pages.browser()
     if not path:
-        raise BenchmarkError("no browser can be driven here: install chromium, and playwright of requirements-test.txt")
+        raise BenchmarkError("no browser can be driven here: install chromium, and what requirements-browser.txt lists")
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], timeout=0)
         window = browser.new_page()
