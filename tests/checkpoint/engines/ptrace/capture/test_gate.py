@@ -76,13 +76,28 @@ def test_a_process_that_is_born_during_the_wait_is_entered_before_the_freeze(
     assert not entered, "to enter one while it stands still takes milliseconds"
 
 
+def moving(monkeypatch: pytest.MonkeyPatch, now: list[float], moves: list[MovedError]) -> list[bool]:
+    """Have the first freezes fail, by a clock of our own: for each freeze from now on, whether the capture counts as long."""
+    look, is_long = PtraceSession._frozen_look, list[bool]()
+
+    def failing(self: PtraceSession, *given: Any, **named: Any) -> Frozen:
+        is_long.append(self._budget.is_long)
+        if moves:
+            raise moves.pop()
+        return look(self, *given, **named)
+
+    monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=time.sleep))
+    monkeypatch.setattr(PtraceSession, "_frozen_look", failing)
+    return is_long
+
+
 def test_a_capture_whose_copy_took_long_is_made_again_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else gigabytes would be copied anew for a process that came in the middle of the first freeze.
 
     Only one freeze may take as long as it must: the second one begins with little to copy.
     """
-    now, moves, copies, is_long = [0.0], [MovedError("one has come")], list[object](), list[bool]()
-    look, copy = PtraceSession._frozen_look, CapturedProcess.copy_running
+    now, moves, copies = [0.0], [MovedError("one has come")], list[object]()
+    copy = CapturedProcess.copy_running
 
     def slow(self: CapturedProcess, *, copied: RunningCopy | None = None, **named: Any) -> RunningCopy:
         copies.append(copied)
@@ -90,14 +105,7 @@ def test_a_capture_whose_copy_took_long_is_made_again_all_the_same(tmp_path: Pat
             now[0] += MOVED_S + LONG_CAPTURE_NS / 1e9
         return copy(self, copied=copied, **named)
 
-    def moving(self: PtraceSession, *given: Any, **named: Any) -> Frozen:
-        is_long.append(self._budget.is_long)
-        if moves:
-            raise moves.pop()
-        return look(self, *given, **named)
-
-    monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=time.sleep))
-    monkeypatch.setattr(PtraceSession, "_frozen_look", moving)
+    is_long = moving(monkeypatch, now, moves)
     monkeypatch.setattr(CapturedProcess, "copy_running", slow)
     with ended(start([sys.executable, "-S", "-c", PARENT, tmp_path], tmp_path)) as program, protected(program) as session:
         program.wait_for_line("ready")
@@ -117,19 +125,11 @@ def test_the_wait_counts_neither_as_a_capture_that_is_made_again_too_often_nor_a
     """Processes come and go in the middle of two freezes, and before each there is a long wait."""
     now = [0.0]
     moves = [MovedError("one has come"), MovedError("one has gone")]
-    look, is_long = PtraceSession._frozen_look, list[bool]()
 
     def wait() -> None:
         now[0] += MOVED_S + LONG_CAPTURE_NS / 1e9
 
-    def moving(self: PtraceSession, *given: Any, **named: Any) -> Frozen:
-        is_long.append(self._budget.is_long)
-        if moves:
-            raise moves.pop()
-        return look(self, *given, **named)
-
-    monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=time.sleep))
-    monkeypatch.setattr(PtraceSession, "_frozen_look", moving)
+    is_long = moving(monkeypatch, now, moves)
     with ended(start([sys.executable, "-S", "-c", PARENT, tmp_path], tmp_path)) as program, protected(program) as session:
         program.wait_for_line("ready")
         assert isinstance(session, PtraceSession)
