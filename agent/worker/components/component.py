@@ -317,10 +317,12 @@ class Component:
         if self._awaits_commit:
             what = "it has committed nothing yet" if self.task_pid else "it has not said yet that it keeps a state"
             raise NothingCommittedError(f"cannot capture {self.name}: {what}")
-        share, is_lent = self.keeper.share(), bool(self.keeper.spare)
-        order = keeper_messages.Capture(base, generation, sequence, epoch, hold, share, lag_ns, if_changed=True, spare=is_lent)
+        share = self.keeper.share()
         async with self._standing_still(is_held_by_guard):
             with self._let_go_if_it_fails(hold and not is_held_by_guard), self._patience(), self.keeper.lending() as spare:
+                order = keeper_messages.Capture(
+                    base, generation, sequence, epoch, hold, share, lag_ns, if_changed=True, spare=bool(spare)
+                )
                 captured, descriptors = await self.keeper.ask(order, spare)
         if isinstance(captured, keeper_messages.Unchanged):
             return captured
