@@ -264,23 +264,29 @@ class PostsFile:
         self._descriptor, self._size, self._safe, self._is_behind = descriptor, size, size, False
 
     def close(self) -> None:
-        """Let another process have it."""
+        """Let another process have it, or another proxy of this one."""
+        if self._lock >= 0:
+            locks.give(self._lock, _LOCK_AT)  # a child that has just been forked has the same opening open
+        self.leave()
+
+    __del__ = close
+    """A proxy that was not closed, and that is garbage, holds the file no longer."""
+
+    def leave(self) -> None:
+        """Close the descriptors. The lock stays with a process that has the same opening: the one that forked this one."""
         for descriptor in (self._descriptor, self._lock):
             if descriptor >= 0:
                 os.close(descriptor)
         self._descriptor = self._lock = -1
-
-    __del__ = close
-    """A proxy that was not closed, and that is garbage, holds the file no longer."""
 
 
 _OPEN: Final = weakref.WeakSet[PostsFile]()
 
 
 def _left_to_the_parent() -> None:
-    """In a process that was forked: a lock would stay as long as either process has it open."""
+    """In a process that was forked: the files are its parent's."""
     for file in list(_OPEN):
-        file.close()
+        file.leave()
 
 
 os.register_at_fork(after_in_child=_left_to_the_parent)

@@ -10,6 +10,7 @@ import resource
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import pytest
 
 from failover.core.messaging.envelope import Envelope
 from failover.core.messaging.mailbox import Outbox
+from failover.drivers import posts_file
 from failover.drivers.here import Here
 from failover.drivers.lookup import lookup
 from failover.drivers.posts_file import FOLDER, NS, PostsFile, place_of
@@ -130,7 +132,19 @@ def test_two_processes_of_a_durable_sender_are_refused_and_so_is_one_without_a_n
             Proxy(here, lookup(here, "engine"), durable=True)
 
 
-def test_a_proxy_that_is_garbage_or_a_process_that_was_forked_holds_no_file(here: Here) -> None:
+class Forgetful(weakref.WeakSet[PostsFile]):
+    """Of it a process that was forked gives up no file."""
+
+    def add(self, item: PostsFile) -> None:
+        """Leave it out."""
+
+
+@pytest.mark.parametrize("runs_before_its_parent", [True, False])
+def test_a_proxy_that_is_garbage_or_a_process_that_was_forked_holds_no_file(
+    here: Here, monkeypatch: pytest.MonkeyPatch, runs_before_its_parent: bool
+) -> None:
+    if not runs_before_its_parent:
+        monkeypatch.setattr(posts_file, "_OPEN", Forgetful())
     with serving(Engine, here) as engine:
         proxy = mission(here)
         proxy.call("set", duty=0.1)
