@@ -28,7 +28,7 @@ from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
-from failover.core.node import URGENT_GAP_NS
+from failover.core.beat_pace import URGENT_GAP_NS
 from failover.errors import BoardError, OvertakenError
 
 UNREADABLE: Final = "own items that could not be read"

@@ -460,6 +460,12 @@ class Membership:
         """The peers that are alive."""
         return tuple([peer for peer in self.peers.values() if peer.boot > 0 and now_ns < peer.loyal_until_ns])
 
+    def is_first(self, robot: str, now_ns: int) -> bool:
+        """Whether of all members that live, this one among them, that peer has the first name."""
+        if robot >= self._config.robot or robot not in self.peers:
+            return False
+        return not any(peer.robot < robot for peer in self.living(now_ns))
+
     def lease_ns(self, robot: str) -> int:
         """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease; or its promise."""
         peer = self.peers.get(robot)

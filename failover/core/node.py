@@ -12,6 +12,7 @@ from checkpoint.model import Position
 from failover.core import acts, commands
 from failover.core.acts import Ready
 from failover.core.beat_builder import Speaker, entry_of
+from failover.core.beat_pace import BeatPace
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import lease, majority, pair, votes
 from failover.core.events import (
@@ -74,9 +75,6 @@ from failover.core.wire.messages import RETURNED, Beat, Entry
 
 NS_PER_S = 1_000 * MS
 
-URGENT_GAP_NS = 2 * MS
-"""Between a beat and the next one that carries a change: a flurry of changes makes no flood of beats."""
-
 LATE_NS = 5 * MS
 """A step this much after the instant asked for is our own lateness, taken back from the peers' silence. Less than the margin."""
 
@@ -112,8 +110,8 @@ class Node:
         self._config = config
         self._boot = boot
         self._now_ns = now_ns
-        self._asked_ns = self._next_beat_ns = now_ns
-        self._last_beat_ns = now_ns - URGENT_GAP_NS
+        self._asked_ns = now_ns
+        self._pace = BeatPace(now_ns)
         self._durable = vote_record
         self._drained = vote_record.drained
         self._team = Membership(config, boot, now_ns, vote_record.awaited)
@@ -154,12 +152,14 @@ class Node:
             _say_who_belongs(turn, before)
         if isinstance(event, Tick):
             self._note_promise(turn)
+        elif isinstance(event, Received) and not event.came_ns and self._team.is_first(event.beat.sender, now_ns):
+            self._pace.follow(now_ns, self._config.beat_ns)
         for component in touched:
             lease.forget_former(component, turn)
             _review(component, turn)
         changed = begins or bool(touched) or self._is_undurable(now_ns)
         persist = self._persist() if changed else None
-        send = self._speak(turn) if changed or now_ns >= self._next_beat_ns else ()
+        send = self._speak(turn) if changed or now_ns >= self._pace.next_ns else ()
         self._asked_ns = self._deadline_ns()
         return Ready(persist, send, tuple(turn.acts), tuple(turn.said))
 
@@ -349,7 +349,7 @@ class Node:
             self._team.promise_unasked(robot, turn.now_ns)
         needs_time = grace_ms and (self._dependents or self.exposed(turn.now_ns))
         self._leaving_ns = turn.now_ns + (LEAVE_NS if needs_time else 0)
-        turn.leaving, self._next_beat_ns = True, turn.now_ns
+        turn.leaving, self._pace.next_ns = True, turn.now_ns
         how = f"it asks its peers to wait {grace_ms / 1_000:g} s for the next one" if grace_ms else "no robot is asked to wait"
         turn.say_of_robot(f"the agent of {turn.me} is about to restart: {how}")
 
@@ -413,8 +413,8 @@ class Node:
         entries = self._entries()
         pressing = self._speaker.pressing(entries)
         if pressing:
-            self._next_beat_ns = min(self._next_beat_ns, self._last_beat_ns + URGENT_GAP_NS)
-        if turn.now_ns < self._next_beat_ns:
+            self._pace.press()
+        if turn.now_ns < self._pace.next_ns:
             return ()
         if self._waiting is not None:
             self._speaker.unsaid(self._waiting)
@@ -424,8 +424,7 @@ class Node:
         beat = self._speaker.beat(entries, self._team.echoes(turn.now_ns), grace_ms, promises, drained=self._drained)
         self._load = beat.load
         self._team.asked(beat.counter, turn.now_ns)
-        self._last_beat_ns = turn.now_ns
-        self._next_beat_ns = turn.now_ns + self._config.beat_ns
+        self._pace.left(turn.now_ns, self._config.beat_ns)
         return (beat,)
 
     def _returned(self, turn: Turn) -> int:
@@ -451,7 +450,7 @@ class Node:
         return (self._team.awaited(now_ns), self._drained) != (self._durable.awaited, self._durable.drained)
 
     def _deadline_ns(self) -> int:
-        instants = [self._next_beat_ns]
+        instants = [self._pace.next_ns]
         death_ns = self._team.next_death_ns(self._now_ns)
         if death_ns is not None:
             instants.append(death_ns)

@@ -33,7 +33,7 @@ from failover.core.frames.frame import Portion
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.roster import roster
 from failover.core.frames.terms import Said
-from failover.core.node import URGENT_GAP_NS
+from failover.core.beat_pace import URGENT_GAP_NS
 from failover.core.wire.messages import Beat, Echo
 from failover.errors import NeverWrittenError
 

@@ -1,0 +1,56 @@
+"""When the next heartbeat of a robot is due.
+
+All members beat right after the first one, by name, of those that live: what they say at one instant, each of them hears in one
+turn. A turn after a sleep is dear, because by then the processor's caches hold other programs.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from msgspec import Struct
+
+from failover.core.types import MS
+
+URGENT_GAP_NS: Final = 2 * MS
+"""Between a beat and the next one that carries a change: a flurry of changes makes no flood of beats."""
+
+EARLY_PART: Final = 10
+"""By this part of a period a beat leaves early at most, so that it follows the first member's…"""
+
+LATE_PART: Final = 25
+"""…and by this part of it late, where it followed the one before; by two of them where it left just before that."""
+
+
+class BeatPace(Struct):
+    """Of one life of a robot.
+
+    Attributes:
+        next_ns: when the next beat is due.
+        last_ns: when the newest one left.
+    """
+
+    next_ns: int
+    last_ns: int = 0
+    _patience_ns: int = 0
+
+    def left(self, now_ns: int, period_ns: int) -> None:
+        """A beat leaves now."""
+        self.last_ns, self.next_ns = now_ns, now_ns + period_ns + self._patience_ns
+        self._patience_ns = 0
+
+    def press(self) -> None:
+        """A beat is due at once, as it carries a change."""
+        self.next_ns = min(self.next_ns, self.last_ns + URGENT_GAP_NS)
+
+    def follow(self, now_ns: int, period_ns: int) -> None:
+        """The first member has just beaten: so does this one, or it comes nearer to that instant by the next period."""
+        patience_ns, least_ns = period_ns // LATE_PART, self.last_ns + period_ns - period_ns // EARLY_PART
+        if self.next_ns < least_ns:
+            return  # a change waits
+        if now_ns - self.last_ns <= patience_ns:
+            self.next_ns = now_ns + period_ns + patience_ns
+        elif now_ns >= least_ns:
+            self.next_ns, self._patience_ns = now_ns, patience_ns
+        else:
+            self.next_ns = least_ns
