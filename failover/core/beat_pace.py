@@ -1,7 +1,7 @@
 """When the next heartbeat of a robot is due.
 
-All members beat right after the first one, by name, of those that live: what they say at one instant, each of them hears in one
-turn. A turn after a sleep is dear, because by then the processor's caches hold other programs.
+All members beat right after the one of the living that has the least name: what all say at one instant, each hears in one turn. A
+turn after a sleep is dear, because by then the processor's caches hold other programs.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from failover.core.types import MS
 
 URGENT_GAP_NS: Final = 2 * MS
 """Between a beat and the next one that carries a change: a flurry of changes makes no flood of beats."""
+
+FREE_BEATS: Final = 50
+"""First beats of a life follow no other member's: robots that start at one instant claim at one instant what they are to run."""
 
 EARLY_PART: Final = 10
 """By this part of a period a beat leaves early at most, so that it follows the first member's…"""
@@ -32,25 +35,28 @@ class BeatPace(Struct):
 
     next_ns: int
     last_ns: int = 0
+    _count: int = 0
     _patience_ns: int = 0
 
     def left(self, now_ns: int, period_ns: int) -> None:
         """A beat leaves now."""
         self.last_ns, self.next_ns = now_ns, now_ns + period_ns + self._patience_ns
-        self._patience_ns = 0
+        self._count, self._patience_ns = self._count + 1, 0
 
     def press(self) -> None:
         """A beat is due at once, as it carries a change."""
         self.next_ns = min(self.next_ns, self.last_ns + URGENT_GAP_NS)
 
-    def follow(self, now_ns: int, period_ns: int) -> None:
-        """The first member has just beaten: so does this one, or it comes nearer to that instant by the next period."""
+    def follow(self, now_ns: int, period_ns: int) -> bool:
+        """The first member has just beaten. Whether this one does now; else it comes nearer to that instant by the next beat."""
         patience_ns, least_ns = period_ns // LATE_PART, self.last_ns + period_ns - period_ns // EARLY_PART
-        if self.next_ns < least_ns:
-            return  # a change waits
+        if self._count < FREE_BEATS or self.next_ns < least_ns:  # the latter: a change waits
+            return False
         if now_ns - self.last_ns <= patience_ns:
             self.next_ns = now_ns + period_ns + patience_ns
-        elif now_ns >= least_ns:
-            self.next_ns, self._patience_ns = now_ns, patience_ns
-        else:
+        elif now_ns < least_ns:
             self.next_ns = least_ns
+        else:
+            self.next_ns, self._patience_ns = now_ns, patience_ns
+            return True
+        return False

@@ -16,6 +16,7 @@ from msgspec import Struct, field
 from failover.core.event_log.decisions import Sighting
 from failover.core.types import COMPONENTS_MAX, MS, Awaited, Config, PeerView, State
 from failover.core.wire.messages import RETURNED, RULES, Beat, Echo, Entry, Promise
+from failover.core.wire.names import weight
 
 ASKED_MAX = 512
 """Beats of ours whose instant of leaving is remembered; ten seconds of them at 20 ms."""
@@ -194,6 +195,8 @@ class Membership:
         self._loyalty_ns, self._grace_ns = config.loyalty_ns, config.grace_ns
         self._elects = config.by_majority
         self._rule = RULES.index(config.rule)
+        lesser = (peer for peer in config.peers if weight(peer) < weight(config.robot))
+        self._before_us = tuple(sorted(lesser, key=weight))
 
     def change(self, config: Config, now_ns: int) -> None:
         """Go on with these peers. A new one is dead until it is heard; a former one is dead once its last lease is over.
@@ -461,10 +464,13 @@ class Membership:
         return tuple([peer for peer in self.peers.values() if peer.boot > 0 and now_ns < peer.loyal_until_ns])
 
     def is_first(self, robot: str, now_ns: int) -> bool:
-        """Whether of all members that live, this one among them, that peer has the first name."""
-        if robot >= self._config.robot or robot not in self.peers:
-            return False
-        return not any(peer.robot < robot for peer in self.living(now_ns))
+        """Whether of all members that live, this one among them, that peer has the least name."""
+        for one in self._before_us:
+            if one == robot:
+                return True
+            if self.alive(one, now_ns):
+                return False
+        return False
 
     def lease_ns(self, robot: str) -> int:
         """Until when this peer's hearing us lets us act: the newest beat of ours that it echoed, and a lease; or its promise."""

@@ -17,8 +17,8 @@ from failover.boards.directory import agents_place
 from failover.cli.demo.robots import Stage
 from failover.config import team
 from failover.config.team import Team
-from failover.core.board.ages import UNBOUNDED_NS
 from failover.core.beat_pace import URGENT_GAP_NS
+from failover.core.board.ages import UNBOUNDED_NS
 from failover.errors import NeverWrittenError
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine

@@ -68,7 +68,7 @@ def arrivals(ours: BeatLane, theirs: BeatLane) -> list[bool]:
 
 
 def test_a_beat_comes_over_every_link_and_says_when(worker: tuple[BeatLane, BeatLane]) -> None:
-    """Of the first socket of a machine that asks for stamps, the kernel begins to give them a moment later (net_enable_timestamp)."""
+    """For a machine's first socket that asks for stamps the kernel begins to give them a moment later (net_enable_timestamp)."""
     ours, theirs = worker
     while not all(arrivals(ours, theirs)):
         """The kernel stamps nothing yet."""

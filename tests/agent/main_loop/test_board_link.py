@@ -24,6 +24,7 @@ from failover.boards.board import Board
 from failover.boards.directory import OWN_NAME, PEER_PREFIX, PRIVATE_NAME, make_file
 from failover.boards.mapping import MappedFile
 from failover.boards.received import MISFIT, UNKNOWN
+from failover.core.beat_pace import URGENT_GAP_NS
 from failover.core.board import layout
 from failover.core.board.ages import UNBOUNDED_NS
 from failover.core.board.due import URGENT_PER_S
@@ -33,7 +34,6 @@ from failover.core.frames.frame import Portion
 from failover.core.frames.lane import FrameLane, Heard
 from failover.core.frames.roster import roster
 from failover.core.frames.terms import Said
-from failover.core.beat_pace import URGENT_GAP_NS
 from failover.core.wire.messages import Beat, Echo
 from failover.errors import NeverWrittenError
 
