@@ -21,6 +21,7 @@ from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import boottime, directory
 from failover.boards.mapping import MappedFile
 from failover.boards.received import ReceivedItems
+from failover.core.beat_pace import URGENT_GAP_NS
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
 from failover.core.board.announcements import RESERVED
@@ -28,7 +29,6 @@ from failover.core.board.due import Bucket, Sent, Turns
 from failover.core.board.layout import Record
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
-from failover.core.beat_pace import URGENT_GAP_NS
 from failover.errors import BoardError, OvertakenError
 
 UNREADABLE: Final = "own items that could not be read"
