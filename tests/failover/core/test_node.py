@@ -224,6 +224,18 @@ def test_a_beat_is_due_all_the_time() -> None:
     assert beats == 1_000 // PAIR.beat_ms
 
 
+@pytest.mark.parametrize(("sender", "came_ns", "follows"), [("robot1", 0, True), ("robot3", 0, False), ("robot1", 1, False)])
+def test_a_beat_follows_that_of_the_least_name_that_has_just_come(sender: str, came_ns: int, follows: bool) -> None:
+    node, now_ns, followed = Node(Config("robot2", ("robot1", "robot3")), 1, VoteRecord(), 0), 0, 0
+    for number in range(1, 101):
+        now_ns += Config("robot2").beat_ns
+        while node.next_deadline_ns() <= now_ns:
+            node.step(Tick(), node.next_deadline_ns())
+        heard = Beat(sender, 1, number, 0, 0, 0)
+        followed += len(node.step(Received(heard, "wire", came_ns=came_ns and now_ns), now_ns).send)
+    assert followed > 30 if follows else not followed
+
+
 def test_a_late_own_loop_accuses_nobody() -> None:
     node = Node(PAIR, 1, VoteRecord(), 0)
     node.step(Received(Beat("robot2", 1, 1), "wire"), 1 * MS)
