@@ -114,6 +114,8 @@ class HotPages:
         self._slot_limit = limit // page_size
         self._slots = np.empty((0, page_size), dtype=np.uint8)
         self._pages = PageMap.empty()
+        self._kept: Words = self._pages.addresses
+        """Ranges outside which no page is known."""
         self._round = 0
 
     @property
@@ -146,6 +148,27 @@ class HotPages:
         if step.parent is None or step.parent != self.position:
             self.forget()
         self._round += 1
+        if not self._is_overwritten(step):
+            self._overlay(step)
+        self.position = step.position
+
+    def _is_overwritten(self, step: Step) -> bool:
+        """Take in a delta that tells pages anew that are known all, and nothing else, as most do: no other page is looked at."""
+        page_size = self._slots.shape[1]
+        if len(step.rows) != step.count or page_set.total_size(step.gone) != step.count * page_size:
+            return False
+        if not np.array_equal(step.kept, self._kept):
+            return False
+        found, places = page_set.found_among(self._pages.addresses, step.addresses)
+        if not found.all():
+            return False
+        self._slots[self._pages.words[places, 0].astype(np.intp)] = step.rows
+        self._pages.words[places, 1] = self._round
+        self.wanted = len(self._pages.addresses) * page_size
+        return True
+
+    def _overlay(self, step: Step) -> None:
+        self._kept = step.kept
         held, _ = self._pages.without(step.kept, step.gone)
         self.wanted = (len(held.addresses) + step.count) * self._slots.shape[1]
         addresses, rows = step.addresses[: self._slot_limit], step.rows[: self._slot_limit]
@@ -157,7 +180,6 @@ class HotPages:
         self._slots[slots] = rows
         words = np.column_stack((slots.astype(np.uint64), np.full(len(slots), self._round, dtype=np.uint64)))
         self._pages, _ = held.overlaid(addresses, words)
-        self.position = step.position
 
     def _grow(self, wanted: int) -> None:
         """Have at least so many slots, within the limit: a generous limit is no reason to ask for all of that memory."""

@@ -21,7 +21,7 @@ from checkpoint.errors import ChainError, FormatError
 from checkpoint.keeper import messages
 from checkpoint.model import PageRun, Snapshot
 from checkpoint.pages import page_set, xor_delta
-from checkpoint.pages.page_set import Buffer, PageTable, Words
+from checkpoint.pages.page_set import Buffer, PageMap, PageTable, Words
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.snapshot import format, layout
 from checkpoint.snapshot.byte_sources import Source
@@ -268,6 +268,30 @@ def test_hot_pages_take_no_more_than_their_limit_and_the_oldest_go_first() -> No
     found, rows = hot.lookup(wanted)
     assert found.tolist() == [True, True, False, False, True, True]
     assert bytes(rows[0]) == page("3 2")
+
+
+@given(STEPS)
+def test_hot_pages_are_those_of_the_state_whatever_a_delta_tells(steps: list[tuple[dict[int, int], frozenset[int]]]) -> None:
+    hot = HotPages(PAGE, ROOM)
+    every = np.array([START + number * PAGE for number in range(31)], dtype=np.uint64)
+    for until, one in enumerate(whole := whole_chain(steps), 1):
+        hot.advance(Step.of(one, ROOM))
+        held = pages_of(chain.fold(whole[:until]))
+        found, rows = hot.lookup(every)
+        assert np.flatnonzero(found).tolist() == sorted(held)
+        assert [bytes(row) for row in rows] == [held[number] for number in sorted(held)]
+        assert hot.size == len(held) * PAGE
+
+
+def test_a_delta_of_known_pages_looks_at_no_other_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    hot = HotPages(PAGE, ROOM)
+    base, again, more = whole_chain([({0: 1, 3: 1}, frozenset()), ({0: 2, 9: 2}, frozenset())])
+    hot.advance(Step.of(base, ROOM))
+    with monkeypatch.context() as patch:
+        patch.setattr(PageMap, "without", None)
+        hot.advance(Step.of(again, ROOM))
+        with pytest.raises(TypeError):
+            hot.advance(Step.of(more, ROOM))
 
 
 def test_after_a_delta_that_was_missed_only_what_the_next_one_tells_is_known() -> None:
