@@ -88,8 +88,30 @@ def _running(arguments: argparse.Namespace, terms: Terms, after: tuple[str, ...]
         signal.signal(signal.SIGTERM, before)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
-    sys.exit(KILLED + number)
+class _Leave:
+    """What SIGTERM does: it ends this command. While a process starts it waits: the process would be left alone."""
+
+    def __init__(self) -> None:
+        self._starts = False
+        self._waits = 0
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not self._starts:
+            sys.exit(KILLED + number)
+        self._waits = number
+
+    def hold(self) -> None:
+        """A process starts."""
+        self._starts = True
+
+    def release(self) -> None:
+        """It has started: the signal that came meanwhile does what it does."""
+        self._starts, waits, self._waits = False, self._waits, 0
+        if waits:
+            sys.exit(KILLED + waits)
+
+
+_leave: Final = _Leave()
 
 
 @contextlib.contextmanager
@@ -99,11 +121,14 @@ def _started(command: Sequence[str], **options: object) -> Iterator[subprocess.P
     Raises:
         ScheduleError: it cannot be started.
     """
+    _leave.hold()
     try:
         process = subprocess.Popen(command, **options)  # type: ignore[call-overload]
     except OSError as error:
+        _leave.release()
         raise ScheduleError(f"cannot run {command[0]}: {error.strerror}") from error
     try:
+        _leave.release()
         yield process
     finally:
         if process.poll() is None:

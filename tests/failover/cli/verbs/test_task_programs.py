@@ -164,6 +164,22 @@ def test_sigterm_ends_task_and_command(place: Path, tmp_path: Path) -> None:
                 os.kill(inner, 0)
 
 
+def test_sigterm_that_comes_while_a_command_starts_ends_it_too(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[subprocess.Popen[bytes]] = []
+
+    def begin(command: list[str]) -> subprocess.Popen[bytes]:
+        begun.append(start(command))
+        os.kill(os.getpid(), signal.SIGTERM)
+        return begun[-1]
+
+    start = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    with pytest.raises(SystemExit) as ended:
+        main.main(["task", "run", "logger", "period_ms=20", "--", "sleep", "1000"])
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert [process.poll() for process in begun] == [-signal.SIGTERM]
+
+
 def test_mistakes_are_sentences(place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("FAILOVER_ACTIVATION_FD", raising=False)
     status, _, err = said(capsys, "wait-activation")
