@@ -419,7 +419,8 @@ class MainLoop:
         if beat is not None:
             self._count_beat(beat, came_ns or now_ns)
             self._mind_earlier_lives(beat)
-            self._step(Received(beat, link, self._copies.take(beat.sender), came_ns))
+            paces = not came_ns and link not in self._media.wireless
+            self._step(Received(beat, link, self._copies.take(beat.sender), came_ns, paces))
 
     def _counts_from_ns(self, now_ns: int, came_ns: int) -> int:
         """When a beat came that waited because this main loop rests: its sender was not late. 0: now, or a stall of ours."""

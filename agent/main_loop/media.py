@@ -95,7 +95,11 @@ class Link(Struct):
 
 
 class Media:
-    """This robot's links, as far as frames leave by them."""
+    """This robot's links, as far as frames leave by them.
+
+    Attributes:
+        wireless: names of the interfaces of those that are radios, or have slots.
+    """
 
     def __init__(self, settings: Settings, beats: BeatLane, lanes: FrameLanes, roster: Roster) -> None:
         self._settings, self._beats, self._lanes, self._roster = settings, beats, lanes, roster
@@ -105,6 +109,7 @@ class Media:
         self._links = tuple(Link(place, self._beat_ns) for place in range(len(settings.me.beats)))
         self._by_name: dict[str, Link] = {}
         self._slotted: tuple[Link, ...] = ()
+        self.wireless: frozenset[str] = frozenset()
         self._lane = lanes.lane(0)
         self._open_casts(self._lane)
 
@@ -122,6 +127,7 @@ class Media:
                 self._set_up(link, now_ns)
         self._by_name = {link.now.name: link for link in reversed(self._links) if link.now.name}
         self._slotted = tuple(link for link in self._links if link.slots is not None)
+        self.wireless = frozenset(link.now.name for link in self._links if link.now.is_wireless or link.slots is not None)
 
     def _set_up(self, link: Link, now_ns: int) -> None:
         config = self._settings.config.medium(link.now.name)

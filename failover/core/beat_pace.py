@@ -15,8 +15,8 @@ from failover.core.types import MS
 URGENT_GAP_NS: Final = 2 * MS
 """Between a beat and the next one that carries a change: a flurry of changes makes no flood of beats."""
 
-FREE_BEATS: Final = 50
-"""First beats of a life follow no other member's: robots that start at one instant claim at one instant what they are to run."""
+FREE_NS: Final = 1_500 * MS
+"""For so long after its birth a robot follows no other: robots that start at one instant then claim at one instant, too."""
 
 EARLY_PART: Final = 10
 """By this part of a period a beat leaves early at most, so that it follows the first member's…"""
@@ -29,34 +29,40 @@ class BeatPace(Struct):
     """Of one life of a robot.
 
     Attributes:
+        born_ns: when that began.
         next_ns: when the next beat is due.
         last_ns: when the newest one left.
+        follows: the next beat is due at once, as soon as all is taken in that has come with the first member's.
     """
 
+    born_ns: int
     next_ns: int
     last_ns: int = 0
-    _count: int = 0
+    follows: bool = False
     _patience_ns: int = 0
 
     def left(self, now_ns: int, period_ns: int) -> None:
         """A beat leaves now."""
         self.last_ns, self.next_ns = now_ns, now_ns + period_ns + self._patience_ns
-        self._count, self._patience_ns = self._count + 1, 0
+        self.follows, self._patience_ns = False, 0
 
     def press(self) -> None:
         """A beat is due at once, as it carries a change."""
         self.next_ns = min(self.next_ns, self.last_ns + URGENT_GAP_NS)
 
-    def follow(self, now_ns: int, period_ns: int) -> bool:
-        """The first member has just beaten. Whether this one does now; else it comes nearer to that instant by the next beat."""
+    def tick(self, now_ns: int) -> None:
+        """All that has come is taken in."""
+        if self.follows:
+            self.next_ns = min(self.next_ns, now_ns)
+
+    def follow(self, now_ns: int, period_ns: int) -> None:
+        """The first member has just beaten: so does this one, or it comes nearer to that instant by its next beat."""
         patience_ns, least_ns = period_ns // LATE_PART, self.last_ns + period_ns - period_ns // EARLY_PART
-        if self._count < FREE_BEATS or self.next_ns < least_ns:  # the latter: a change waits
-            return False
+        if now_ns - self.born_ns < FREE_NS or self.next_ns < least_ns:  # the latter: a change waits
+            return
         if now_ns - self.last_ns <= patience_ns:
             self.next_ns = now_ns + period_ns + patience_ns
         elif now_ns < least_ns:
             self.next_ns = least_ns
         else:
-            self.next_ns, self._patience_ns = now_ns, patience_ns
-            return True
-        return False
+            self.follows, self._patience_ns = True, patience_ns

@@ -21,12 +21,14 @@ class Received(Struct, frozen=True):
         copies: (link, instant) of the latest copy of a beat of this sender that came over each other link. They say nothing but
             that the link carries.
         came_ns: when it came, if it is taken in later because this robot rested; 0: now.
+        paces: it has just come over a wire, so that this robot may beat right after it. On a radio frames would meet.
     """
 
     beat: Beat
     link: str = ""
     copies: tuple[tuple[str, int], ...] = ()
     came_ns: int = 0
+    paces: bool = True
 
 
 class Unread(Struct, frozen=True):

@@ -111,7 +111,7 @@ class Node:
         self._boot = boot
         self._now_ns = now_ns
         self._asked_ns = now_ns
-        self._pace = BeatPace(now_ns)
+        self._pace = BeatPace(now_ns, now_ns)
         self._durable = vote_record
         self._drained = vote_record.drained
         self._team = Membership(config, boot, now_ns, vote_record.awaited)
@@ -147,30 +147,22 @@ class Node:
             self._begin(turn)
         if self._leaving_ns:
             self._wait_for_those_that_restart(turn)
-        if isinstance(event, Received) and self._follows(event, now_ns):
-            self._look(list(self._components.values()), turn)  # as at a Tick, before anything that the first member says now
-            self._note_promise(turn)
         touched = self._take(event, turn)
         if isinstance(event, TeamChanged):
             _say_who_belongs(turn, before)
         if isinstance(event, Tick):
             self._note_promise(turn)
-        self._look(touched, turn)
+            self._pace.tick(now_ns)
+        for component in touched:
+            lease.forget_former(component, turn)
+            _review(component, turn)
         changed = begins or bool(touched) or self._is_undurable(now_ns)
         persist = self._persist() if changed else None
         send = self._speak(turn) if changed or now_ns >= self._pace.next_ns else ()
+        if isinstance(event, Received) and event.paces and self._team.is_first(event.beat.sender, now_ns):
+            self._pace.follow(now_ns, self._config.beat_ns)
         self._asked_ns = self._deadline_ns()
         return Ready(persist, send, tuple(turn.acts), tuple(turn.said))
-
-    def _follows(self, event: Received, now_ns: int) -> bool:
-        """Whether a beat is due now, because the first member's has just come."""
-        is_first = not event.came_ns and self._team.is_first(event.beat.sender, now_ns)
-        return is_first and self._pace.follow(now_ns, self._config.beat_ns)
-
-    def _look(self, components: list[Component], turn: Turn) -> None:
-        for component in components:
-            lease.forget_former(component, turn)
-            _review(component, turn)
 
     def outlived_by(self, beat: Beat) -> int:
         """A life of this robot that the sender has heard and that is not an earlier one of ours; 0 for none.
@@ -459,6 +451,8 @@ class Node:
         return (self._team.awaited(now_ns), self._drained) != (self._durable.awaited, self._durable.drained)
 
     def _deadline_ns(self) -> int:
+        if self._pace.follows:
+            return self._now_ns
         instants = [self._pace.next_ns]
         death_ns = self._team.next_death_ns(self._now_ns)
         if death_ns is not None:

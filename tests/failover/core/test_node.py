@@ -43,6 +43,7 @@ SPEC = ComponentSpec("/lab/x", launch=Launch(("x",)))
 A = TypeVar("A", bound=acts.Act)
 ALONE = Config("robot1", grace_ms=300)
 PAIR = Config("robot1", ("robot2",), grace_ms=300)
+PAIR_OF_2 = Config("robot2", ("robot1",), grace_ms=300)
 
 
 def running(node: Node, spec: ComponentSpec = SPEC) -> acts.Ready:
@@ -224,16 +225,45 @@ def test_a_beat_is_due_all_the_time() -> None:
     assert beats == 1_000 // PAIR.beat_ms
 
 
-@pytest.mark.parametrize(("sender", "came_ns", "follows"), [("robot1", 0, True), ("robot3", 0, False), ("robot1", 1, False)])
-def test_a_beat_follows_that_of_the_least_name_that_has_just_come(sender: str, came_ns: int, follows: bool) -> None:
-    node, now_ns, followed = Node(Config("robot2", ("robot1", "robot3")), 1, VoteRecord(), 0), 0, 0
-    for number in range(1, 101):
-        now_ns += Config("robot2").beat_ns
+@pytest.mark.parametrize(
+    ("sender", "paces", "follows"), [("robot1", True, True), ("robot3", True, False), ("robot1", False, False)]
+)
+def test_a_beat_is_due_at_once_when_that_of_the_least_name_has_come(sender: str, paces: bool, follows: bool) -> None:
+    config = Config("robot2", ("robot1", "robot3"))
+    node, now_ns, followed = Node(config, 1, VoteRecord(), 0), 0, 0
+    for number in range(1, 201):
+        now_ns += config.beat_ns
         while node.next_deadline_ns() <= now_ns:
             node.step(Tick(), node.next_deadline_ns())
-        heard = Beat(sender, 1, number, 0, 0, 0)
-        followed += len(node.step(Received(heard, "wire", came_ns=came_ns and now_ns), now_ns).send)
-    assert followed > 30 if follows else not followed
+        assert not node.step(Received(Beat(sender, 1, number), "wire", paces=paces), now_ns).send, "other beats wait to be read"
+        if node.next_deadline_ns() <= now_ns:
+            followed += len(node.step(Tick(), now_ns).send)
+    assert followed > 50 if follows else not followed
+
+
+@pytest.mark.parametrize("late_us", [0, 300, 2_000, 4_900])
+def test_a_beat_that_comes_at_the_instant_of_its_senders_death_counts_before_anything_is_decided(late_us: int) -> None:
+    position = Position(64, 5, b"12345678")
+    record = Record("/lab/x", 1, "robot1", State.STANDBY, ("robot2",), trusted=True, spec=SPEC, begun=True)
+    node = Node(replace(PAIR_OF_2, lease_ms=200), 1, VoteRecord((record,)), 0, (Held("/lab/x", (position,)),))
+    entry = Entry("/lab/x", STATES.index(State.PRIMARY), 1, "robot1", 64, 5, position.digest, "robot2")
+
+    def beat(counter: int) -> Beat:
+        return Beat("robot1", 1, counter, 1, 0, 1, (Echo("robot2", 1, max(counter - 1, 1)),), (entry,))
+
+    now_ns, last = 0, 120
+    for counter in range(1, last + 1):
+        now_ns += PAIR_OF_2.beat_ns
+        node.step(Received(beat(counter), "wire"), now_ns)
+        while node.next_deadline_ns() <= now_ns:
+            node.step(Tick(), node.next_deadline_ns())
+    dead_ns = node._team.peers["robot1"].loyal_until_ns
+    while node.next_deadline_ns() < dead_ns:
+        node.step(Tick(), node.next_deadline_ns())
+    now_ns = dead_ns + late_us * 1_000
+    node.step(Received(beat(last + 1), "wire"), now_ns)
+    node.step(Tick(), max(now_ns, node.next_deadline_ns()))
+    assert node.status(now_ns).components[0].state is State.STANDBY
 
 
 def test_a_late_own_loop_accuses_nobody() -> None:
