@@ -42,6 +42,7 @@ class ItemConfig:
     bound_ms: float = 0
     banks: int = 2
     writer: str = ""
+    user: str = ""
     transmit: bool = True
     urgent: bool = False
     finite: bool = False

@@ -43,6 +43,15 @@ BOUND_MS_MAX: Final = 24 * 3_600_000
 NAME_SIZE_MAX: Final = 63
 """Bytes of an item's name, as of a robot's."""
 
+USER_SIZE_MAX: Final = 64
+"""Bytes of a user's name; useradd(8) allows 32, a directory of an organisation may have longer ones."""
+
+OWNED_MAX: Final = 400
+"""Items of one user alone: their table is one value of an item (`failover.core.board.owners`)."""
+
+OWNERS_MAX: Final = 64
+"""Users who have such items: the main loop reads a file of each in every round."""
+
 PATTERNS_MAX: Final = 64
 """Robots or patterns in one list: as many as a team has voters."""
 
@@ -67,11 +76,12 @@ class Item(Struct, frozen=True, dict=True):
         robots: which robots have it: names, or patterns with ``*``.
         bound_ms: past this age a reading is stale; 0: the bound follows from period and round.
         banks: copies, 2 to 8.
-        writer: the component that is meant to write it. Nothing enforces that: the first process that puts it does.
+        writer: the component that is meant to write it, for people. Nothing enforces that: the first process that puts it does.
         transmit: False: it is received from others and never sent, for a robot that only listens.
         urgent: it is sent at once where no slots are, not with the next round.
         finite: refuse NaN and infinities.
         keep: an item added while it runs is there again after a reboot.
+        user: the one user who may put it, on each robot; "": who may write the board may.
 
     Raises:
         ItemError: says which key is wrong, and what to write.
@@ -91,6 +101,7 @@ class Item(Struct, frozen=True, dict=True):
     urgent: bool = False
     finite: bool = False
     keep: bool = False
+    user: str = ""
 
     def __post_init__(self) -> None:
         _check_kinds(self)
@@ -136,6 +147,8 @@ class Item(Struct, frozen=True, dict=True):
         """Every key as plain values, the type as its text: the canonical declaration."""
         kind = canonical(self.type)
         words: dict[str, object] = {name: getattr(self, name) for name in self.__struct_fields__}
+        if not self.user:
+            del words["user"]  # robots that know no such key have the same digest
         return words | {"type": kind, "bound_ms": float(self.bound_ms)}
 
 
@@ -155,12 +168,15 @@ def check_name(name: str) -> None:
     Raises:
         ItemError: says why.
     """
-    visible = name.isprintable() and not any(character.isspace() for character in name)
-    if not name or "/" in name or not visible or names.text_size(name) > NAME_SIZE_MAX:
+    if not name or "/" in name or not _is_visible(name) or names.text_size(name) > NAME_SIZE_MAX:
         raise ItemError(
             f"{name[:80]!r} cannot name an item: use 1 to {NAME_SIZE_MAX} bytes of visible characters without blanks and '/'",
             "name",
         )
+
+
+def _is_visible(text: str) -> bool:
+    return text.isprintable() and not any(character.isspace() for character in text)
 
 
 def _typed(said: Any, size: int) -> Type:
@@ -221,6 +237,8 @@ def _check_words(item: Item) -> None:
             names.check_component(item.writer)
         except NameFormatError as error:
             raise ItemError(f"writer: {error}", "writer") from error
+    if not _is_visible(item.user) or set(item.user) & set("/:") or len(item.user.encode(errors="replace")) > USER_SIZE_MAX:
+        raise ItemError(f"user {item.user[:80]!r} cannot be the name of a user; see getent passwd", "user")
 
 
 def _matches(patterns: tuple[str, ...], robot: str) -> bool:
@@ -248,6 +266,12 @@ class Board(Struct, frozen=True):
             seen.add(item.name)
         if len(self.items) > ITEMS_MAX:
             raise ItemError(f"{len(self.items)} items are over the limit of {ITEMS_MAX}")
+        users = [item.user for item in self.items if item.user]
+        if len(users) > OWNED_MAX or len(set(users)) > OWNERS_MAX:
+            raise ItemError(
+                f"{len(users)} items of {len(set(users))} users are for one user each; {OWNED_MAX} items of {OWNERS_MAX} users "
+                "are possible"
+            )
         size = sum(item.banks * bank_stride(item.size) for item in self.items)
         if size > BLOCK_SIZE_MAX:
             raise ItemError(f"the items take {size} bytes with their banks, over the limit of {BLOCK_SIZE_MAX} for a block")
@@ -275,3 +299,7 @@ class Board(Struct, frozen=True):
     def private_of(self, robot: str) -> dict[int, Item]:
         """Number → item, of those that stay at a robot."""
         return {number: item for number, item in enumerate(self.items) if item.is_at(robot) and not item.is_shared_by(robot)}
+
+    def owned_at(self, robot: str) -> dict[int, Item]:
+        """Number → item, of those of a robot that one user alone may put, shared or not."""
+        return {number: item for number, item in enumerate(self.items) if item.user and item.is_at(robot)}

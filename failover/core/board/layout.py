@@ -173,6 +173,11 @@ class Record(Wanted, frozen=True):
         return record_at(self.index)
 
 
+def is_exactly(record: Record | None, wanted: Wanted) -> bool:
+    """Whether a record is exactly as it is wanted."""
+    return record is not None and all(getattr(record, name) == getattr(wanted, name) for name in Wanted.__struct_fields__)
+
+
 def aligned(size: int) -> int:
     """Bytes of the cache lines that so many bytes take."""
     return -(-size // LINE) * LINE

@@ -47,6 +47,11 @@ def test_an_item_knows_its_type_and_its_size() -> None:
         ({"name": "a", "size": 4, "robots": ("a/b",)}, "robots", "cannot name a robot"),
         ({"name": "a", "size": 4, "robots": "robot1"}, "robots", "no list"),
         ({"name": "a", "size": 4, "writer": "mapper"}, "writer", "cannot name a component"),
+        ({"name": "a", "size": 4, "user": 3}, "user", "user 3 is no str"),
+        *[
+            ({"name": "a", "size": 4, "user": user}, "user", "cannot be the name")
+            for user in ("a b", "a/b", "a:b", "a\n", "u" * 65)
+        ],
     ],
 )
 def test_a_mistaken_item_names_its_key(keys: dict[str, Any], key: str, said: str) -> None:
@@ -72,6 +77,10 @@ def test_a_board_has_limits() -> None:
         Board((Item("a", size=4), Item("a", size=8)))
     with pytest.raises(ItemError, match="1025 items are over the limit of 1024"):
         Board(tuple(Item(f"i{number}", size=4) for number in range(ITEMS_MAX + 1)))
+    with pytest.raises(ItemError, match="401 items of 1 users are for one user each; 400 items of 64 users are possible"):
+        Board(tuple(Item(f"i{number}", size=4, user="mapper") for number in range(401)))
+    with pytest.raises(ItemError, match="65 items of 65 users are for one user each"):
+        Board(tuple(Item(f"i{number}", size=4, user=f"u{number}") for number in range(65)))
     many = BLOCK_SIZE_MAX // (8 * bank_stride(65536)) + 1
     with pytest.raises(ItemError, match="over the limit of 16777216 for a block"):
         Board(tuple(Item(f"i{number}", size=65536, shared=False, banks=8) for number in range(many)))
@@ -89,6 +98,7 @@ CHANGES: list[dict[str, Any]] = [
     {"writer": "/lab/a"},
     {"transmit": False},
     {"urgent": True},
+    {"user": "mapper"},
 ]
 
 
@@ -97,6 +107,12 @@ def test_every_change_of_an_item_changes_the_boards_digest(change: dict[str, Any
     said: dict[str, Any] = {"name": "a", "type": {"x": "f4", "y": "f4"}}
     assert Board((Item(**said),)).digest == Board((Item(**(said | {"type": "{x:f4, y:f4}", "bound_ms": 0.0})),)).digest
     assert Board((Item(**said),)).digest != Board((Item(**(said | change)),)).digest
+
+
+def test_an_item_that_names_no_user_has_the_digest_that_older_robots_give_it() -> None:
+    assert f"{Board((Item('a', size=4), Item('b', 'f8', writer='/lab/a'))).digest:016x}" == "4600590114ceffb1"
+    assert list(Board((Item("a", size=4), Item("b", size=4, user="u", robots=("r1",)))).owned_at("r1")) == [1]
+    assert not Board((Item("b", size=4, user="u", robots=("r1",)),)).owned_at("r2")
 
 
 def test_the_order_of_items_is_part_of_the_digest_and_no_board_has_none() -> None:
