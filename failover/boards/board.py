@@ -17,16 +17,18 @@ from msgspec import Struct
 
 from checkpoint.sentences import near
 from failover.boards import boottime, directory
+from failover.boards.agents_file import PRIMARIES, AgentsFile
 from failover.boards.component_item import Primary, decode
 from failover.boards.fence import FENCE
 from failover.boards.item import Item, ItemWriter, Source, values_for
-from failover.boards.mapping import MappedFile
+from failover.boards.mapping import USER_PREFIX, MappedFile, uid_of
 from failover.boards.watch import Watch
 from failover.core.board import ages, layout
 from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
 from failover.core.board.banks import Place, Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
+from failover.core.board.owners import Owner
 from failover.core.naming import worlds
 from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
 
@@ -59,7 +61,7 @@ class _Opened:
         self.pid = os.getpid()
         self.files = [self.own]
         self.peers: dict[str, MappedFile] = {}
-        self._agents: MappedFile | None = None
+        self._agents = AgentsFile(self.directory)
         try:
             self._open_others()
         except BaseException:
@@ -67,10 +69,49 @@ class _Opened:
             raise
 
     def _open_others(self) -> None:
-        paths = [self.directory / directory.PRIVATE_NAME, *sorted(self.directory.glob(f"{directory.OWN_NAME}+*"))]
-        for path in paths:
+        if not self.own.header.flags & layout.ALONE:
+            self.own.owners = self._agents.owners
+        with contextlib.suppress(FileNotFoundError):
+            self._open(self.directory / directory.PRIVATE_NAME)
+        for path in sorted(self.directory.glob(f"{USER_PREFIX}*")):
+            with contextlib.suppress(FileNotFoundError, BoardError):  # its user can spoil it: told when an item of it is used
+                self._open(path)
+
+    def _open(self, path: Path) -> MappedFile:
+        file = MappedFile.open(path)
+        file.owners = self.own.owners
+        self.files.append(file)
+        return file
+
+    def owner(self, name: str) -> Owner | None:
+        """Who alone may put an item; None: who may write the board.
+
+        Raises:
+            BoardError: the agent's table cannot be read.
+        """
+        return (self.own.owners() or {}).get(name) if self.own.owners is not None else None
+
+    def files_of(self, name: str) -> list[MappedFile]:
+        """Where this robot's item of that name can be.
+
+        Raises:
+            BoardError: the file of the one user who may put it cannot be read.
+        """
+        owner = self.owner(name)
+        if owner is None:
+            return self.files if self.own.owners is None else [file for file in self.files if uid_of(file.path) is None]
+        path = self.directory / f"{USER_PREFIX}{owner.uid}"
+        found = [file for file in self.files if file.path == path]
+        if not found and owner.uid is not None:
             with contextlib.suppress(FileNotFoundError):
-                self.files.append(MappedFile.open(path))
+                found = [self._open(path)]
+        return found
+
+    def forget_gone(self) -> None:
+        """Close files of one user that the agent has removed or made anew while it kept the others."""
+        for file in [file for file in self.files[1:] if file.is_gone]:
+            self.files.remove(file)
+            file.close()
 
     def peer(self, robot: str) -> MappedFile:
         """Another robot's file, or a guest's.
@@ -96,15 +137,13 @@ class _Opened:
         Raises:
             BoardError: there is none: no agent has made this board.
         """
-        if self._agents is None or self._agents.is_gone:
-            try:
-                self._agents = MappedFile.open(self.directory / directory.AGENT_NAME, writable=False)
-            except FileNotFoundError:
-                raise BoardError(
-                    f"no agent has made the board {self.directory}: it alone knows which robot runs a component; "
-                    "read the item of a robot by its name"
-                ) from None
-        return self._agents
+        file = self._agents.opened()
+        if file is None:
+            raise BoardError(
+                f"no agent has made the board {self.directory}: it alone knows which robot runs a component; "
+                "read the item of a robot by its name"
+            )
+        return file
 
     def path_of(self, robot: str) -> Path:
         """Where another robot's file is."""
@@ -220,6 +259,9 @@ class Board:
         """
         with self.guard:
             opened = self.ensured()
+            self._check_user(opened, declaration)
+            if opened.owner(declaration.name) is not None:
+                return self.item(declaration.name, declaration.shape)
             file = opened.own if declaration.is_shared_by(opened.robot) else self._private(opened)
             if not file.is_writable:
                 raise BoardError(f"cannot add item {declaration.name!r}: {file.path} may only be read by uid {os.geteuid()}")
@@ -242,6 +284,21 @@ class Board:
             self._added[declaration.name] = declaration
             return self.item(declaration.name, declaration.shape)
 
+    def _check_user(self, opened: _Opened, declaration: Declaration) -> None:
+        """Refuse to add an item for one user which is another one's, or which only the team file can give to one user."""
+        name, user, owner = declaration.name, declaration.user, opened.owner(declaration.name)
+        if owner is not None:
+            found = self._where(opened, name) or self._elsewhere(opened, name)
+            if user not in ("", owner.user) or (found is not None and not is_alike(found[1], wanted_of(declaration, 0))):
+                raise BoardError(
+                    f"cannot add item {name!r}: team.toml declares it otherwise, for user {owner.user!r} alone; take it as it is"
+                )
+        elif user and not (opened.own.header.flags & layout.ALONE and is_this_user(user)):
+            raise BoardError(
+                f"cannot add item {name!r} for user {user!r} alone: an item of one user is declared in team.toml, and without an "
+                f"agent the board is that of its user, here uid {os.geteuid()}; declare it there, or leave user out"
+            )
+
     def remove(self, name: str) -> None:
         """Take an item off the board; its name is free then.
 
@@ -251,7 +308,7 @@ class Board:
         with self.guard:
             file, record = self.found(name, self.ensured().robot)
             if not file.is_writable:
-                raise BoardError(f"cannot remove item {name!r}: {file.path} may only be read by uid {os.geteuid()}")
+                raise BoardError(f"cannot remove item {name!r}: {self.read_only(file, record)}")
             self._added.pop(name, None)
             with file.changing():
                 file.remove(record)
@@ -312,7 +369,9 @@ class Board:
         with self.guard:
             file = self.ensured().agents()
             place = (
-                file.place(file.records()[0]) if self._primaries is None or self._primaries[0] is not file else self._primaries[1]
+                file.place(_primaries_of(file))
+                if self._primaries is None or self._primaries[0] is not file
+                else self._primaries[1]
             )
             number = place.words[place.newest]
             if self._primaries is None or self._primaries[0] is not file or self._primaries[2] != number:
@@ -407,8 +466,15 @@ class Board:
             return bool(self.found(name, robot))
         return False
 
+    def read_only(self, file: MappedFile, record: Record) -> str:
+        """Why this program may not put an item."""
+        owner = self.ensured().owner(record.name)
+        if owner is None:
+            return f"{file.path} may only be read by uid {os.geteuid()}"
+        return f"user {owner.user!r} (uid {owner.uid}) alone may put it, and this program runs as uid {os.geteuid()}"
+
     def whose(self, file: MappedFile, record: Record) -> str:
-        """Why an item cannot be put."""
+        """Why an item cannot be put: another process does."""
         pid = file.word32(record.at + layout.PID_FIELD)
         name = next((f" ({name})" for user, _, name in self.users() if user == pid and name), "")
         same = " in another opening of the board" if pid == os.getpid() else ""
@@ -434,6 +500,7 @@ class Board:
                 for declaration in list(self._added.values()):
                     with contextlib.suppress(BoardError):  # the next use of the item says why
                         self.add(declaration)
+            opened.forget_gone()
             return opened
 
     def _forget(self) -> None:
@@ -454,22 +521,31 @@ class Board:
     # --- Records ---
 
     def _where(self, opened: _Opened, name: str) -> tuple[MappedFile, Record] | None:
-        found = ((file, file.record(name)) for file in opened.files)
+        found = ((file, file.record(name)) for file in opened.files_of(name))
         return next(((file, record) for file, record in found if record is not None), None)
 
     def _declared(self, name: str) -> Record:
         """An item's record here, or at any other robot."""
         opened = self.ensured()
-        there = self._where(opened, name)
-        if there is not None:
-            return there[1]
+        there = self._where(opened, name) or self._elsewhere(opened, name)
+        if there is None:
+            raise BoardError(self._unknown(name, opened.robot))
+        return there[1]
+
+    def _elsewhere(self, opened: _Opened, name: str) -> tuple[MappedFile, Record] | None:
         for robot in (*opened.peer_names(), *opened.guest_names()):
-            record = opened.peer(robot).record(name)
+            file = opened.peer(robot)
+            record = file.record(name)
             if record is not None:
-                return record
-        raise BoardError(self._unknown(name, opened.robot))
+                return file, record
+        return None
 
     def _unknown(self, name: str, robot: str) -> str:
+        owner = self.ensured().owner(name)
+        if owner is not None and robot == self.ensured().robot:
+            return (
+                f"item {name!r} is for user {owner.user!r} alone, and no program of {robot} can put it: failover status says why"
+            )
         cure = near(name, self.names()) or "; declare it in team.toml, or with board.add()"
         return f"{robot} has no item {name!r} on the board {self.ensured().directory}{cure}"
 
@@ -478,6 +554,23 @@ class Board:
             if file.header.flags & layout.PRIVATE:
                 return file
         raise BoardError(f"the board {opened.directory} has no file for private items")
+
+
+def _primaries_of(file: MappedFile) -> Record:
+    record = file.record(PRIMARIES)
+    if record is None:
+        raise BoardError(f"damaged: {file.path} has no table of primaries")
+    return record
+
+
+def is_this_user(user: str) -> bool:
+    """Whether this process runs as that user."""
+    from failover.config.accounts import account_of  # here: few programs need it
+
+    try:
+        return account_of(user).pw_uid == os.geteuid()
+    except (KeyError, ValueError):
+        return False
 
 
 def is_alike(record: Record, wanted: layout.Wanted) -> bool:

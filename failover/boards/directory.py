@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,6 +37,12 @@ AGENT_NAME: Final = "agent"
 PEER_PREFIX: Final = "peer-"
 GUEST_PREFIX: Final = "guest-"
 """Of simulated robots: no agent receives for them, and only programs of their world take them for robots of the team."""
+
+_RIGHTS: Final = "system.posix_acl_access"
+_ACL_VERSION: Final = (2).to_bytes(4, "little")
+_ENTRY: Final = struct.Struct("<HHI")
+_USER_OBJ, _USER, _GROUP_OBJ, _MASK, _OTHER = 1, 2, 4, 16, 32
+_NOBODY: Final = 2**32 - 1
 
 TURNS: Final = 1000
 """Of making or opening a board that others make and remove at the same time."""
@@ -95,6 +102,7 @@ def make_file(
     digest: int = 0,
     mode: int = 0o600,
     group: int = -1,
+    user: int | None = None,
     hold: bool = False,
 ) -> int:
     """Make one file of a board, whole at its place.
@@ -104,6 +112,7 @@ def make_file(
         items: number → declaration; from `ITEMS_MAX` on they were added at run time.
         digest: of the team's declarations.
         group: whose it is to be; -1: this process's.
+        user: the one who may write it beside its owner, with what ``mode`` lets its owner do; None: nobody.
         hold: return an opening that is user 0 already and has the table lock.
 
     Returns:
@@ -118,6 +127,8 @@ def make_file(
         flags, capacity, check_robot(robot), boottime.boot_id(), rank=rank, state=state, roster_digest=digest
     )
     with _linked(path, mode, group) as made:
+        if user is not None:
+            give_to(made, user, mode)
         os.ftruncate(made, layout.names_at(capacity))
         os.pwrite(made, header, 0)
         for number, item in (items or {}).items():
@@ -134,6 +145,30 @@ def make_file(
         return made
     os.close(made)
     return -1
+
+
+def give_to(file: int | Path, user: int, mode: int) -> None:
+    """Have one user read and write a file as its owner may, the owner's group as ``mode`` says, and nobody else.
+
+    By an access control list, not by making the user its owner: that needs no capability, and the owner of a file could close it
+    to the agent. Source: acl(5); the list's bytes: `struct posix_acl_xattr_entry` in include/uapi/linux/posix_acl_xattr.h.
+
+    Raises:
+        OSError: this kernel has no such lists on tmpfs (CONFIG_TMPFS_POSIX_ACL), or the file is not this user's.
+    """
+    owner, group = mode >> 6 & 7, mode >> 3 & 7
+    entries = ((_USER_OBJ, owner, _NOBODY), (_USER, owner, user), (_GROUP_OBJ, group, _NOBODY), (_MASK, owner, _NOBODY))
+    rights = b"".join(_ENTRY.pack(*entry) for entry in (*entries, (_OTHER, 0, _NOBODY)))
+    if isinstance(file, int) or rights_of(file) != rights:
+        os.setxattr(file, _RIGHTS, _ACL_VERSION + rights)
+
+
+def rights_of(path: Path) -> bytes:
+    """The entries of a file's access control list; b"" where it has none."""
+    try:
+        return os.getxattr(path, _RIGHTS)[len(_ACL_VERSION) :]
+    except OSError:
+        return b""
 
 
 @contextmanager

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
+from pathlib import Path
 from typing import ClassVar, Final
 
 from failover.boards import locks
@@ -12,6 +14,7 @@ from failover.core.board import layout
 from failover.core.board.banks import Place, place_of
 from failover.core.board.items import BLOCK_SIZE_MAX
 from failover.core.board.layout import USER_LOCKS, USERS_MAX, WRITER_LOCKS, Header, Record, Wanted
+from failover.core.board.owners import Owners, is_rightful
 from failover.errors import BoardError, BoardGoneError
 
 USER_PREFIX: Final = "own+"
@@ -20,13 +23,24 @@ USER_PREFIX: Final = "own+"
 _U32: Final = struct.Struct("<I")
 
 
+def uid_of(path: Path) -> int | None:
+    """The one user who may write a file, by its name; None: it is no file of one user."""
+    uid = path.name.removeprefix(USER_PREFIX)
+    return int(uid) if uid != path.name and uid.isascii() and uid.isdigit() else None
+
+
 class MappedFile(SharedFile):
-    """A file of a board, mapped; see `SharedFile`. It may grow while it is open."""
+    """A file of a board, mapped; see `SharedFile`. It may grow while it is open.
+
+    Attributes:
+        owners: tells whose the items are; what stands in the file without a right to is left out. None: all is believed.
+    """
 
     SIZE_MIN: ClassVar[int] = layout.RECORDS_AT
     SIZE_MAX: ClassVar[int] = BLOCK_SIZE_MAX
 
     header: Header
+    owners: Callable[[], Owners | None] | None = None
 
     # --- What the file says ---
 
@@ -52,9 +66,14 @@ class MappedFile(SharedFile):
         """All items, as the file says now."""
         header = self._reach()
         try:
-            return list(layout.read_records(self.view, header))
+            found = list(layout.read_records(self.view, header))
         except BoardError as error:
             raise BoardError(f"{self.path}: {error}") from None
+        owners = self.owners() if self.owners is not None else None
+        if owners is None:
+            return found
+        uid = uid_of(self.path)
+        return [record for record in found if is_rightful(owners, record.name, uid)]
 
     def _reach(self) -> Header:
         """The header; the mapping then reaches as far as the file, if others have added items since.

@@ -128,7 +128,7 @@ class ReceivedItems:
             BoardError: another process holds the table; nothing was changed.
         """
         known = {record.id: record for record in self.added()}
-        fresh = [wanted for wanted in added if not _is(known.get(wanted.id), wanted)]
+        fresh = [wanted for wanted in added if not layout.is_exactly(known.get(wanted.id), wanted)]
         gone = [known[number] for number in {*removed, *(wanted.id for wanted in fresh)} if number in known]
         if not fresh and not gone:
             return
@@ -176,8 +176,3 @@ class ReceivedItems:
             if record.period not in bounds:
                 bounds[record.period] = min(compute(record.period), UNBOUNDED_NS)
             self.file.words[(record.at + layout.FORMULA_FIELD) // 8] = bounds[record.period]
-
-
-def _is(record: Record | None, wanted: Wanted) -> bool:
-    """Whether a record is exactly as it is wanted."""
-    return record is not None and all(getattr(record, name) == getattr(wanted, name) for name in Wanted.__struct_fields__)

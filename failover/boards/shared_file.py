@@ -7,6 +7,7 @@ long as it lives); the locks belong to the second one, which can be closed at an
 from __future__ import annotations
 
 import contextlib
+import errno
 import mmap
 import os
 from collections.abc import Iterator
@@ -17,6 +18,9 @@ from typing import Any, ClassVar, Final, Self
 from failover.boards import futex, locks
 from failover.core.board.layout import GENERATION_AT, GONE, HOLE, TABLE_LOCK
 from failover.errors import BoardError, BoardGoneError, FailoverError
+
+REFUSED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+"""Why a file cannot be opened for writing, and perhaps for reading."""
 
 GENERATION: Final = GENERATION_AT // 8
 """The word of every such file that is odd while its table changes."""
@@ -72,18 +76,10 @@ class SharedFile:
             BoardError, ScheduleError: it is none, or cannot be opened.
             FileNotFoundError: there is none.
         """
-        if writable is None:
-            writable = os.access(path, os.W_OK, effective_ids=True)
-        flags = (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC | os.O_NOFOLLOW
+        opened, is_writable = cls._first_opening(path, writable)
         try:
-            opened = os.open(path, flags)
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise cls.ERROR(f"cannot open {path}: {error.strerror}") from error
-        try:
-            file = cls(path, cls._mapped(path, opened, writable), writable, descriptor, _identity(opened))
-            if writable and descriptor < 0:
+            file = cls(path, cls._mapped(path, opened, is_writable), is_writable, descriptor, _identity(opened))
+            if is_writable and descriptor < 0:
                 file.descriptor = cls._second_opening(path, opened)
             return file
         finally:
@@ -156,6 +152,20 @@ class SharedFile:
                 locks.give(self.descriptor, TABLE_LOCK)
 
     # --- Openings ---
+
+    @classmethod
+    def _first_opening(cls, path: Path, writable: bool | None) -> tuple[int, bool]:
+        """A descriptor, and whether it may write. The opening itself asks: access(2) of old kernels knows no lists of users."""
+        for is_writable in (True, False) if writable is None else (writable,):
+            flags = (os.O_RDWR if is_writable else os.O_RDONLY) | os.O_CLOEXEC | os.O_NOFOLLOW
+            try:
+                return os.open(path, flags), is_writable
+            except FileNotFoundError:
+                raise
+            except OSError as error:
+                if not is_writable or writable or error.errno not in REFUSED:
+                    raise cls.ERROR(f"cannot open {path}: {error.strerror}") from error
+        raise AssertionError
 
     @classmethod
     def _mapped(cls, path: Path, descriptor: int, writable: bool) -> mmap.mmap:
