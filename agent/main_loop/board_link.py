@@ -7,6 +7,7 @@ anything into `own`; every size is checked before it is believed, and nothing of
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,23 +16,23 @@ from typing import Final
 from msgspec import Struct
 
 from agent.main_loop.announcements import Announcements
-from agent.main_loop.own_items import OwnItems
+from agent.main_loop.own_items import UNREADABLE, Newest, own_items
 from agent.main_loop.primaries import LEFT_OUT, Primaries
 from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import boottime, directory
-from failover.boards.mapping import MappedFile
+from failover.boards.agents_file import AgentsFile
+from failover.boards.mapping import USER_PREFIX, MappedFile, uid_of
 from failover.boards.received import ReceivedItems
 from failover.core.beat_pace import URGENT_GAP_NS
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
 from failover.core.board.announcements import RESERVED
 from failover.core.board.due import Bucket, Sent, Turns
-from failover.core.board.layout import Record
+from failover.core.board.owners import Owners
 from failover.core.frames.frame import Portion
 from failover.core.frames.lane import Heard
 from failover.errors import BoardError, OvertakenError
 
-UNREADABLE: Final = "own items that could not be read"
 WAITED: Final = "items that waited a round for room in a frame"
 
 REMOVE_ROUNDS: Final = 3
@@ -42,6 +43,9 @@ BOUNDS_TOLD_NS: Final = 1_000_000_000
 
 WORST_FALLS: Final = 1000
 """Frames in which the longest way is forgotten by two thirds: what is longer than it is about one frame of a thousand."""
+
+
+log = logging.getLogger("failover.heart")
 
 
 class _Peer(Struct):
@@ -70,20 +74,25 @@ class BoardLink:
     """
 
     def __init__(
-        self, own: MappedFile, peers: Mapping[str, ReceivedItems], round_ns: int, primaries: Primaries | None = None
+        self,
+        own: Sequence[MappedFile],
+        peers: Mapping[str, ReceivedItems],
+        round_ns: int,
+        primaries: Primaries | None = None,
+        owners: Owners | None = None,
     ) -> None:
-        self._file = own
+        self._files = own
         self._round_ns, self._skew_ns = round_ns, boottime.skew_ns()
         self._turns: dict[int, Turns] = {}
         self.dropped: Counter[str] = Counter()
-        self._own = OwnItems(own)
+        self._own = own_items([(file, uid_of(file.path)) for file in own], owners, self.dropped)
         self._gone: dict[tuple[int, int], int] = {}
         self._looked: dict[int, int] = {}
         self._buckets: dict[tuple[int, int], Bucket] = {}
-        self.wakes = UrgentItems(own, self._own)
+        self.wakes = UrgentItems(own)
         self._urgent_ns = 0
         self._peers = {name: _Peer(items) for name, items in peers.items()}
-        self._announcements = Announcements(own.header.rank, peers)
+        self._announcements = Announcements(own[0].header.rank, peers)
         self._primaries = primaries
 
     @classmethod
@@ -93,11 +102,16 @@ class BoardLink:
         Raises:
             BoardError, FileNotFoundError: there is none.
         """
-        own = MappedFile.open(place / directory.OWN_NAME, writable=True)
+        own, owners = [MappedFile.open(place / directory.OWN_NAME, writable=True)], AgentsFile(place).owners()
+        for uid in sorted({owner.uid for owner in (owners or {}).values() if owner.uid is not None}):
+            try:
+                own.append(MappedFile.open(place / f"{USER_PREFIX}{uid}", writable=True))
+            except (BoardError, FileNotFoundError) as error:  # its user has spoilt it since the worker looked
+                log.warning("items of uid %d are not sent: %s", uid, error)
         prefix = directory.PEER_PREFIX
         peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
         agents = Primaries.open(place) if (place / directory.AGENT_NAME).exists() else None
-        return cls(own, peers, round_ns, agents)
+        return cls(own, peers, round_ns, agents, owners)
 
     # --- Out ---
 
@@ -112,14 +126,12 @@ class BoardLink:
             if self._own.look(now_ns):
                 self._hold(*self._turns.values())
                 self._announcements.hold(self._own.records.values())
-                self.wakes.ask()
+                self._own.ask()
             told = self._announcements.due(round_, medium)
             due = self._turns_of(medium).due(round_, since)
             if not due:
                 return told
-            numbers, records = self._own.newest(), self._own.records
-            newest = [(record, numbers[record.index]) for record in map(records.__getitem__, due)]
-            return told + self._portions(newest, now_ns)
+            return told + self._portions(self._own.newest(due), now_ns)
         except (BoardError, OSError):
             self.dropped[UNREADABLE] += 1
             return []
@@ -155,7 +167,7 @@ class BoardLink:
         if medium == 0:
             self._looked = numbers
         for record in own.urgent:
-            lane, number = (medium, record.id), numbers[record.id]
+            lane, number = (medium, record.id), numbers.get(record.id, 0)
             if number > gone.get(lane, 0) and self._bucket(lane).take(now_ns):
                 may.append((record, number))
         return self._portions(may, now_ns)
@@ -170,7 +182,7 @@ class BoardLink:
         """What `urgent` gave is on its way: programs are to tell of their next put. Whether there was one since it looked."""
         self.wakes.heed()
         try:
-            self.wakes.ask()
+            self._own.ask()
         except OSError:
             self.dropped[UNREADABLE] += 1
         return self.has_urgent()
@@ -203,7 +215,7 @@ class BoardLink:
         if self._own.urgent:
             self._gone.update([((medium, portion.number), portion.put) for portion in portions])
 
-    def _portions(self, newest: Sequence[tuple[Record, int]], now_ns: int) -> list[Portion]:
+    def _portions(self, newest: Newest, now_ns: int) -> list[Portion]:
         """Of items with the numbers of their newest puts."""
         found, left_ns, get = [], now_ns - self._skew_ns, self._own.get
         if len(newest) > 1:
@@ -279,7 +291,7 @@ class BoardLink:
         self.wakes.close()
         if self._primaries is not None:
             self._primaries.close()
-        for file in (self._file, *[peer.items.file for peer in self._peers.values()]):
+        for file in (*self._files, *[peer.items.file for peer in self._peers.values()]):
             file.close()
 
     def left_out(self) -> Counter[str]:

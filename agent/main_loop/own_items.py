@@ -6,18 +6,23 @@ Programs of a group may write the file, and so make it shorter. The kernel ends 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
 from failover.core.board.banks import RETRIES, Found, sum_of
 from failover.core.board.items import BLOCK_SIZE_MAX
-from failover.core.board.layout import NOT_SENT, URGENT, Record
+from failover.core.board.layout import ADDED, NOT_SENT, URGENT, Record
+from failover.core.board.owners import Owners
 from failover.errors import BoardError, OvertakenError
+
+UNREADABLE: Final = "own items that could not be read"
 
 LOOK_NS: Final = 100_000_000
 """Between two looks at a table that changes: a program that changes it all the time costs the loop no more."""
@@ -30,19 +35,27 @@ _BANK: Final = struct.Struct("<QQQII")
 
 _NUMBER: Final = struct.Struct("<Q")
 
+WAITS_FOR_ANY: Final = b"\x01"
+ANY_FIELD: Final = layout.WAITERS_FIELD + 1
+
 _NEWEST: Final = struct.Struct(f"<{layout.NEWEST_FIELD}xQ{layout.RECORD_SIZE - layout.NEWEST_FIELD - 8}x")
 """Of a record the number of its newest put."""
 
 
+Newest = list[tuple[Record, int]]
+"""Items with the numbers of their newest puts; 0: none."""
+
+
 class OwnItems:
-    """The items that this robot sends.
+    """The items that this robot sends, of one file.
 
     Attributes:
         records: by number, as the table was when it was last read.
     """
 
-    def __init__(self, file: MappedFile) -> None:
-        self._file = file
+    def __init__(self, file: MappedFile, believes: Callable[[Record], bool] | None = None) -> None:
+        """``believes``: whether an item may stand in this file; None: any may."""
+        self._file, self._believes = file, believes
         self._descriptor = file.descriptor
         self.records: dict[int, Record] = {}
         self.urgent: tuple[Record, ...] = ()
@@ -65,6 +78,8 @@ class OwnItems:
         content = os.pread(self._descriptor, min(os.fstat(self._descriptor).st_size, BLOCK_SIZE_MAX), 0)
         header = layout.read_header(content)
         found = [record for record in layout.read_records(content, header) if not record.flags & NOT_SENT]
+        if self._believes is not None:
+            found = list(filter(self._believes, found))
         self._generation = generation if generation % 2 == 0 else -1
         self._table_size = header.count * layout.RECORD_SIZE
         self.records = {record.id: record for record in found}
@@ -82,8 +97,17 @@ class OwnItems:
         pread, descriptor = os.pread, self._descriptor
         return {number: int.from_bytes(pread(descriptor, 8, at), "little") for number, at in self._urgent_at}
 
-    def newest(self) -> list[int]:
-        """The numbers of the newest puts as they are now, by the indexes of the records; 0: none.
+    def ask(self) -> None:
+        """Have the writers of urgent items tell of their next put.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        for record in self.urgent:
+            os.pwrite(self._descriptor, WAITS_FOR_ANY, record.at + ANY_FIELD)
+
+    def newest(self, numbers: Sequence[int]) -> Newest:
+        """Of the items with these numbers the newest puts as they are now.
 
         Raises:
             BoardError: the file was made shorter.
@@ -91,9 +115,10 @@ class OwnItems:
         table = os.pread(self._descriptor, self._table_size, layout.RECORDS_AT)
         if len(table) < self._table_size:
             raise BoardError(f"{self._file.path}: the file was made shorter")
-        return [number for (number,) in _NEWEST.iter_unpack(table)]
+        puts = [put for (put,) in _NEWEST.iter_unpack(table)]
+        return [(record, puts[record.index]) for record in map(self.records.__getitem__, numbers)]
 
-    def read_ahead(self, newest: Sequence[tuple[Record, int]]) -> None:
+    def read_ahead(self, newest: Newest) -> None:
         """Read the newest puts of several items with two calls, not two for each: `get` has those that were whole.
 
         Raises:
@@ -154,3 +179,85 @@ class OwnItems:
 
     def _word(self, offset: int) -> int:
         return int.from_bytes(os.pread(self._descriptor, 8, offset), "little")
+
+
+class OwnFiles:
+    """The items that this robot sends, where there are files of one user beside `own`: as `OwnItems`, of all of them.
+
+    What a user does to his file harms no item of another file: it is counted, and the others go.
+    """
+
+    def __init__(self, files: Sequence[OwnItems], dropped: Counter[str]) -> None:
+        self._files, self._dropped = files, dropped
+        self._of: dict[int, OwnItems] = {}
+        self.records: dict[int, Record] = {}
+        self.urgent: tuple[Record, ...] = ()
+
+    @contextlib.contextmanager
+    def _counted(self) -> Iterator[None]:
+        try:
+            yield
+        except (BoardError, OSError):
+            self._dropped[UNREADABLE] += 1
+
+    def look(self, now_ns: int) -> bool:
+        """Read the tables that have changed; whether there are other items now."""
+        changed = False
+        for one in self._files:
+            with self._counted():
+                changed = one.look(now_ns) or changed
+        if changed:
+            self._of = {number: one for one in reversed(self._files) for number in one.records}
+            self.records = {number: one.records[number] for number, one in self._of.items()}
+            self.urgent = tuple(record for record in self.records.values() if record.flags & URGENT)
+        return changed
+
+    def urgent_numbers(self) -> dict[int, int]:
+        """See `OwnItems.urgent_numbers`."""
+        found: dict[int, int] = {}
+        for one in self._files:
+            with self._counted():
+                found.update(one.urgent_numbers())
+        return found
+
+    def ask(self) -> None:
+        """See `OwnItems.ask`."""
+        for one in self._files:
+            with self._counted():
+                one.ask()
+
+    def newest(self, numbers: Sequence[int]) -> Newest:
+        """See `OwnItems.newest`; without those of a file that cannot be read."""
+        found: dict[int, tuple[Record, int]] = {}
+        for one in self._files:
+            with self._counted():
+                mine = [number for number in numbers if self._of[number] is one]
+                found.update(zip(mine, one.newest(mine) if mine else (), strict=True))
+        return [found[number] for number in numbers if number in found]
+
+    def read_ahead(self, newest: Newest) -> None:
+        """See `OwnItems.read_ahead`."""
+        for one in self._files:
+            with self._counted():
+                one.read_ahead([pair for pair in newest if self._of[pair[0].id] is one])
+
+    def get(self, record: Record, number: int) -> Found | None:
+        """See `OwnItems.get`."""
+        return self._of[record.id].get(record, number)
+
+
+def own_items(
+    files: Sequence[tuple[MappedFile, int | None]], owners: Owners | None, dropped: Counter[str]
+) -> OwnItems | OwnFiles:
+    """The items of `own`, the first file, and of files of one user, each with the uid of that one."""
+    if owners is None:
+        return OwnItems(files[0][0])
+    numbers = {owner.number for owner in owners.values()}
+
+    def believes(uid: int | None) -> Callable[[Record], bool]:
+        if uid is None:
+            return lambda record: record.name not in owners and record.id not in numbers
+        theirs = {(name, owner.number) for name, owner in owners.items() if owner.uid == uid}
+        return lambda record: (record.name, record.id) in theirs and not record.flags & ADDED
+
+    return OwnFiles([OwnItems(file, believes(uid)) for file, uid in files], dropped)

@@ -8,16 +8,10 @@ asks again when it has sent. A wake-up may be lost, so the loop compares the num
 from __future__ import annotations
 
 import logging
-import os
-from typing import Final
+from collections.abc import Sequence
 
-from agent.main_loop.own_items import OwnItems
 from agent.system.inotify import Touches
 from failover.boards.mapping import MappedFile
-from failover.core.board import layout
-
-WAITS_FOR_ANY: Final = b"\x01"
-ANY_FIELD: Final = layout.WAITERS_FIELD + 1
 
 log = logging.getLogger("failover.heart")
 
@@ -25,11 +19,10 @@ log = logging.getLogger("failover.heart")
 class UrgentItems:
     """Readable (`fileno`) when an urgent item was put."""
 
-    def __init__(self, file: MappedFile, items: OwnItems) -> None:
-        self._file, self._items = file, items
+    def __init__(self, files: Sequence[MappedFile]) -> None:
         self._touches: Touches | None = None
         try:
-            self._touches = Touches(file.descriptor)
+            self._touches = Touches(*[file.descriptor for file in files])
         except OSError as error:
             log.warning("urgent items go with the rounds only: %s", error)
 
@@ -41,15 +34,6 @@ class UrgentItems:
         """What was told is being seen to; nothing, if it has been already."""
         if self._touches is not None:
             self._touches.heed()
-
-    def ask(self) -> None:
-        """Have the writers tell of their next put.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
-        for record in self._items.urgent:
-            os.pwrite(self._file.descriptor, WAITS_FOR_ANY, record.at + ANY_FIELD)
 
     def close(self) -> None:
         """Give the descriptor back. A second call does nothing."""

@@ -18,16 +18,16 @@ IN_CLOEXEC: Final = os.O_CLOEXEC
 IN_NONBLOCK: Final = os.O_NONBLOCK
 
 EVENTS_SIZE: Final = 4 << 10
-"""Bytes: room for all events of one file that the kernel does not merge."""
+"""Bytes: room for all events of some files that the kernel does not merge; what is left over wakes once more."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Touches:
-    """Readable (`fileno`) since the times of a file were set, until `heed`."""
+    """Readable (`fileno`) since the times of one of some files were set, until `heed`."""
 
-    def __init__(self, file: int) -> None:
-        """Watch the file that this descriptor has open.
+    def __init__(self, *files: int) -> None:
+        """Watch the files that these descriptors have open.
 
         Raises:
             OSError: the user has too many such descriptors (fs.inotify.max_user_instances), or the kernel has none.
@@ -35,7 +35,8 @@ class Touches:
         self._descriptor = int(_libc.inotify_init1(IN_CLOEXEC | IN_NONBLOCK))
         check(self._descriptor, "inotify_init1")
         try:
-            check(_libc.inotify_add_watch(self._descriptor, b"/proc/self/fd/%d" % file, IN_ATTRIB), "inotify_add_watch")
+            for file in files:
+                check(_libc.inotify_add_watch(self._descriptor, b"/proc/self/fd/%d" % file, IN_ATTRIB), "inotify_add_watch")
         except OSError:
             self.close()
             raise

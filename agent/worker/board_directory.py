@@ -7,25 +7,33 @@ kernel's boot are others it is made anew; programs that have the old one open ar
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import grp
 import logging
 import os
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from msgspec.structs import replace
 
 from agent.config import Settings
 from agent.errors import AgentError
+from agent.system.permissions import NOBODY, uid_named
 from agent.worker import kept_items
 from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, directory
-from failover.boards.mapping import MappedFile
+from failover.boards.agents_file import AgentsFile
+from failover.boards.mapping import USER_PREFIX, MappedFile, uid_of
+from failover.boards.received import ReceivedItems
 from failover.boards.schedule_file import ScheduleFile
 from failover.core.board import layout
 from failover.core.board.announcements import first_number
 from failover.core.board.item_types import ITEM_SIZE_MAX
 from failover.core.board.items import ITEMS_MAX, Board, Item
+from failover.core.board.owners import Owner, encode
+from failover.core.frames.frame import Portion
 from failover.errors import BoardError, ScheduleError
 
 DIRECTORY_MODE: Final = 0o755
@@ -33,7 +41,10 @@ PROGRAMS_MODE: Final = 0o660
 PEERS_MODE: Final = 0o640
 
 PRIMARIES: Final = Item("primaries", "msgpack", size=ITEM_SIZE_MAX, shared=False)
-"""The one item of the agent's own file: which robot runs which component (`failover.boards.component_item`)."""
+"""In the agent's own file: which robot runs which component (`failover.boards.component_item`)."""
+OWNERS_NUMBER: Final = 1
+OWNERS: Final = Item("owners", size=ITEM_SIZE_MAX, shared=False)
+"""There too, if there are such items: whose the items are that one user alone may put (`failover.core.board.owners`)."""
 
 log = logging.getLogger("failover.lanes")
 
@@ -43,8 +54,11 @@ def place_of(settings: Settings) -> Path:
     return directory.agents_place(settings.team.team, settings.config.robot)
 
 
-def provide(settings: Settings) -> Path | None:
+def provide(settings: Settings, tell: Callable[[str], None] = log.warning) -> Path | None:
     """Have every file of the board at its place, and a link to it beside the control socket; None for a team without a board.
+
+    Args:
+        tell: is told of users whose items no program of this robot can put, in a sentence.
 
     Raises:
         AgentError, BoardError, OSError: it cannot be had.
@@ -61,16 +75,22 @@ def provide(settings: Settings) -> Path | None:
     ranks = settings.team.roster().ranks
     robots = [name for name in ranks if settings.team.robots[name].role == "robot"]
     files = _Files(place, board.digest, _group(board.group), ranks)
+    files.dismiss_unfit(directory.OWN_NAME, layout.OWN, me)  # first: until it is there again nobody opens what is in between
     for name in robots:
         if name != me:
             files.have(f"{directory.PEER_PREFIX}{name}", layout.PEER, name, board.shared_by(name))
     for path in place.glob(f"{directory.PEER_PREFIX}*"):
         if path.name.removeprefix(directory.PEER_PREFIX) not in set(robots) - {me}:
             directory.dismiss(path)
+    owned = board.owned_at(me)
+    files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES, OWNERS_NUMBER: OWNERS} if owned else {0: PRIMARIES})
+    files.have_owned(me, owned, tell)
     kept = _kept(Path(settings.config.state_directory), board, me)
-    files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, board.private_of(me), [one for one in kept if not one.shared])
-    files.have(directory.OWN_NAME, layout.OWN, me, board.shared_by(me), [one for one in kept if one.shared])
-    files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES})
+    private, own = (
+        {n: item for n, item in some.items() if not item.user} for some in (board.private_of(me), board.shared_by(me))
+    )
+    files.have(directory.PRIVATE_NAME, layout.PRIVATE, me, private, [one for one in kept if not one.shared])
+    files.have(directory.OWN_NAME, layout.OWN, me, own, [one for one in kept if one.shared])
     files.have_schedule(me)
     _point(link, place)
     _leave(Path(settings.config.runtime_directory) / SCHEDULE_PLACE)
@@ -103,6 +123,51 @@ class _Files:
         self._group = group
         self._ranks = ranks
 
+    def dismiss_unfit(self, name: str, area: int, robot: str) -> None:
+        """Unlink a file that is to be made anew."""
+        if not self._fits(self._place / name, area, robot):
+            directory.dismiss(self._place / name)
+
+    def have_owned(self, robot: str, items: Mapping[int, Item], tell: Callable[[str], None]) -> None:
+        """A file of each user who alone may put items, and none of former ones; and the table that says whose is what."""
+        uids = {item.user: uid_named(item.user) for item in items.values()}
+        of_uid: dict[int, dict[int, Item]] = {}
+        for number, item in items.items():
+            of_uid.setdefault(uids[item.user], {})[number] = item
+        lacking = of_uid.pop(NOBODY, {})
+        for user in sorted({item.user for item in lacking.values()}):
+            names = _names(item for item in lacking.values() if item.user == user)
+            tell(f"{robot} has no user {user!r}: no program here can put {names}; make the user, and restart the agent")
+        for path in self._place.glob(f"{USER_PREFIX}*"):
+            if uid_of(path) not in of_uid:
+                directory.dismiss(path)
+        for uid, theirs in of_uid.items():
+            try:
+                self._have_of_user(uid, robot, theirs)
+            except OSError as error:
+                if error.errno != errno.EOPNOTSUPP:
+                    raise
+                lacking |= theirs
+                tell(
+                    f"{self._place} takes no access control lists: no program here can put {_names(theirs.values())}; "
+                    "use a kernel with CONFIG_TMPFS_POSIX_ACL, or declare them without user"
+                )
+        owners = {one.name: Owner(n, one.user, None if n in lacking else uids[one.user]) for n, one in items.items()}
+        if items and AgentsFile(self._place).owners() != owners:
+            table = ReceivedItems.open(self._place / directory.AGENT_NAME)
+            table.take((Portion(OWNERS_NUMBER, 0, 1, encode(owners)),), boottime.machine_ns(), 0, 0)
+            table.file.close()
+
+    def _have_of_user(self, uid: int, robot: str, items: Mapping[int, Item]) -> None:
+        items = {number: replace(item, transmit=item.transmit and item.is_shared_by(robot)) for number, item in items.items()}
+        path = self._place / f"{USER_PREFIX}{uid}"
+        if self._fits(path, layout.OWN, robot, [layout.wanted_of(item, number) for number, item in items.items()]):
+            os.chown(path, -1, self._group)
+            directory.give_to(path, uid, PEERS_MODE)
+            return
+        directory.dismiss(path)
+        self._make(path, layout.OWN, robot, PEERS_MODE, user=uid, capacity=len(items))(items=items)
+
     def have(self, name: str, area: int, robot: str, items: Mapping[int, Item], kept: Sequence[Item] = ()) -> None:
         """Keep a file that fits; make it otherwise, with the items that were ``kept`` as far as they have room."""
         path = self._place / name
@@ -112,18 +177,9 @@ class _Files:
             path.chmod(mode)
             return
         directory.dismiss(path)
-        make = functools.partial(
-            directory.make_file,
-            path,
-            area,
-            robot,
-            rank=self._ranks[robot],
-            state=layout.NOT if area == layout.PEER else layout.RUN,
-            digest=self._digest,
-            mode=mode,
-            group=self._group,
-        )
+        make = self._make(path, area, robot, mode)
         first = first_number(self._ranks[robot])
+
         left_out: list[str] = []
         while True:
             added = kept[: len(kept) - len(left_out)]
@@ -137,6 +193,20 @@ class _Files:
                 break
         if left_out:
             log.warning("items that programs had added with keep = true are not added again: %s: %s", ", ".join(left_out), why)
+
+    def _make(self, path: Path, area: int, robot: str, mode: int, **more: Any) -> Callable[..., int]:
+        return functools.partial(
+            directory.make_file,
+            path,
+            area,
+            robot,
+            rank=self._ranks[robot],
+            state=layout.NOT if area == layout.PEER else layout.RUN,
+            digest=self._digest,
+            mode=mode,
+            group=self._group,
+            **more,
+        )
 
     def have_schedule(self, robot: str) -> None:
         """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""
@@ -152,18 +222,25 @@ class _Files:
         directory.dismiss(path)
         directory.make_schedule(self._place, robot, mode=PROGRAMS_MODE, group=self._group)
 
-    def _fits(self, path: Path, area: int, robot: str) -> bool:
+    def _fits(self, path: Path, area: int, robot: str, items: Sequence[layout.Wanted] | None = None) -> bool:
+        """Whether a file is as it is to be; ``items``: with these and no others."""
         try:
             file = MappedFile.open(path, writable=True)
-            live = len(file.records())
+            records = file.records()
         except (BoardError, FileNotFoundError):
             return False
         header = file.header
         file.close()
-        if area == layout.PEER and header.count - live > ITEMS_MAX // 2:
+        if area == layout.PEER and header.count - len(records) > ITEMS_MAX // 2:
             return False  # no room is left for what that robot adds
+        if items is not None and not (len(records) == len(items) and all(map(layout.is_exactly, records, items))):
+            return False
         found = (header.flags, header.roster_digest, header.boot_id, header.robot, header.rank)
         return found == (area, self._digest, boottime.boot_id(), robot, self._ranks[robot])
+
+
+def _names(items: Iterable[Item]) -> str:
+    return ", ".join(item.name for item in items)
 
 
 def _make_directory(place: Path) -> None:

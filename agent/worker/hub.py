@@ -110,6 +110,7 @@ class Switchboard:
         self._end: asyncio.Event = asyncio.Event()
         self._incompatible: dict[str, str] = {}
         self._own_troubles: list[str] = []
+        self._board_troubles: list[str] = []
         self._signs: dict[tuple[str, str], float] = {}
         keys = self._keys()
         if keys.present and keys.public not in settings.me.keys:
@@ -440,6 +441,7 @@ class Switchboard:
         """What is wrong with the lines, for the status."""
         return [
             *self._own_troubles,
+            *self._board_troubles,
             *self._incompatible.values(),
             *self.team_changes.notes(),
             *self._replication_link.troubles(),

@@ -162,16 +162,17 @@ class Worker(Switchboard):
             await self._provide_board()
 
     async def _provide_board(self) -> None:
+        self._board_troubles.clear()
         if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):
             self._provide_place_of_schedule()
             return
         from agent.worker import board_directory  # here: a team without a board does not load it
 
         try:
-            place = await asyncio.to_thread(board_directory.provide, self.settings)
+            place = await asyncio.to_thread(board_directory.provide, self.settings, self._board_troubles.append)
         except (AgentError, FailoverError, OSError) as error:
             log.warning("no board: %s", error)
-            self._own_troubles.append(f"programs here have no board of the team: {error}")
+            self._board_troubles.append(f"programs here have no board of the team: {error}")
         else:
             self._board_place = place
             if place is not None:
