@@ -115,13 +115,13 @@ static inline fb_item *fb_find(fb_board *board, const char *name, size_t size, u
 
 /* Read a robot's newest value. Returns its age in ns (at least); `age_max`, unless NULL, gets the most that it can be.
  * -ENODATA: never written. -EAGAIN: it was written 16 times meanwhile (give it more banks). -ENOENT: no such robot, or the robot has no such
- * item. */
+ * item. -EACCES: it is for a user whom this robot does not have. */
 static inline int64_t fb_get(fb_item *item, const char *robot, void *value, int64_t *age_max);
 
 /* The same; 0, and more about the value. */
 static inline int fb_get_reading(fb_item *item, const char *robot, void *value, fb_reading *reading);
 
-/* Put a value of this robot: 0. -EBUSY: another process writes this item. */
+/* Put a value of this robot: 0. -EBUSY: another process writes this item. -EACCES: team.toml names another user, who alone may put it. */
 static inline int fb_put(fb_item *item, const void *value);
 
 /* The same of a value that was measured at an instant: ns of CLOCK_BOOTTIME, as this process reads that clock. */
@@ -911,18 +911,24 @@ static inline void fb_give_up_(fb_board *board)
     board->own = NULL;
 }
 
-/* Forget the files of other robots that were removed or made anew, and all places in them; this robot's stay as they are. Whether there
- * was one. The guard is held. */
-static inline bool fb_forget_peers_(fb_board *board)
+/* Forget the files of other robots, and of one user, that were removed or made anew, and all places in them; the others stay as they are.
+ * Whether there was one. The guard is held. */
+static inline bool fb_forget_gone_(fb_board *board)
 {
     bool is_one = false;
     for (fb_area_ **link = &board->areas; *link != NULL;) {
         fb_area_ *area = *link;
-        if (!area->is_peer || fb_is_there_(area)) {
+        if ((!area->is_peer && !area->always_wakes) || fb_is_there_(area)) {
             link = &area->next;
             continue;
         }
-        for (fb_item *item = board->items; item != NULL; item = item->next)
+        for (fb_item *item = board->items; item != NULL; item = item->next) {
+            if (item->own != NULL && item->own->area == area) {
+                fb_place_ *own = __atomic_exchange_n(&item->own, NULL, __ATOMIC_ACQ_REL);
+                own->has_lock = false;
+                own->older = board->given_up;
+                board->given_up = own;
+            }
             for (fb_place_ **at = &item->peers; *at != NULL;) {
                 fb_place_ *place = *at;
                 if (place->area != area) {
@@ -933,6 +939,7 @@ static inline bool fb_forget_peers_(fb_board *board)
                 place->older = board->given_up;
                 board->given_up = place;
             }
+        }
         fb_leave_(board, link);
         is_one = true;
     }
@@ -1181,6 +1188,102 @@ static inline int fb_ensure_(fb_board *board)
     return 0;
 }
 
+/* --- Items of one user ------------------------------------------------------------------------------------------------------------------
+ *
+ * BOARD.md, "Files of one user": the agent's table says whose items are whose; what a file says otherwise of itself is not believed. */
+
+typedef struct fb_owner_ {
+    char name[FB_NAME_MAX_ + 1], user[FB_NAME_MAX_ + 2], file[24]; /* `file`: "" where no program of this robot can put it */
+} fb_owner_;
+
+static inline fb_area_ *fb_peer_(fb_board *board, const char *robot);
+static inline void fb_lies_(fb_place_ *place, fb_area_ *area, uint32_t index, const fb_record_ *record, uint64_t skew);
+static inline int fb_copy_(const char *name, const fb_place_ *place, void *value, fb_reading *reading, uint64_t *stamp, uint32_t *error_us);
+
+/* Find an item in a table, by its name, or, where that is NULL, by its number: 1, 0 or -EBADMSG. */
+static inline int fb_owner_in_(char *table, const char *name, uint32_t id, fb_owner_ *owner)
+{
+    const size_t size = name == NULL ? 0 : strlen(name);
+    for (char *line = table, *end = strchr(line, '\n'); end != NULL; line = end + 1, end = strchr(line, '\n')) {
+        char uid[12];
+        unsigned number;
+        *end = '\0';
+        if (name != NULL && (strncmp(line, name, size) != 0 || line[size] != ' '))
+            continue;
+        if (sscanf(line, "%63s %u %11s %64s", owner->name, &number, uid, owner->user) != 4)
+            return fb_fail_(EBADMSG, "damaged: the agent's table of items of one user");
+        snprintf(owner->file, sizeof owner->file, "%s%s", *uid == '-' ? "" : "own+", *uid == '-' ? "" : uid);
+        if (name != NULL || number == id)
+            return 1;
+    }
+    return 0;
+}
+
+/* Whose an item is: 1, one user's alone; 0, nobody's; -ENODATA: the agent tells nothing of that; another error. The guard is held. */
+static inline int fb_whose_(fb_board *board, const char *name, uint32_t id, fb_owner_ *owner)
+{
+    fb_area_ *area;
+    fb_record_ record;
+    fb_reading reading;
+    fb_place_ place;
+    uint64_t stamp;
+    uint32_t error_us;
+    char *table;
+    int index;
+    if ((board->own->flags & FB_ALONE_) != 0)
+        return -ENODATA;
+    area = fb_peer_(board, FB_AGENT_);
+    if (area == NULL)
+        return errno == ENOENT ? -ENODATA : -errno;
+    index = fb_search_(area, "owners", 0, &record);
+    if (index < 0)
+        return index == -ENOENT ? -ENODATA : index;
+    table = (char *)calloc(1, (size_t)record.size + 1);
+    if (table == NULL)
+        return fb_fail_(ENOMEM, "cannot look an item up: no memory");
+    fb_lies_(&place, area, (uint32_t)index, &record, 0);
+    index = fb_copy_("owners", &place, table, &reading, &stamp, &error_us);
+    index = index == 0 ? fb_owner_in_(table, name, id, owner) : index;
+    free(table);
+    return index;
+}
+
+/* Whether an item may stand in one of this robot's files: 1, 0 or an error. */
+static inline int fb_is_rightful_(fb_board *board, const fb_area_ *area, const char *name)
+{
+    fb_owner_ owner;
+    const int whose = fb_whose_(board, name, 0, &owner);
+    if (whose < 0)
+        return whose == -ENODATA ? 1 : whose;
+    return whose == 0 ? !area->always_wakes : strcmp(area->name, owner.file) == 0;
+}
+
+/* Find this robot's item, by its name, or, where that is NULL, by its number, in the files where it may stand. Index, -ENOENT, or another
+ * error. The guard is held. */
+static inline int fb_search_own_(fb_board *board, const char *name, uint32_t id, fb_record_ *record, fb_area_ **found)
+{
+    fb_owner_ owner;
+    const int whose = fb_whose_(board, name, id, &owner);
+    int index = -ENOENT;
+    bool is_open = false;
+    if (whose < 0 && whose != -ENODATA)
+        return whose;
+    if (whose > 0 && *owner.file == '\0')
+        return fb_fail_(EACCES, "item %s is for user %s alone, and no program of %s can put it: failover status says why", owner.name,
+                        owner.user, board->own->robot);
+    for (fb_area_ *area = board->areas; whose > 0 && area != NULL; area = area->next)
+        is_open = is_open || strcmp(area->name, owner.file) == 0;
+    if (whose > 0 && !is_open && fb_mapped_(board, owner.file, -1) == NULL)
+        return -errno;
+    for (fb_area_ *area = board->areas; index == -ENOENT && area != NULL; area = area->next) {
+        if (area->is_peer || (whose > 0 ? strcmp(area->name, owner.file) != 0 : whose == 0 && area->always_wakes))
+            continue;
+        index = fb_search_(area, whose > 0 ? owner.name : name, id, record);
+        *found = area;
+    }
+    return index;
+}
+
 /* --- Adding items ---------------------------------------------------------------------------------------------------------------------- */
 
 /* Begin to change a table: its lock is held, its generation is odd. */
@@ -1254,7 +1357,7 @@ static inline int fb_append_(fb_area_ *area, const fb_record_ *wanted, const cha
 static inline int fb_add_again_(fb_board *board, const fb_declaration *wanted)
 {
     const char *text = wanted->type;
-    fb_area_ *target = board->own;
+    fb_area_ *target = board->own, *where = NULL;
     fb_record_ record, found;
     int outcome;
     memset(&record, 0, sizeof record);
@@ -1276,15 +1379,12 @@ static inline int fb_add_again_(fb_board *board, const fb_declaration *wanted)
     outcome = fb_begin_change_(board, target);
     if (outcome != 0)
         return outcome;
-    outcome = -ENOENT;
-    for (fb_area_ *area = board->areas; outcome == -ENOENT && area != NULL; area = area->next) {
-        outcome = area->is_peer ? -ENOENT : fb_search_(area, wanted->name, 0, &found);
-        if (outcome >= 0 && (area != target || found.kind != record.kind || found.banks != record.banks || found.size != record.size ||
-                             found.period != record.period || found.phase != record.phase || found.bound != record.bound ||
-                             found.digest != record.digest))
-            outcome = fb_fail_(EEXIST, "cannot add item %s: it is declared otherwise already in %s (%u bytes, period %u, banks %u)",
-                               wanted->name, area->name, found.size, found.period, found.banks);
-    }
+    outcome = fb_search_own_(board, wanted->name, 0, &found, &where);
+    if (outcome >= 0 && ((where != target && !where->always_wakes) || found.kind != record.kind || found.banks != record.banks ||
+                         found.size != record.size || found.period != record.period || found.phase != record.phase ||
+                         found.bound != record.bound || found.digest != record.digest))
+        outcome = fb_fail_(EEXIST, "cannot add item %s: it is declared otherwise already in %s (%u bytes, period %u, banks %u)", wanted->name,
+                           where->name, found.size, found.period, found.banks);
     outcome = outcome == -ENOENT ? fb_append_(target, &record, wanted->name, text) : outcome < 0 ? outcome : 0;
     fb_end_change_(target);
     return outcome;
@@ -1324,6 +1424,8 @@ static inline int fb_add(fb_board *board, const fb_declaration *wanted)
     pthread_mutex_lock(&board->guard);
     outcome = -ESTALE;
     for (int turn = 0; outcome == -ESTALE && turn < FB_TURNS_; turn++) {
+        if (turn > 0)
+            fb_forget_gone_(board);
         outcome = fb_ensure_(board);
         outcome = outcome == 0 ? fb_add_again_(board, &added->wanted) : outcome;
     }
@@ -1347,11 +1449,11 @@ static inline int fb_remove(fb_board *board, const char *name)
     for (int turn = 0; outcome == -ESTALE && turn < FB_TURNS_; turn++) {
         fb_area_ *found = NULL;
         int index = -ENOENT;
+        if (turn > 0)
+            fb_forget_gone_(board);
         outcome = fb_ensure_(board);
-        for (fb_area_ *area = board->areas; outcome == 0 && index == -ENOENT && area != NULL; area = area->next) {
-            index = area->is_peer ? -ENOENT : fb_search_(area, name, 0, &record);
-            found = index >= 0 ? area : found;
-        }
+        if (outcome == 0)
+            index = fb_search_own_(board, name, 0, &record, &found);
         if (outcome == 0 && index == -ENOENT)
             outcome = fb_fail_(ENOENT, "cannot remove item %s: this robot has none on the board %.300s", name, board->directory);
         else if (outcome == 0 && index < 0)
@@ -1457,10 +1559,7 @@ static inline int fb_bind_(fb_item *item, const char *robot)
     fb_place_ *place;
     int index = -ENOENT;
     if (is_own) {
-        for (fb_area_ *area = board->areas; index == -ENOENT && area != NULL; area = area->next) {
-            index = area->is_peer ? -ENOENT : fb_search_(area, item->name, 0, &record);
-            found = index >= 0 ? area : found;
-        }
+        index = fb_search_own_(board, item->name, 0, &record, &found);
     } else {
         found = fb_peer_(board, robot);
         if (found == NULL)
@@ -1515,8 +1614,12 @@ static inline int fb_take_item_(fb_item *item, fb_place_ *place)
 {
     uint64_t newest, begin = fb_epoch_() << FB_EPOCH_BITS_;
     uint32_t pid = (uint32_t)getpid();
+    fb_owner_ owner;
     if (!place->is_own)
         return fb_fail_(EPERM, "item %s of %s is another robot's: it can only be read here", item->name, place->robot);
+    if (!place->area->is_writable && place->area->always_wakes && fb_whose_(item->board, item->name, 0, &owner) == 1)
+        return fb_fail_(EACCES, "item %s cannot be put: user %s (uid %s) alone may put it, and this program runs as uid %u", item->name,
+                        owner.user, place->area->name + 4, (unsigned)geteuid());
     if (!place->area->is_writable)
         return fb_fail_(EACCES, "item %s may only be read by uid %u", item->name, (unsigned)geteuid());
     if (!fb_take_(place->area->file, FB_WRITER_LOCKS_ + place->index))
@@ -1545,7 +1648,7 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
             place = fb_known_(item, robot);
         }
         if (failed == -ESTALE && ++lost < 3) { /* made anew since it was opened; or that file alone is gone, and stays so */
-            if (!fb_forget_peers_(board))
+            if (!fb_forget_gone_(board))
                 fb_give_up_(board);
             continue;
         }
@@ -1555,7 +1658,7 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
         }
         const uint64_t generation = fb_load_(place->generation);
         if (fb_is_lost_(generation)) {
-            if (!fb_forget_peers_(board))
+            if (!fb_forget_gone_(board))
                 fb_give_up_(board);
             continue;
         }
@@ -1832,7 +1935,7 @@ static inline int fb_open_all_(fb_board *board)
     DIR *folder;
     if (outcome != 0)
         return outcome;
-    fb_forget_peers_(board); /* those that were made anew are opened again */
+    fb_forget_gone_(board); /* those that were made anew are opened again */
     folder = opendir(board->directory);
     for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder))
         if (strncmp(entry->d_name, "peer-", 5) == 0)
@@ -1910,7 +2013,11 @@ static inline fb_taken_ **fb_taken_of_(fb_board *board, fb_area_ *area, fb_taken
         memcpy(taken->name, name, size);
         snprintf(taken->robot, sizeof taken->robot, "%.64s", area->robot);
         fb_lies_(&taken->place, area, index, &record, (uint64_t)board->skew);
-        *outcome = fb_copy_(taken->name, &taken->place, taken + 1, &taken->reading, &taken->stamp, &taken->error_us);
+        *outcome = area->is_peer ? 1 : fb_is_rightful_(board, area, taken->name);
+        if (*outcome > 0)
+            *outcome = fb_copy_(taken->name, &taken->place, taken + 1, &taken->reading, &taken->stamp, &taken->error_us);
+        else if (*outcome == 0)
+            *outcome = -ENODATA;
         if (*outcome != 0) {
             free(taken);
             *outcome = *outcome == -ENODATA ? 0 : *outcome;
@@ -2314,8 +2421,9 @@ static inline fb_item *fb_find(fb_board *board, const char *name, size_t size, u
     pthread_mutex_lock(&board->guard);
     outcome = fb_ensure_(board);
     outcome = outcome == 0 ? fb_bind_(item, NULL) : outcome;
-    if (outcome == -ENOENT) { /* other robots may have it */
+    if (outcome == -ENOENT || outcome == -EACCES) { /* other robots may have it */
         char sentence[sizeof fb_sentence_];
+        outcome = -ENOENT;
         DIR *folder = opendir(board->directory);
         memcpy(sentence, fb_sentence_, sizeof sentence);
         for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); outcome == -ENOENT && entry != NULL; entry = readdir(folder))

@@ -77,23 +77,26 @@ static inline void DB_free(void)
 static inline int fb_db_look_(fb_board *board, int id, char *name, size_t *size)
 {
     DIR *folder = opendir(board->directory);
-    int index = -ENOENT;
+    fb_area_ *found = NULL;
     fb_record_ record;
+    int index;
     for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder))
         if (strncmp(entry->d_name, "peer-", 5) == 0)
             fb_peer_(board, entry->d_name + 5);
     if (folder != NULL)
         closedir(folder);
-    for (int turn = 0; turn < 2; turn++)
-        for (fb_area_ *area = board->areas; index < 0 && area != NULL; area = area->next) {
-            index = area->is_peer == (turn == 1) ? fb_search_(area, NULL, (uint32_t)id, &record) : -ENOENT;
-            if (index >= 0) {
-                const uint32_t length = area->map[record.name] | (uint32_t)area->map[record.name + 1] << 8;
-                memset(name, 0, FB_NAME_MAX_ + 1);
-                memcpy(name, area->map + record.name + 2, length < FB_NAME_MAX_ ? length : (uint32_t)FB_NAME_MAX_);
-                *size = record.size;
-            }
-        }
+    fb_forget_gone_(board);
+    index = fb_search_own_(board, NULL, (uint32_t)id, &record, &found);
+    for (fb_area_ *area = board->areas; index < 0 && area != NULL; area = area->next) {
+        index = area->is_peer && strcmp(area->name, "agent") != 0 ? fb_search_(area, NULL, (uint32_t)id, &record) : -ENOENT;
+        found = area;
+    }
+    if (index >= 0) {
+        const uint32_t length = found->map[record.name] | (uint32_t)found->map[record.name + 1] << 8;
+        memset(name, 0, FB_NAME_MAX_ + 1);
+        memcpy(name, found->map + record.name + 2, length < FB_NAME_MAX_ ? length : (uint32_t)FB_NAME_MAX_);
+        *size = record.size;
+    }
     return index >= 0 ? 0 : fb_fail_(ENOENT, "the board %.300s has no item of number %d", board->directory, id);
 }
 
