@@ -53,6 +53,12 @@ def test_the_schedule_of_a_robot_without_a_board_is_known_by_its_path() -> None:
     assert not boards.is_board(os.getpid(), f"{nowhere}/failover-schedule/own", (0, 0))
 
 
+@pytest.mark.parametrize("name", ["own", "private", "own+1000", "peer-robot2", "guest-world.robot3", "agent", "schedule"])
+def test_each_file_of_a_board_is_known_by_its_name_and_no_other_beside_them(name: str) -> None:
+    assert boards.is_board(os.getpid(), f"{boards.PLACE}0123-robot1/{name}", (0, 0))
+    assert not boards.is_board(os.getpid(), f"{boards.PLACE}0123-robot1/x{name}", (0, 0))
+
+
 def made(directory: Path) -> Path:
     """A directory with files of a board, as far as a capture looks at them."""
     directory.mkdir()
