@@ -54,14 +54,14 @@ user = "{MAPPER}"
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs other users")
 
 
-def as_user(uid: int, act: Callable[[], object]) -> None:
+def as_user(uid: int, act: Callable[[], object], group: str = GROUP) -> None:
     """Do that in a process of another user, a member of the board's group; what goes wrong there goes wrong here."""
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
         status = 1
         try:
-            os.setgroups([grp.getgrnam(GROUP).gr_gid])
+            os.setgroups([grp.getgrnam(group).gr_gid])
             os.setgid(65534)
             os.setuid(uid)
             act()
