@@ -23,6 +23,7 @@ from failover.boards import directory
 from failover.boards.agents_file import AgentsFile
 from failover.boards.board import Board
 from failover.boards.mapping import MappedFile
+from failover.cli.main import main
 from failover.core.board import layout
 from failover.core.board.items import Item
 from failover.core.board.layout import wanted_of
@@ -131,6 +132,23 @@ def test_its_user_puts_an_item_all_get_it_and_the_kernel_refuses_the_put_of_othe
 
     as_user(OTHER, another)
     assert number_of(place) == 7
+
+
+@needs_root
+def test_a_put_by_hand_as_another_user_is_one_sentence_that_names_the_user(
+    place: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    as_user(UID, lambda: put(place, "map", {"n": 7}))
+    assert main(["board", "get", "map", "--board", str(place)]) == 0  # loads what another user need not find the way to
+    capfd.readouterr()
+    as_user(OTHER, lambda: _equal(main(["board", "put", "map", '{"n": 8}', "--board", str(place)]), 1))
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1
+    assert f"item 'map' cannot be put: user '{MAPPER}' (uid {UID}) alone may put it, and this program runs as uid {OTHER}" in said
+    as_user(OTHER, lambda: _equal(main(["board", "get", "map", "--board", str(place)]), 0))
+    assert '"n": 7' in capfd.readouterr().out
+    as_user(UID, lambda: _equal(main(["board", "put", "map", '{"n": 9}', "--board", str(place)]), 0))
+    assert number_of(place) == 9
 
 
 @needs_root
