@@ -11,6 +11,8 @@ import mmap
 import os
 import pwd
 import struct
+import subprocess
+import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -98,6 +100,33 @@ def place(folder: Path, found: None) -> Path:
     made = board_directory.provide(loaded(folder, OWNED))
     assert made is not None
     return made
+
+
+WITHOUT_CAPABILITIES = ("setpriv", "--bounding-set=-all", "--inh-caps=-all", sys.executable, "-c")
+PROVIDE = """
+import sys
+from pathlib import Path
+from agent import config
+from agent.worker import board_directory
+assert "CapEff:\\t0000000000000000" in Path("/proc/self/status").read_text()
+board_directory.provide(config.load(Path(sys.argv[1])), print)
+"""
+
+
+@needs_root
+def test_an_agent_without_any_capability_makes_and_adopts_the_files(folder: Path, found: None) -> None:
+    """As under systemd: root's files are all that it has."""
+    loaded(folder, OWNED.replace(f'group = "{GROUP}"', ""))
+    place = board_directory.place_of(loaded(folder))
+    made = []
+    for _ in range(2):
+        ran = subprocess.run([*WITHOUT_CAPABILITIES, PROVIDE, folder / "agent.toml"], capture_output=True, text=True, check=False)
+        assert (ran.returncode, ran.stdout) == (0, ""), ran.stdout + ran.stderr
+        made.append((place / f"own+{UID}").stat().st_ino)
+    assert made[0] == made[1] and (place / f"own+{UID}").stat().st_uid == 0
+    root = grp.getgrgid(os.getegid()).gr_name
+    as_user(UID, lambda: put(place, "map", {"n": 7}), root)
+    as_user(OTHER, lambda: _equal((number_of(place), "alone may put it" in refused(place, "map", {"n": 8})), (7, True)), root)
 
 
 @needs_root
