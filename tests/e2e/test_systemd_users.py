@@ -62,6 +62,17 @@ on_degraded = ["/bin/sh", "-c", "cat >>/var/alice/alerts"]
 """
 
 
+BOARD = """
+[board]
+group = "failover"
+[board.items.map]
+type = "u8"
+user = "alice"
+[board.items.ball]
+type = "u8"
+"""
+
+
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A robot with two people on it."""
@@ -71,6 +82,8 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
         booted.run("install", "-d", "-m755", "-oalice", "/var/alice")  # not sticky: there the kernel itself refuses to follow
         with (booted.root / "etc/failover/agent.toml").open("a") as settings:
             settings.write(ALERTS)
+        with (booted.root / "etc/failover/team/team.toml").open("a") as members:
+            members.write(BOARD)
         booted.run("systemctl", "start", SERVICE)
         yield booted
 
@@ -123,6 +136,17 @@ def test_a_program_inherits_what_it_would_in_the_shell_of_whoever_asked(machine:
     _, seen = as_user(machine, user, f"cd /var; {ODD}; {portrait.replace('python3', 'failover run -- python3')}")
     assert re.sub(OURS, "", seen, count=1) == expected
     assert "345" in seen and "'COLOUR', 'green'" in seen  # the script did set things up
+
+
+def test_the_agent_gives_an_item_to_one_user_without_any_capability_and_another_members_put_is_refused(machine: Machine) -> None:
+    assert as_user(machine, "alice", "failover board put map 7")[0] == 0
+    status, said = as_user(machine, "bob", "failover board put map 8")
+    assert (status, "user 'alice' (uid 7001) alone may put it, and this program runs as uid 7002" in said) == (1, True), said
+    assert as_user(machine, "bob", "failover board put ball 8")[0] == 0
+    status, said = as_user(machine, "bob", "failover board get map --json")
+    assert (status, json.loads(said)["value"]) == (0, 7), said
+    assert as_user(machine, "bob", ": <>/run/failover/board/own+7001")[0] != 0
+    assert as_user(machine, "alice", ": <>/run/failover/board/own+7001")[0] == 0
 
 
 def test_root_may_have_a_program_run_as_somebody_else(machine: Machine) -> None:
