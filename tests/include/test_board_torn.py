@@ -36,10 +36,11 @@ import sys
 from failover.boards.board import board
 with board() as opened:
     item, size, number = opened.item(sys.argv[1]), int(sys.argv[2]), 0
-    print("ready", flush=True)
     while True:
         number += 1
         item.put((number.to_bytes(8, "little") * (size // 8 + 1))[:size])
+        if number == 1:
+            print("ready", flush=True)
 """
 
 
