@@ -28,7 +28,7 @@ from failover.core.board.announcements import DECLARATION_SIZE_MAX, told
 from failover.core.board.banks import Place, Reading, get_carefully
 from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
-from failover.core.board.owners import Owner
+from failover.core.board.owners import Owner, Owners
 from failover.core.naming import worlds
 from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
 
@@ -62,6 +62,7 @@ class _Opened:
         self.files = [self.own]
         self.peers: dict[str, MappedFile] = {}
         self._agents = AgentsFile(self.directory)
+        self._owners: Owners | None = None
         try:
             self._open_others()
         except BaseException:
@@ -100,18 +101,32 @@ class _Opened:
         owner = self.owner(name)
         if owner is None:
             return self.files if self.own.owners is None else [file for file in self.files if uid_of(file.path) is None]
-        path = self.directory / f"{USER_PREFIX}{owner.uid}"
-        found = [file for file in self.files if file.path == path]
-        if not found and owner.uid is not None:
-            with contextlib.suppress(FileNotFoundError):
-                found = [self._open(path)]
-        return found
+        return [] if owner.uid is None else [self._of_user(owner.uid)]
 
-    def forget_gone(self) -> None:
-        """Close files of one user that the agent has removed or made anew while it kept the others."""
-        for file in [file for file in self.files[1:] if file.is_gone]:
+    def _of_user(self, uid: int) -> MappedFile:
+        path = self.directory / f"{USER_PREFIX}{uid}"
+        try:
+            return next((file for file in self.files if file.path == path), None) or self._open(path)
+        except FileNotFoundError:
+            raise BoardError(f"{path} is not there: the agent makes it when it starts") from None
+
+    def renew(self) -> None:
+        """Close files of one user that the agent has removed, open those that it has made, while it kept the others."""
+        gone = [file for file in self.files[1:] if file.is_gone]
+        for file in gone:
             self.files.remove(file)
             file.close()
+        try:
+            owners = self.own.owners() if self.own.owners is not None else None
+        except BoardError:  # the next look-up says why
+            return
+        if gone or owners is not self._owners:
+            self._owners = owners
+            for uid in {owner.uid for owner in (owners or {}).values() if owner.uid is not None}:
+                try:
+                    self._of_user(uid)
+                except BoardError:  # at the next call again
+                    self._owners = None
 
     def peer(self, robot: str) -> MappedFile:
         """Another robot's file, or a guest's.
@@ -500,7 +515,7 @@ class Board:
                 for declaration in list(self._added.values()):
                     with contextlib.suppress(BoardError):  # the next use of the item says why
                         self.add(declaration)
-            opened.forget_gone()
+            opened.renew()
             return opened
 
     def _forget(self) -> None:

@@ -321,7 +321,9 @@ def test_a_user_who_is_made_later_has_the_item_after_the_next_start_and_programs
         with pytest.raises(failover.BoardError, match="failover status says why"):
             item.put(b"a")
         board_directory.provide(loaded(folder))
+        assert sorted(board.names()) == ["ball", "map", "notes"]
         item.put(b"b")
+        assert board.snapshot()["robot1"]["map"].value == b"b"
         assert (item.get().value, ball.get().number) == (b"b", 1)
         monkeypatch.setattr(board_directory, "uid_named", lambda _: 7001)  # and then another number
         board_directory.provide(loaded(folder))
