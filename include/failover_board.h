@@ -1258,6 +1258,15 @@ static inline int fb_is_rightful_(fb_board *board, const fb_area_ *area, const c
     return whose == 0 ? !area->always_wakes : strcmp(area->name, owner.file) == 0;
 }
 
+/* The file of one user, opened if it is not open; NULL, with errno, where there is none. */
+static inline fb_area_ *fb_of_user_(fb_board *board, const char *file)
+{
+    for (fb_area_ *area = board->areas; area != NULL; area = area->next)
+        if (strcmp(area->name, file) == 0)
+            return area;
+    return fb_mapped_(board, file, -1);
+}
+
 /* Find this robot's item, by its name, or, where that is NULL, by its number, in the files where it may stand. Index, -ENOENT, or another
  * error. The guard is held. */
 static inline int fb_search_own_(fb_board *board, const char *name, uint32_t id, fb_record_ *record, fb_area_ **found)
@@ -1265,20 +1274,17 @@ static inline int fb_search_own_(fb_board *board, const char *name, uint32_t id,
     fb_owner_ owner;
     const int whose = fb_whose_(board, name, id, &owner);
     int index = -ENOENT;
-    bool is_open = false;
     if (whose < 0 && whose != -ENODATA)
         return whose;
     if (whose > 0 && *owner.file == '\0')
         return fb_fail_(EACCES, "item %s is for user %s alone, and no program of %s can put it: failover status says why", owner.name,
                         owner.user, board->own->robot);
-    for (fb_area_ *area = board->areas; whose > 0 && area != NULL; area = area->next)
-        is_open = is_open || strcmp(area->name, owner.file) == 0;
-    if (whose > 0 && !is_open && fb_mapped_(board, owner.file, -1) == NULL)
-        return -errno;
+    if (whose > 0) {
+        *found = fb_of_user_(board, owner.file);
+        return *found == NULL ? -errno : fb_search_(*found, owner.name, 0, record);
+    }
     for (fb_area_ *area = board->areas; index == -ENOENT && area != NULL; area = area->next) {
-        if (area->is_peer || (whose > 0 ? strcmp(area->name, owner.file) != 0 : whose == 0 && area->always_wakes))
-            continue;
-        index = fb_search_(area, whose > 0 ? owner.name : name, id, record);
+        index = area->is_peer || (whose == 0 && area->always_wakes) ? -ENOENT : fb_search_(area, name, id, record);
         *found = area;
     }
     return index;
@@ -1940,6 +1946,8 @@ static inline int fb_open_all_(fb_board *board)
     for (struct dirent *entry = folder == NULL ? NULL : readdir(folder); entry != NULL; entry = readdir(folder))
         if (strncmp(entry->d_name, "peer-", 5) == 0)
             fb_peer_(board, entry->d_name + 5); /* one that is gone meanwhile is none */
+        else if (strncmp(entry->d_name, "own+", 4) == 0)
+            fb_of_user_(board, entry->d_name);
     if (folder != NULL)
         closedir(folder);
     return 0;

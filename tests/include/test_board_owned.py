@@ -129,7 +129,10 @@ def test_c_goes_on_where_its_user_gets_the_item_later(folder: Path, place: Path,
         c.ok("put", "plan", "before")
         monkeypatch.setattr(board_directory, "uid_named", {MAPPER: OTHER_UID, OTHER: UID, "no-such-user": OTHER_UID}.get)
         board_directory.provide(loaded(folder))
+        words = {word.partition("=")[0] for word in c.say("snapshot").split(" ") if word}
+        assert words == {"robot1/ball"}
         c.ok("put", "map", "mine")
+        assert {word.partition("=")[0] for word in c.say("snapshot").split(" ") if word} == {"robot1/ball", "robot1/map"}
         assert "alone may put it" in c.say("put", "plan", "x")
         c.ok("find", "way", 8)
         c.ok("put", "way", "now")
