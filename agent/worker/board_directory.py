@@ -75,7 +75,6 @@ def provide(settings: Settings, tell: Callable[[str], None] = log.warning) -> Pa
     ranks = settings.team.roster().ranks
     robots = [name for name in ranks if settings.team.robots[name].role == "robot"]
     files = _Files(place, board.digest, _group(board.group), ranks)
-    files.dismiss_unfit(directory.OWN_NAME, layout.OWN, me)  # first: until it is there again nobody opens what is in between
     for name in robots:
         if name != me:
             files.have(f"{directory.PEER_PREFIX}{name}", layout.PEER, name, board.shared_by(name))
@@ -83,6 +82,7 @@ def provide(settings: Settings, tell: Callable[[str], None] = log.warning) -> Pa
         if path.name.removeprefix(directory.PEER_PREFIX) not in set(robots) - {me}:
             directory.dismiss(path)
     owned = board.owned_at(me)
+    files.dismiss_unfit(directory.OWN_NAME, layout.OWN, me)  # until it is there again no program sees a part of what follows
     files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES, OWNERS_NUMBER: OWNERS} if owned else {0: PRIMARIES})
     files.have_owned(me, owned, tell)
     kept = _kept(Path(settings.config.state_directory), board, me)
