@@ -42,6 +42,8 @@ PEERS_MODE: Final = 0o640
 
 PRIMARIES: Final = Item("primaries", "msgpack", size=ITEM_SIZE_MAX, shared=False)
 """In the agent's own file: which robot runs which component (`failover.boards.component_item`)."""
+NO_LIST: Final = (errno.EOPNOTSUPP, errno.EINVAL)
+"""The kernel has no access control lists on tmpfs; this agent's user namespace has no such uid."""
 OWNERS_NUMBER: Final = 1
 OWNERS: Final = Item("owners", size=ITEM_SIZE_MAX, shared=False)
 """There too, if there are such items: whose the items are that one user alone may put (`failover.core.board.owners`)."""
@@ -145,12 +147,13 @@ class _Files:
             try:
                 self._have_of_user(uid, robot, theirs)
             except OSError as error:
-                if error.errno != errno.EOPNOTSUPP:
+                if error.errno not in NO_LIST:
                     raise
                 lacking |= theirs
                 tell(
-                    f"{self._place} takes no access control lists: no program here can put {_names(theirs.values())}; "
-                    "use a kernel with CONFIG_TMPFS_POSIX_ACL, or declare them without user"
+                    f"{self._place} takes no access control list with uid {uid} ({error.strerror}): no program here can put "
+                    f"{_names(theirs.values())}; use a kernel with CONFIG_TMPFS_POSIX_ACL and a user namespace that has "
+                    "this uid, or declare them without user"
                 )
         owners = {one.name: Owner(n, one.user, None if n in lacking else uids[one.user]) for n, one in items.items()}
         if items and AgentsFile(self._place).owners() != owners:

@@ -1,4 +1,4 @@
-"""What the agent tells the programs of its robot in a file that it alone writes: where components run, who may put which item."""
+"""What the agent tells the programs of its robot in a file of its own: where components run, who may put which item."""
 
 from __future__ import annotations
 

@@ -306,12 +306,12 @@ class Board:
             found = self._where(opened, name) or self._elsewhere(opened, name)
             if user not in ("", owner.user) or (found is not None and not is_alike(found[1], wanted_of(declaration, 0))):
                 raise BoardError(
-                    f"cannot add item {name!r}: team.toml declares it otherwise, for user {owner.user!r} alone; take it as it is"
+                    f"cannot add item {name!r}: team.toml declares it otherwise, for user {owner.user!r} alone; take it so"
                 )
         elif user and not (opened.own.header.flags & layout.ALONE and is_this_user(user)):
             raise BoardError(
-                f"cannot add item {name!r} for user {user!r} alone: an item of one user is declared in team.toml, and without an "
-                f"agent the board is that of its user, here uid {os.geteuid()}; declare it there, or leave user out"
+                f"cannot add item {name!r} for user {user!r} alone: an item of one user is declared in team.toml, and without "
+                f"an agent the board is that of its user, here uid {os.geteuid()}; declare it there, or leave user out"
             )
 
     def remove(self, name: str) -> None:
@@ -558,9 +558,7 @@ class Board:
     def _unknown(self, name: str, robot: str) -> str:
         owner = self.ensured().owner(name)
         if owner is not None and robot == self.ensured().robot:
-            return (
-                f"item {name!r} is for user {owner.user!r} alone, and no program of {robot} can put it: failover status says why"
-            )
+            return f"item {name!r} is for user {owner.user!r} alone; no program of {robot} can put it: failover status says why"
         cure = near(name, self.names()) or "; declare it in team.toml, or with board.add()"
         return f"{robot} has no item {name!r} on the board {self.ensured().directory}{cure}"
 

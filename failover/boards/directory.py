@@ -150,8 +150,8 @@ def make_file(
 def give_to(file: int | Path, user: int, mode: int) -> None:
     """Have one user read and write a file as its owner may, the owner's group as ``mode`` says, and nobody else.
 
-    By an access control list, not by making the user its owner: that needs no capability, and the owner of a file could close it
-    to the agent. Source: acl(5); the list's bytes: `struct posix_acl_xattr_entry` in include/uapi/linux/posix_acl_xattr.h.
+    By an access control list, not by making the user its owner: that needs no capability, and the owner of a file could close
+    it to the agent. Source: acl(5); the list's bytes: `struct posix_acl_xattr_entry` in include/uapi/linux/posix_acl_xattr.h.
 
     Raises:
         OSError: this kernel has no such lists on tmpfs (CONFIG_TMPFS_POSIX_ACL), or the file is not this user's.

@@ -138,7 +138,7 @@ def test_a_program_inherits_what_it_would_in_the_shell_of_whoever_asked(machine:
     assert "345" in seen and "'COLOUR', 'green'" in seen  # the script did set things up
 
 
-def test_the_agent_gives_an_item_to_one_user_without_any_capability_and_another_members_put_is_refused(machine: Machine) -> None:
+def test_the_agent_gives_an_item_to_one_user_without_a_capability_and_another_members_put_is_refused(machine: Machine) -> None:
     assert as_user(machine, "alice", "failover board put map 7")[0] == 0
     status, said = as_user(machine, "bob", "failover board put map 8")
     assert (status, "user 'alice' (uid 7001) alone may put it, and this program runs as uid 7002" in said) == (1, True), said

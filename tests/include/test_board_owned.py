@@ -69,7 +69,7 @@ def test_its_user_puts_it_in_c_others_read_it_and_another_users_put_names_the_us
         assert mapper.say("get", "plan", "-").startswith("theirs ")
         assert "cannot remove item map" in other.say("remove", "map")
         said = other.say("find", "way", 8), other.say("put", "way", "x")
-        assert "item way is for user no-such-user alone, and no program of robot1 can put it: failover status says why" in said[1]
+        assert "item way is for user no-such-user alone; no program of robot1 can put it: failover status says" in said[1]
         words = {word.partition("/")[2].partition("/")[0] for word in other.say("snapshot").split(" ") if word}
         assert words == {"map=mine", "plan=theirs", "ball=b"}
         python.item("plan").put(b"root may") if other.say("close") == "ok" else None

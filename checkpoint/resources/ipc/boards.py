@@ -5,9 +5,9 @@ that others have, too, nor carry one robot's values to another. A restore maps p
 /dev/null in place of the files. A generation of zero tells the program's client that it must open the board again: it then opens
 the board of the robot where it runs, and takes its locks there.
 
-Its files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``, ``guest-WORLD.ROBOT``, ``agent``, and ``schedule``,
-the tasks of the robot) in a directory ``/dev/shm/failover-…``; ``schedule`` also in one that is called ``failover-schedule``. In
-any other directory a file counts as a board's if it also begins as one.
+Its files have fixed names (``own``, ``private``, ``own+UID``, ``peer-ROBOT``, ``guest-WORLD.ROBOT``, ``agent``, and the tasks
+of the robot, ``schedule``) in a directory ``/dev/shm/failover-…``; ``schedule`` also in one that is called ``failover-schedule``.
+In any other directory a file counts as a board's if it also begins as one.
 
 Facts of a descriptor: ``descriptors``, ``path``, ``flags`` of open(2). Facts of the mappings: ``descriptors`` (none),
 ``mappings``: [address, pages] of each.
