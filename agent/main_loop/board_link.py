@@ -21,8 +21,9 @@ from agent.main_loop.primaries import LEFT_OUT, Primaries
 from agent.main_loop.urgent_items import UrgentItems
 from failover.boards import boottime, directory
 from failover.boards.agents_file import AgentsFile
-from failover.boards.mapping import USER_PREFIX, MappedFile, uid_of
+from failover.boards.mapping import USER_PREFIX, uid_of
 from failover.boards.received import ReceivedItems
+from failover.boards.unmapped_file import UnmappedFile
 from failover.core.beat_pace import URGENT_GAP_NS
 from failover.core.board import layout
 from failover.core.board.ages import NO_ERROR_BOUND, NS_PER_US, bound_ns, sent_age_us
@@ -75,7 +76,7 @@ class BoardLink:
 
     def __init__(
         self,
-        own: Sequence[MappedFile],
+        own: Sequence[UnmappedFile],
         peers: Mapping[str, ReceivedItems],
         round_ns: int,
         primaries: Primaries | None = None,
@@ -92,7 +93,7 @@ class BoardLink:
         self.wakes = UrgentItems(own)
         self._urgent_ns = 0
         self._peers = {name: _Peer(items) for name, items in peers.items()}
-        self._announcements = Announcements(own[0].header.rank, peers)
+        self._announcements = Announcements(own[0].header().rank, peers)
         self._primaries = primaries
 
     @classmethod
@@ -100,13 +101,13 @@ class BoardLink:
         """The board that the worker process has made.
 
         Raises:
-            BoardError, FileNotFoundError: there is none.
+            BoardError, OSError: there is none.
         """
-        own, owners = [MappedFile.open(place / directory.OWN_NAME, writable=True)], AgentsFile(place).owners()
+        own, owners = [UnmappedFile.open(place / directory.OWN_NAME)], AgentsFile(place).owners()
         for uid in sorted({owner.uid for owner in (owners or {}).values() if owner.uid is not None}):
             try:
-                own.append(MappedFile.open(place / f"{USER_PREFIX}{uid}", writable=True))
-            except (BoardError, FileNotFoundError) as error:  # its user has spoilt it since the worker looked
+                own.append(UnmappedFile.open(place / f"{USER_PREFIX}{uid}"))
+            except OSError as error:
                 log.warning("items of uid %d are not sent: %s", uid, error)
         prefix = directory.PEER_PREFIX
         peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
@@ -291,8 +292,10 @@ class BoardLink:
         self.wakes.close()
         if self._primaries is not None:
             self._primaries.close()
-        for file in (*self._files, *[peer.items.file for peer in self._peers.values()]):
+        for file in self._files:
             file.close()
+        for peer in self._peers.values():
+            peer.items.file.close()
 
     def left_out(self) -> Counter[str]:
         """Values that were not taken, by reason, and those that waited."""

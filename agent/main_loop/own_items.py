@@ -1,7 +1,6 @@
 """This robot's items as the main loop takes them: by read(2), not from a mapping.
 
-Programs of a group may write the file, and so make it shorter. The kernel ends a process that touches a lost page of a mapping
-(SIGBUS); a read only comes back short. The order of loads is that of `failover.core.board.banks.get_carefully`.
+The files are `failover.boards.unmapped_file`'s. The order of loads is that of `failover.core.board.banks.get_carefully`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
-from failover.boards.mapping import MappedFile
+from failover.boards.unmapped_file import UnmappedFile
 from failover.core.board import layout
 from failover.core.board.banks import RETRIES, Found, sum_of
 from failover.core.board.items import BLOCK_SIZE_MAX
@@ -53,7 +52,7 @@ class OwnItems:
         records: by number, as the table was when it was last read.
     """
 
-    def __init__(self, file: MappedFile, believes: Callable[[Record], bool] | None = None) -> None:
+    def __init__(self, file: UnmappedFile, believes: Callable[[Record], bool] | None = None) -> None:
         """``believes``: whether an item may stand in this file; None: any may."""
         self._file, self._believes = file, believes
         self._descriptor = file.descriptor
@@ -247,7 +246,7 @@ class OwnFiles:
 
 
 def own_items(
-    files: Sequence[tuple[MappedFile, int | None]], owners: Owners | None, dropped: Counter[str]
+    files: Sequence[tuple[UnmappedFile, int | None]], owners: Owners | None, dropped: Counter[str]
 ) -> OwnItems | OwnFiles:
     """The items of `own`, the first file, and of files of one user, each with the uid of that one."""
     if owners is None:

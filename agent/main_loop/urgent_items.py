@@ -11,7 +11,7 @@ import logging
 from collections.abc import Sequence
 
 from agent.system.inotify import Touches
-from failover.boards.mapping import MappedFile
+from failover.boards.unmapped_file import UnmappedFile
 
 log = logging.getLogger("failover.heart")
 
@@ -19,7 +19,7 @@ log = logging.getLogger("failover.heart")
 class UrgentItems:
     """Readable (`fileno`) when an urgent item was put."""
 
-    def __init__(self, files: Sequence[MappedFile]) -> None:
+    def __init__(self, files: Sequence[UnmappedFile]) -> None:
         self._touches: Touches | None = None
         try:
             self._touches = Touches(*[file.descriptor for file in files])

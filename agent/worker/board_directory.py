@@ -25,9 +25,10 @@ from agent.system.permissions import NOBODY, uid_named
 from agent.worker import kept_items
 from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, directory
 from failover.boards.agents_file import AgentsFile
-from failover.boards.mapping import USER_PREFIX, MappedFile, uid_of
+from failover.boards.mapping import USER_PREFIX, uid_of
 from failover.boards.received import ReceivedItems
 from failover.boards.schedule_file import ScheduleFile
+from failover.boards.unmapped_file import UnmappedFile
 from failover.core.board import layout
 from failover.core.board.announcements import first_number
 from failover.core.board.item_types import ITEM_SIZE_MAX
@@ -228,12 +229,10 @@ class _Files:
     def _fits(self, path: Path, area: int, robot: str, items: Sequence[layout.Wanted] | None = None) -> bool:
         """Whether a file is as it is to be; ``items``: with these and no others."""
         try:
-            file = MappedFile.open(path, writable=True)
-            records = file.records()
-        except (BoardError, FileNotFoundError):
+            with contextlib.closing(UnmappedFile.open(path)) as file:
+                header, records = file.table()
+        except (BoardError, OSError):
             return False
-        header = file.header
-        file.close()
         if area == layout.PEER and header.count - len(records) > ITEMS_MAX // 2:
             return False  # no room is left for what that robot adds
         if items is not None and not (len(records) == len(items) and all(map(layout.is_exactly, records, items))):

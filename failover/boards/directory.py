@@ -17,8 +17,7 @@ from typing import Final
 
 from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, locks
 from failover.boards.mapping import MappedFile
-from failover.boards.schedule_file import ScheduleFile
-from failover.boards.shared_file import GENERATION, SharedFile
+from failover.boards.unmapped_file import UnmappedFile
 from failover.client.control import socket_path
 from failover.core.board import layout
 from failover.core.board.items import ITEMS_MAX, Item
@@ -26,7 +25,7 @@ from failover.core.board.layout import ALONE, GONE, OWN, PEER, PRIVATE, TABLE_LO
 from failover.core.schedule import layout as schedule_layout
 from failover.core.wire.codec import team_tag
 from failover.core.wire.names import check_robot
-from failover.errors import BoardError, BoardGoneError, NameFormatError, ScheduleError
+from failover.errors import BoardError, BoardGoneError, NameFormatError
 
 VARIABLE: Final = "FAILOVER_BOARD"
 SHARED_MEMORY: Final = Path("/dev/shm")
@@ -216,12 +215,14 @@ def make_peer(
 
 def dismiss(path: Path) -> None:
     """Unlink a file of a board, or the schedule, and tell all who have it open that it is another one now."""
-    kind: type[SharedFile] = ScheduleFile if path.name == SCHEDULE_NAME else MappedFile
-    with contextlib.suppress(OSError, BoardError, ScheduleError):
-        file = kind.open(path, writable=True)
-        file.words[GENERATION] = GONE
-        file.close()
+    retire(path)
     path.unlink(missing_ok=True)
+
+
+def retire(path: Path) -> None:
+    """As `dismiss`, and leave the file its name."""
+    with contextlib.suppress(OSError), contextlib.closing(UnmappedFile.open(path)) as file:
+        file.retire()
 
 
 def enter(directory: Path, name: str, robot: str = "") -> tuple[MappedFile, int]:

@@ -177,6 +177,8 @@ class SharedFile:
             return mmap.mmap(descriptor, min(size, cls.SIZE_MAX), mmap.MAP_SHARED, protection)
         except OSError as error:
             raise cls.ERROR(f"cannot map {path}: {error.strerror}") from error
+        except ValueError as error:  # it was made shorter since it was asked how long it is
+            raise cls.ERROR(f"cannot map {path}: {error}") from error
 
     @classmethod
     def _second_opening(cls, path: Path, first: int) -> int:

@@ -5,11 +5,13 @@ Programs here are real processes of other users, members of the board's group.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import grp
 import mmap
 import os
 import pwd
+import signal
 import struct
 import subprocess
 import sys
@@ -20,6 +22,7 @@ from pathlib import Path
 import pytest
 
 import failover
+from agent.main_loop.board_link import BoardLink
 from agent.worker import board_directory
 from failover.boards import directory
 from failover.boards.agents_file import AgentsFile
@@ -271,6 +274,59 @@ def test_a_file_that_its_user_has_spoilt_harms_no_other_item_and_is_whole_again_
     as_user(UID, lambda: put(place, "map", {"n": 8}))
     with Board(place, "test") as board:
         assert (board.item("map").get().value, board.item("plan").get().value) == ({"n": 8}, b"p")
+
+
+def test_a_file_that_is_made_shorter_while_it_is_mapped_is_told_in_a_sentence(
+    folder: Path, found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = board_directory.provide(loaded(folder, BALL))
+    assert place is not None
+    long = os.stat_result((*(place / "own").stat()[:6], 1 << 23, *(place / "own").stat()[7:]))
+    with monkeypatch.context() as patch:  # what fstat(2) said a moment ago
+        patch.setattr(os, "fstat", lambda _: long)
+        with pytest.raises(failover.BoardError, match="cannot map .*own: mmap length is greater than file size"):
+            MappedFile.open(place / "own")
+
+
+def shortening(path: Path) -> int:
+    """A process of the file's user that makes it shorter and whole again without a pause, also each new one."""
+    pid = os.fork()
+    if pid == 0:
+        os.setgroups([])
+        os.setgid(65534)
+        os.setuid(UID)
+        while True:
+            with contextlib.suppress(OSError), open(path, "rb+", buffering=0) as file:
+                content = os.pread(file.fileno(), 1 << 20, 0)
+                while os.fstat(file.fileno()).st_nlink:
+                    os.ftruncate(file.fileno(), 0)
+                    os.pwrite(file.fileno(), content, 0)
+    return pid
+
+
+@needs_root
+def test_a_user_who_makes_his_file_shorter_all_the_time_ends_no_agent(folder: Path, place: Path) -> None:
+    """Neither the worker, which examines the file, nor the main loop, which opens it; each try is a process of its own."""
+
+    def agents() -> None:
+        settings = loaded(folder)
+        for _ in range(10):
+            board_directory.provide(settings)
+            BoardLink.open(place, 20_000_000).close()
+
+    hostile = shortening(place / f"own+{UID}")
+    try:
+        for _ in range(20):
+            pid = os.fork()
+            if pid == 0:
+                with contextlib.suppress(BaseException):
+                    agents()
+                    os._exit(0)
+                os._exit(1)
+            assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    finally:
+        os.kill(hostile, signal.SIGKILL)
+        os.waitpid(hostile, 0)
 
 
 @needs_root
