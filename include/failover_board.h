@@ -235,6 +235,7 @@ enum {
     FB_FOLLOW_NS_ = 20000000,   /* the longest sleep without a look at who is the primary */
     FB_SLICE_NS_ = 100000000,   /* the longest sleep without a look: a wake-up may be lost */
     FB_TABLE_WAIT_MS_ = 5000,   /* for a process that changes a table, which takes microseconds */
+    FB_GONE_MS_ = 2000,         /* for an agent that makes the board anew */
     FB_MAPS_ = 4096             /* mappings that are guarded against files that become shorter */
 };
 
@@ -339,7 +340,7 @@ struct fb_board {
     fb_component *components;
     fb_added_ *added;
     uint32_t user;
-    int64_t skew;
+    int64_t skew, gone; /* gone: since when the agent has not replaced the board that it is to make anew, or 0 */
     bool is_forked;
 };
 
@@ -1163,6 +1164,7 @@ static inline int fb_add_again_(fb_board *board, const fb_declaration *wanted);
 /* The board is open, of this robot and this process: 0 or -errno. The guard is held. */
 static inline int fb_ensure_(fb_board *board)
 {
+    const struct timespec pause = {0, 1000000};
     bool is_named = false;
     int outcome = 1;
     if (board->own != NULL && !board->is_forked &&
@@ -1172,12 +1174,21 @@ static inline int fb_ensure_(fb_board *board)
     board->is_forked = false;
     board->skew = fb_skew_();
     outcome = fb_find_directory_(board, &is_named);
-    for (int turn = 0; outcome >= 0 && turn < FB_TURNS_ * 10; turn++) {
+    for (int turn = 0; outcome >= 0 && turn < FB_TURNS_ * 10 + FB_GONE_MS_; turn++) {
         outcome = fb_enter_(board, is_named);
         if (outcome == 0)
             break;
         fb_give_up_(board);
+        if (outcome == -ESTALE) {
+            const int64_t now = fb_clock_(CLOCK_MONOTONIC);
+            board->gone = board->gone == 0 ? now : board->gone;
+            if (now - board->gone < (int64_t)FB_GONE_MS_ * 1000000) {
+                nanosleep(&pause, NULL);
+                outcome = 1;
+            }
+        }
     }
+    board->gone = outcome == 0 ? 0 : board->gone;
     if (outcome == 1)
         outcome = fb_fail_(ESTALE, "cannot open the board %.400s: others make and remove it meanwhile; try again", board->directory);
     if (outcome != 0)

@@ -33,7 +33,7 @@ from failover.core.board import layout
 from failover.core.board.announcements import first_number
 from failover.core.board.item_types import ITEM_SIZE_MAX
 from failover.core.board.items import ITEMS_MAX, Board, Item
-from failover.core.board.owners import Owner, encode
+from failover.core.board.owners import Owner, Owners, encode
 from failover.core.frames.frame import Portion
 from failover.errors import BoardError, ScheduleError
 
@@ -85,9 +85,10 @@ def provide(settings: Settings, tell: Callable[[str], None] = log.warning) -> Pa
         if path.name.removeprefix(directory.PEER_PREFIX) not in set(robots) - {me}:
             directory.dismiss(path)
     owned = board.owned_at(me)
-    files.dismiss_unfit(directory.OWN_NAME, layout.OWN, me)  # until it is there again no program sees a part of what follows
+    uids = _uids(owned.values(), files.former_owners(me), me, tell)  # first: a directory of users may let it wait
+    files.retire_unfit(directory.OWN_NAME, layout.OWN, me)  # until another one is there no program sees a part of what follows
     files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES, OWNERS_NUMBER: OWNERS} if owned else {0: PRIMARIES})
-    files.have_owned(me, owned, tell)
+    files.have_owned(me, owned, uids, tell)
     kept = _kept(Path(settings.config.state_directory), board, me)
     private, own = (
         {n: item for n, item in some.items() if not item.user} for some in (board.private_of(me), board.shared_by(me))
@@ -126,36 +127,42 @@ class _Files:
         self._group = group
         self._ranks = ranks
 
-    def dismiss_unfit(self, name: str, area: int, robot: str) -> None:
-        """Unlink a file that is to be made anew."""
-        if not self._fits(self._place / name, area, robot):
-            directory.dismiss(self._place / name)
+    def former_owners(self, robot: str) -> Owners:
+        """What the agent before told of these very items, since the machine started."""
+        if self._fits(self._place / directory.AGENT_NAME, layout.PEER, robot):
+            with contextlib.suppress(BoardError):
+                return AgentsFile(self._place).owners() or {}
+        return {}
 
-    def have_owned(self, robot: str, items: Mapping[int, Item], tell: Callable[[str], None]) -> None:
+    def retire_unfit(self, name: str, area: int, robot: str) -> None:
+        """Tell the users of a file that it is to be made anew. Its name stays: where there is none, a program makes a board."""
+        if not self._fits(self._place / name, area, robot):
+            directory.retire(self._place / name)
+
+    def have_owned(self, robot: str, items: Mapping[int, Item], uids: Mapping[str, int], tell: Callable[[str], None]) -> None:
         """A file of each user who alone may put items, and none of former ones; and the table that says whose is what."""
-        uids = {item.user: uid_named(item.user) for item in items.values()}
         of_uid: dict[int, dict[int, Item]] = {}
         for number, item in items.items():
             of_uid.setdefault(uids[item.user], {})[number] = item
         lacking = of_uid.pop(NOBODY, {})
-        for user in sorted({item.user for item in lacking.values()}):
-            names = _names(item for item in lacking.values() if item.user == user)
-            tell(f"{robot} has no user {user!r}: no program here can put {names}; make the user, and restart the agent")
         for path in self._place.glob(f"{USER_PREFIX}*"):
             if uid_of(path) not in of_uid:
                 directory.dismiss(path)
         for uid, theirs in of_uid.items():
             try:
                 self._have_of_user(uid, robot, theirs)
-            except OSError as error:
-                if error.errno not in NO_LIST:
-                    raise
+            except (BoardError, OSError) as error:
                 lacking |= theirs
-                tell(
-                    f"{self._place} takes no access control list with uid {uid} ({error.strerror}): no program here can put "
-                    f"{_names(theirs.values())}; use a kernel with CONFIG_TMPFS_POSIX_ACL and a user namespace that has "
-                    "this uid, or declare them without user"
-                )
+                directory.dismiss(self._place / f"{USER_PREFIX}{uid}")
+                why = f"there is no file for uid {uid} in {self._place} ({error})"
+                cure = "free /dev/shm, and restart the agent"
+                if isinstance(error, OSError) and error.errno in NO_LIST:
+                    why = f"{self._place} takes no access control list with uid {uid} ({error.strerror})"
+                    cure = (
+                        "use a kernel with CONFIG_TMPFS_POSIX_ACL and a user namespace that has this uid, or declare them "
+                        "without user"
+                    )
+                tell(f"{why}: no program here can put {_names(theirs.values())}; {cure}")
         owners = {one.name: Owner(n, one.user, None if n in lacking else uids[one.user]) for n, one in items.items()}
         if items and AgentsFile(self._place).owners() != owners:
             table = ReceivedItems.open(self._place / directory.AGENT_NAME)
@@ -169,7 +176,6 @@ class _Files:
             os.chown(path, -1, self._group)
             directory.give_to(path, uid, PEERS_MODE)
             return
-        directory.dismiss(path)
         self._make(path, layout.OWN, robot, PEERS_MODE, user=uid, capacity=len(items))(items=items)
 
     def have(self, name: str, area: int, robot: str, items: Mapping[int, Item], kept: Sequence[Item] = ()) -> None:
@@ -180,7 +186,6 @@ class _Files:
             os.chown(path, -1, self._group)
             path.chmod(mode)
             return
-        directory.dismiss(path)
         make = self._make(path, area, robot, mode)
         first = first_number(self._ranks[robot])
 
@@ -209,6 +214,7 @@ class _Files:
             digest=self._digest,
             mode=mode,
             group=self._group,
+            replacing=True,
             **more,
         )
 
@@ -239,6 +245,26 @@ class _Files:
             return False
         found = (header.flags, header.roster_digest, header.boot_id, header.robot, header.rank)
         return found == (area, self._digest, boottime.boot_id(), robot, self._ranks[robot])
+
+
+def _uids(items: Iterable[Item], former: Owners, robot: str, tell: Callable[[str], None]) -> dict[str, int]:
+    """The numbers of the users who alone may put items; `NOBODY` for one whom this robot does not have.
+
+    Where users are in a directory elsewhere, a look-up can fail for a while: who had a number keeps it until the next boot.
+    """
+    items, uids = list(items), {}
+    before = {owner.user: owner.uid for owner in former.values() if owner.uid is not None}
+    for user in sorted({item.user for item in items}):
+        uids[user], names = uid_named(user), _names(item for item in items if item.user == user)
+        if uids[user] == NOBODY and user in before:
+            uids[user] = before[user]
+            tell(
+                f"{robot} finds no user {user!r} now, and had one: uid {before[user]} may still put {names}; see getent passwd, "
+                "and restart the machine if the user was removed"
+            )
+        elif uids[user] == NOBODY:
+            tell(f"{robot} has no user {user!r}: no program here can put {names}; make the user, and restart the agent")
+    return uids
 
 
 def _names(items: Iterable[Item]) -> str:

@@ -10,6 +10,7 @@ import contextlib
 import os
 import stat
 import struct
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,8 +44,12 @@ _ENTRY: Final = struct.Struct("<HHI")
 _USER_OBJ, _USER, _GROUP_OBJ, _MASK, _OTHER = 1, 2, 4, 16, 32
 _NOBODY: Final = 2**32 - 1
 
-TURNS: Final = 1000
+TURNS: Final = 5000
 """Of making or opening a board that others make and remove at the same time."""
+
+GONE_WAIT_S: Final = 2.0
+GONE_LOOK_S: Final = 0.001
+"""How long a program waits for a board that its agent makes anew, and between two looks."""
 
 
 def find() -> Path:
@@ -103,6 +108,7 @@ def make_file(
     group: int = -1,
     user: int | None = None,
     hold: bool = False,
+    replacing: bool = False,
 ) -> int:
     """Make one file of a board, whole at its place.
 
@@ -113,19 +119,20 @@ def make_file(
         group: whose it is to be; -1: this process's.
         user: the one who may write it beside its owner, with what ``mode`` lets its owner do; None: nobody.
         hold: return an opening that is user 0 already and has the table lock.
+        replacing: it takes the place of a file that is there; at no instant is there none.
 
     Returns:
         The opening, or -1 without ``hold``.
 
     Raises:
-        FileExistsError: there is one.
+        FileExistsError: there is one, without ``replacing``.
         OSError: it cannot be made there.
         BoardError: there is no room for so many items.
     """
     header = layout.new_header(
         flags, capacity, check_robot(robot), boottime.boot_id(), rank=rank, state=state, roster_digest=digest
     )
-    with _linked(path, mode, group) as made:
+    with _linked(path, mode, group, replacing) as made:
         if user is not None:
             give_to(made, user, mode)
         os.ftruncate(made, layout.names_at(capacity))
@@ -171,14 +178,20 @@ def rights_of(path: Path) -> bytes:
 
 
 @contextmanager
-def _linked(path: Path, mode: int, group: int = -1) -> Iterator[int]:
+def _linked(path: Path, mode: int, group: int = -1, replacing: bool = False) -> Iterator[int]:
     """A file without a name that the body fills; then it has its place. The caller closes it."""
+    place = path.with_name(f".{path.name}.new") if replacing else path
     made = os.open(path.parent, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, mode)
     try:
         os.fchown(made, -1, group)
         os.fchmod(made, mode)  # not what the umask leaves of it
         yield made
-        os.link(f"/proc/self/fd/{made}", path, src_dir_fd=made)  # with a descriptor Python follows the link, linkat(2)
+        if replacing:
+            place.unlink(missing_ok=True)
+        os.link(f"/proc/self/fd/{made}", place, src_dir_fd=made)  # with a descriptor Python follows the link, linkat(2)
+        if replacing:
+            retire(path)
+            place.replace(path)
     except BaseException:
         os.close(made)
         raise
@@ -238,8 +251,15 @@ def enter(directory: Path, name: str, robot: str = "") -> tuple[MappedFile, int]
     Raises:
         BoardError: it is no board, cannot be made, or has too many users.
     """
+    until_s = time.monotonic() + GONE_WAIT_S
     for _ in range(TURNS):
-        entered = _try_to_enter(directory, name, robot or this_robot())
+        try:
+            entered = _try_to_enter(directory, name, robot or this_robot())
+        except BoardGoneError as error:
+            if time.monotonic() > until_s:
+                raise BoardError(f"{error}, and not replaced yet; is its agent running?") from None
+            time.sleep(GONE_LOOK_S)
+            continue
         if entered is not None:
             return entered
     raise BoardError(f"cannot open the board {directory}: others have made and removed it {TURNS} times meanwhile; try again")
@@ -261,10 +281,7 @@ def _try_to_enter(directory: Path, name: str, robot: str) -> tuple[MappedFile, i
             if _is_abandoned(path, descriptor):
                 _remove(directory, descriptor)
                 return None
-            try:
-                file = MappedFile.open(path, descriptor, writable=True)
-            except BoardGoneError as error:
-                raise BoardError(f"{error}, and not replaced yet; is its agent running?") from None
+            file = MappedFile.open(path, descriptor, writable=True)
             index = file.enter(os.getpid(), os.geteuid(), name)
             keep = True
             return file, index

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import pwd
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from agent.worker import board_directory
+from failover.boards import directory
 from failover.boards.board import Board
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
@@ -74,6 +76,19 @@ def test_its_user_puts_it_in_c_others_read_it_and_another_users_put_names_the_us
         assert words == {"map=mine", "plan=theirs", "ball=b"}
         python.item("plan").put(b"root may") if other.say("close") == "ok" else None
         assert mapper.say("get", "plan", "-").startswith("root may ")
+
+
+def test_while_the_agent_makes_the_board_anew_a_program_waits_for_it(folder: Path, place: Path) -> None:
+    with tool(place) as c:
+        c.ok("find", "ball", 8)
+        c.ok("put", "ball", "before")
+        directory.retire(place / "own")
+        with ThreadPoolExecutor(1) as pool:
+            said = pool.submit(c.say, "put", "ball", "after")
+            board_directory.provide(loaded(folder))
+            assert said.result() == "ok"
+    with Board(place, "test") as python:
+        assert python.item("ball").get().value == b"after"
 
 
 def test_what_others_write_into_their_files_is_no_item_of_the_user_for_c(place: Path) -> None:

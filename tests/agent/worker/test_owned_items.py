@@ -284,7 +284,7 @@ def test_a_file_that_is_made_shorter_while_it_is_mapped_is_told_in_a_sentence(
     long = os.stat_result((*(place / "own").stat()[:6], 1 << 23, *(place / "own").stat()[7:]))
     with monkeypatch.context() as patch:  # what fstat(2) said a moment ago
         patch.setattr(os, "fstat", lambda _: long)
-        with pytest.raises(failover.BoardError, match="cannot map .*own: mmap length is greater than file size"):
+        with pytest.raises(failover.BoardError, match=r"cannot map .*own: mmap length is greater than file size"):
             MappedFile.open(place / "own")
 
 
@@ -327,6 +327,82 @@ def test_a_user_who_makes_his_file_shorter_all_the_time_ends_no_agent(folder: Pa
     finally:
         os.kill(hostile, signal.SIGKILL)
         os.waitpid(hostile, 0)
+
+
+OPENS = """
+import sys
+from pathlib import Path
+from failover.boards import directory
+from failover.boards.board import Board
+from failover.errors import BoardError
+make = directory._made
+def made(*of):
+    print("made a board in the agent's place", flush=True)
+    return make(*of)
+directory._made = made
+print("begins", flush=True)
+while True:
+    try:
+        with Board(Path(sys.argv[1]), "test") as board:
+            board.item("ball")
+    except BoardError:
+        pass
+"""
+
+
+@needs_root
+def test_no_program_makes_a_board_of_its_own_while_the_agent_makes_its_one_anew(folder: Path, found: None) -> None:
+    """A program of the agent's user could: the directory is its user's."""
+    place = board_directory.provide(loaded(folder, OWNED))
+    assert place is not None
+    with subprocess.Popen([sys.executable, "-c", OPENS, place], stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None and program.stdout.readline() == "begins\n"
+        names = {path.name for path in place.iterdir()}
+        for size in range(9, 29):
+            board_directory.provide(loaded(folder, OWNED.replace("size = 8", f"size = {size}")))
+            assert {path.name for path in place.iterdir()} == names
+        program.kill()
+        assert program.stdout.read() == ""
+
+
+@needs_root
+def test_a_file_of_a_user_that_cannot_be_made_costs_no_other_item(
+    folder: Path, found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    give = directory.give_to
+
+    def full(file: int | Path, user: int, mode: int) -> None:
+        if user == UID:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        give(file, user, mode)
+
+    told: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(directory, "give_to", full)
+        place = board_directory.provide(loaded(folder, OWNED), told.append)
+    assert place is not None
+    assert len(told) == 1 and "No space left on device): no program here can put map, secret; free /dev/shm" in told[0]
+    as_user(OTHER, lambda: put(place, "plan", b"p"))
+    assert board_directory.provide(loaded(folder)) == place
+    as_user(UID, lambda: put(place, "map", {"n": 7}))
+
+
+def test_a_look_up_of_a_user_that_fails_for_a_while_costs_no_value_and_no_right(
+    folder: Path, found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    me = pwd.getpwuid(os.geteuid()).pw_name
+    place = board_directory.provide(loaded(folder, BALL + f'[board.items.map]\nsize = 8\nuser = "{me}"\n'))
+    assert place is not None
+    put(place, "map", b"v")
+    told: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(board_directory, "uid_named", lambda _: board_directory.NOBODY)
+        board_directory.provide(loaded(folder), told.append)
+    assert len(told) == 1
+    assert told[0].startswith(f"robot1 finds no user '{me}' now, and had one: uid {os.geteuid()} may still put map; see getent")
+    with Board(place, "test") as board:
+        assert board.item("map").get().value == b"v"
+        board.item("map").put(b"w")
 
 
 @needs_root
