@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -30,7 +30,7 @@ from failover.core.board.items import Item as Declaration
 from failover.core.board.layout import Record, wanted_of
 from failover.core.board.owners import Owner, Owners
 from failover.core.naming import worlds
-from failover.errors import BoardError, BoardGoneError, NeverWrittenError, OvertakenError, ValueMisfitError
+from failover.errors import BoardError, BoardGoneError, ItemError, NeverWrittenError, OvertakenError, ValueMisfitError
 
 COMPONENT_VARIABLE: Final = "FAILOVER_COMPONENT"
 
@@ -59,38 +59,66 @@ class _Opened:
         world = worlds.checked(os.environ.get(worlds.VARIABLE, ""))
         self._prefix = directory.GUEST_PREFIX + worlds.guest(world) if world else directory.PEER_PREFIX
         self.pid = os.getpid()
-        self.files = [self.own]
+        self._others: dict[str, MappedFile] = {}
         self.peers: dict[str, MappedFile] = {}
         self._agents = AgentsFile(self.directory)
-        self._owners: Owners | None = None
+        if not self.own.header.flags & layout.ALONE:
+            self.own.owners = self._agents.owners
         try:
-            self._open_others()
+            unowned = [] if self.owners() else [path.name for path in sorted(self.directory.glob(f"{USER_PREFIX}*"))]
+            self._common = (directory.PRIVATE_NAME, *unowned)
+            self._opened_of(self._common)
         except BaseException:
             self.leave()
             raise
 
-    def _open_others(self) -> None:
-        if not self.own.header.flags & layout.ALONE:
-            self.own.owners = self._agents.owners
-        with contextlib.suppress(FileNotFoundError):
-            self._open(self.directory / directory.PRIVATE_NAME)
-        for path in sorted(self.directory.glob(f"{USER_PREFIX}*")):
-            with contextlib.suppress(FileNotFoundError, BoardError):  # its user can spoil it: told when an item of it is used
-                self._open(path)
-
-    def _open(self, path: Path) -> MappedFile:
-        file = MappedFile.open(path)
-        file.owners = self.own.owners
-        self.files.append(file)
+    def _open(self, name: str) -> MappedFile:
+        """One of the files beside `own`, mapped when it is first asked for, and again when the agent has made it anew."""
+        file = self._others.get(name)
+        if file is not None and file.is_gone:
+            del self._others[name]
+            file.close()
+            file = None
+        if file is None:
+            file = self._others[name] = MappedFile.open(self.directory / name)
+            file.owners = self.own.owners
         return file
 
-    def owner(self, name: str) -> Owner | None:
-        """Who alone may put an item; None: who may write the board.
+    def _opened_of(self, names: Iterable[str]) -> list[MappedFile]:
+        found = []
+        for name in names:
+            with contextlib.suppress(FileNotFoundError, BoardGoneError):
+                try:
+                    found.append(self._open(name))
+                except BoardError:
+                    if not name.startswith(USER_PREFIX):  # its user can spoil it: told when an item of it is used
+                        raise
+        return found
+
+    @property
+    def files(self) -> list[MappedFile]:
+        """All that hold items of this robot, `own` first; without those of one user that cannot be opened."""
+        return [self.own, *self._opened_of((*self._common, *[f"{USER_PREFIX}{uid}" for uid in self.uids()]))]
+
+    def private(self) -> MappedFile | None:
+        """The file of items that stay here."""
+        return next(iter(self._opened_of((directory.PRIVATE_NAME,))), None)
+
+    def owners(self) -> Owners:
+        """Who alone may put which item.
 
         Raises:
             BoardError: the agent's table cannot be read.
         """
-        return (self.own.owners() or {}).get(name) if self.own.owners is not None else None
+        return (self.own.owners() or {}) if self.own.owners is not None else {}
+
+    def owner(self, name: str) -> Owner | None:
+        """Who alone may put an item; None: who may write the board. Raises: see `owners`."""
+        return self.owners().get(name)
+
+    def uids(self) -> list[int]:
+        """The users of this robot who have items of their own. Raises: see `owners`."""
+        return sorted({owner.uid for owner in self.owners().values() if owner.uid is not None})
 
     def files_of(self, name: str) -> list[MappedFile]:
         """Where this robot's item of that name can be.
@@ -100,33 +128,20 @@ class _Opened:
         """
         owner = self.owner(name)
         if owner is None:
-            return self.files if self.own.owners is None else [file for file in self.files if uid_of(file.path) is None]
-        return [] if owner.uid is None else [self._of_user(owner.uid)]
+            return [self.own, *self._opened_of(self._common)]
+        return [] if owner.uid is None else [self.of_user(owner.uid)]
 
-    def _of_user(self, uid: int) -> MappedFile:
-        path = self.directory / f"{USER_PREFIX}{uid}"
+    def of_user(self, uid: int) -> MappedFile:
+        """The file that one user alone writes.
+
+        Raises:
+            BoardError: it cannot be read.
+        """
+        name = f"{USER_PREFIX}{uid}"
         try:
-            return next((file for file in self.files if file.path == path), None) or self._open(path)
+            return self._open(name)
         except FileNotFoundError:
-            raise BoardError(f"{path} is not there: the agent makes it when it starts") from None
-
-    def renew(self) -> None:
-        """Close files of one user that the agent has removed, open those that it has made, while it kept the others."""
-        gone = [file for file in self.files[1:] if file.is_gone]
-        for file in gone:
-            self.files.remove(file)
-            file.close()
-        try:
-            owners = self.own.owners() if self.own.owners is not None else None
-        except BoardError:  # the next look-up says why
-            return
-        if gone or owners is not self._owners:
-            self._owners = owners
-            for uid in {owner.uid for owner in (owners or {}).values() if owner.uid is not None}:
-                try:
-                    self._of_user(uid)
-                except BoardError:  # at the next call again
-                    self._owners = None
+            raise BoardError(f"{self.directory / name} is not there: the agent makes it when it starts") from None
 
     def peer(self, robot: str) -> MappedFile:
         """Another robot's file, or a guest's.
@@ -177,8 +192,7 @@ class _Opened:
 
     def leave(self) -> None:
         """Give everything back; the last user without an agent removes the board. A forked child only closes its files."""
-        for file in self.files[1:]:
-            file.close()
+        self._close_others()
         if self.pid != os.getpid():
             self.own.close()
         elif self.own.descriptor >= 0:
@@ -186,7 +200,11 @@ class _Opened:
 
     def drop(self) -> None:
         """Close all without being the last user: the board is another one now, or this is a forked child."""
-        for file in self.files:
+        self._close_others()
+        self.own.close()
+
+    def _close_others(self) -> None:
+        for file in self._others.values():
             file.close()
 
 
@@ -259,9 +277,9 @@ class Board:
             return item
 
     def names(self) -> list[str]:
-        """The items of this robot."""
+        """The items of this robot, without those of a user who has damaged his file: the next use of one says so."""
         with self.guard:
-            return [record.name for file in self.ensured().files for record in file.records()]
+            return [record.name for file in self.ensured().files for record in _records(file)]
 
     def add(self, declaration: Declaration) -> Item:
         """Declare an item while the board is in use; one that is declared alike already stays.
@@ -399,13 +417,17 @@ class Board:
         return table[component]
 
     def snapshot(self) -> dict[str, dict[str, Reading]]:
-        """Robot → item → reading, of all that was ever put, without guests; each value whole, all ages at one instant."""
+        """Robot → item → reading, of all that was ever put, without guests; each value whole, all ages at one instant.
+
+        A value that its one user has damaged is left out: to get the item says why.
+        """
         with self.guard:
             opened = self.ensured()
-            found = [(opened.robot, one) for file in opened.files for one in _all_found(file)]
+            owners = opened.owners()
+            found = [(opened.robot, one) for file in opened.files for one in _all_found(file, owners)]
             for robot in opened.peer_names():
                 with contextlib.suppress(BoardGoneError):
-                    found += [(robot, one) for one in _all_found(opened.peer(robot))]
+                    found += [(robot, one) for one in _all_found(opened.peer(robot), owners)]
             now = boottime.now_ns(self.skew_ns)
         readings: dict[str, dict[str, Reading]] = {robot: {} for robot in (opened.robot, *opened.peer_names())}
         for robot, (record, bank, formula_ns) in found:
@@ -414,8 +436,12 @@ class Board:
             stale = ages.is_stale(age_max_ns, record.bound_ns or formula_ns)
             try:
                 value = values_for(record, None).unpack(bank.value)
-            except ValueMisfitError as error:
-                raise ValueMisfitError(f"item {record.name!r} of {robot}: {error}") from None
+            except (ValueMisfitError, ItemError, BoardError) as error:
+                if record.name in owners:
+                    continue
+                if isinstance(error, ValueMisfitError):
+                    raise ValueMisfitError(f"item {record.name!r} of {robot}: {error}") from None
+                raise
             readings[robot][record.name] = Reading(value, age_ns, age_max_ns, robot, bank.number, stale)
         return readings
 
@@ -515,7 +541,6 @@ class Board:
                 for declaration in list(self._added.values()):
                     with contextlib.suppress(BoardError):  # the next use of the item says why
                         self.add(declaration)
-            opened.renew()
             return opened
 
     def _forget(self) -> None:
@@ -563,9 +588,9 @@ class Board:
         return f"{robot} has no item {name!r} on the board {self.ensured().directory}{cure}"
 
     def _private(self, opened: _Opened) -> MappedFile:
-        for file in opened.files:
-            if file.header.flags & layout.PRIVATE:
-                return file
+        file = opened.private()
+        if file is not None:
+            return file
         raise BoardError(f"the board {opened.directory} has no file for private items")
 
 
@@ -592,15 +617,27 @@ def is_alike(record: Record, wanted: layout.Wanted) -> bool:
     return all(getattr(record, name) == getattr(wanted, name) for name in names)
 
 
-def _all_found(file: MappedFile) -> Iterator[tuple[Record, Any, int]]:
-    """Record, bank and bound by the formula, of all items of a file that were ever put."""
-    for record in file.records():
+def _records(file: MappedFile) -> list[Record]:
+    """All items of a file; none of one that its one user has damaged."""
+    try:
+        return file.records()
+    except BoardError:
+        if uid_of(file.path) is None:
+            raise
+        return []
+
+
+def _all_found(file: MappedFile, owners: Owners) -> Iterator[tuple[Record, Any, int]]:
+    """Record, bank and bound by the formula, of all items of a file that were ever put; of one user's only what is whole."""
+    for record in _records(file):
         place = file.place(record)
         try:
             yield record, get_carefully(place, FENCE), place.words[place.formula]
         except NeverWrittenError:
             continue
         except (OvertakenError, BoardError) as error:
+            if record.name in owners:
+                continue
             raise type(error)(f"item {record.name!r} of {file.header.robot}: {error}") from None
 
 

@@ -11,11 +11,12 @@ from failover.boards import boottime
 from failover.boards.board import Board
 from failover.boards.fence import FENCE
 from failover.boards.item import values_for
-from failover.boards.mapping import MappedFile
+from failover.boards.mapping import MappedFile, uid_of
 from failover.core.board import ages, layout
 from failover.core.board.banks import get_carefully
 from failover.core.board.item_values import Values
 from failover.core.board.layout import Record
+from failover.core.board.owners import Owners
 from failover.errors import BoardError, BoardGoneError, ItemError, NeverWrittenError, ValueMisfitError
 
 AREAS: Final = {layout.PRIVATE: "private", layout.OWN: "own", layout.PEER: "peer"}
@@ -79,9 +80,19 @@ class Overview:
                 with contextlib.suppress(BoardGoneError):
                     files.append((robot, opened.peer(robot)))
             now_ns = boottime.now_ns(board.skew_ns)
-            known = {str(file.path): self._rows(robot, file) for robot, file in files}
+            known, damaged = {}, list[Seen]()
+            uids = opened.uids()
+            for robot, file in files:
+                if uid_of(file.path) not in uids:
+                    known[str(file.path)] = self._rows(robot, file)
+            for uid in uids:
+                try:
+                    file = opened.of_user(uid)
+                    known[str(file.path)] = self._rows(opened.robot, file)
+                except BoardError as error:
+                    damaged += _complaints(opened.robot, opened.owners(), uid, str(error))
             self._known = known
-            return [_seen(row, now_ns) for _, _, rows in known.values() for row in rows]
+            return [*[_seen(row, now_ns) for _, _, rows in known.values() for row in rows], *damaged]
 
     def _rows(self, robot: str, file: MappedFile) -> tuple[MappedFile, int, list[_Row]]:
         generation = file.generation
@@ -120,6 +131,13 @@ class _Row:
 def overview(board: Board) -> list[Seen]:
     """`Overview.look`, once."""
     return Overview(board).look()
+
+
+def _complaints(robot: str, owners: Owners, uid: int, why: str) -> list[Seen]:
+    """The items of a user whose file cannot be read."""
+    nothing: dict[str, Any] = {"area": "own", "type": "", "size": 0, "period": 1, "phase": 0, "banks": 0}
+    theirs = [(name, owner.number) for name, owner in owners.items() if owner.uid == uid]
+    return [Seen(robot=robot, item=name, id=number, complaint=why, **nothing) for name, number in theirs]
 
 
 def _seen(row: _Row, now_ns: int) -> Seen:

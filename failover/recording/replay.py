@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from failover.boards import boottime, directory
 from failover.boards.board import Board, board, is_alike
+from failover.boards.directory import PRIVATE_NAME
 from failover.boards.received import ReceivedItems
 from failover.core.board import ages, layout, recording
 from failover.core.board.item_types import parse
@@ -276,7 +277,7 @@ class Stage:
             BoardError: too little room would be left for programs: the row of an item that was removed is not used again.
         """
         wanted = {_prefixed(prefix, channel): channel.wanted for channel in contents.channels.values()}
-        file = next(file for file in self.board.ensured().files if file.header.flags & layout.PRIVATE)
+        file = next(file for file in self.board.ensured().files if file.path.name == PRIVATE_NAME)
         for record in file.records():
             is_ours = record.flags & layout.ADDED and record.name.startswith(f"{prefix}.")
             if not is_ours or record.name.count(".") < prefix.count(".") + 2:

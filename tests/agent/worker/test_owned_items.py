@@ -28,6 +28,7 @@ from failover.boards import directory
 from failover.boards.agents_file import AgentsFile
 from failover.boards.board import Board
 from failover.boards.mapping import MappedFile
+from failover.boards.overview import overview
 from failover.cli.main import main
 from failover.core.board import layout
 from failover.core.board.items import Item
@@ -270,10 +271,65 @@ def test_a_file_that_its_user_has_spoilt_harms_no_other_item_and_is_whole_again_
         board.add(Item("fresh", size=8)).put(b"f")
         with pytest.raises(failover.BoardError, match=f"own.{UID}: damaged: record 0 has 99 banks"):
             board.item("map")
+        assert sorted(board.names()) == ["ball", "fresh", "notes", "plan"]
+        assert set(board.snapshot()["robot1"]) == {"ball", "fresh", "plan"}
+        with pytest.raises(failover.BoardError, match="did you mean 'plan'"):
+            board.item("plam")
+        said = {one.item: one.complaint for one in overview(board) if one.robot == "robot1"}
+        assert {name for name, complaint in said.items() if "record 0 has 99 banks" in complaint} == {"map", "secret"}
+        assert set(said) == {"ball", "fresh", "map", "notes", "plan", "secret"}
     board_directory.provide(loaded(folder))
     as_user(UID, lambda: put(place, "map", {"n": 8}))
     with Board(place, "test") as board:
         assert (board.item("map").get().value, board.item("plan").get().value) == ({"n": 8}, b"p")
+
+
+@needs_root
+def test_a_value_that_its_user_has_damaged_hides_no_other_value(place: Path) -> None:
+    put(place, "ball", {"x": 1.0, "y": 2.0})
+    as_user(OTHER, lambda: put(place, "plan", b"p"))
+    as_user(UID, lambda: put(place, "map", {"n": 7}))
+
+    def damage() -> None:
+        file = MappedFile.open(place / f"own+{UID}", writable=True)
+        record = file.record("map")
+        assert record is not None
+        bank = record.offset + record.stride
+        struct.pack_into("<I", file.area, bank + 24, 1 << 30)
+
+    as_user(UID, damage)
+    with Board(place, "test") as board:
+        assert set(board.snapshot()["robot1"]) == {"ball", "plan"}
+        with pytest.raises(failover.BoardError):
+            board.item("map").get()
+
+
+@needs_root
+def test_a_program_that_uses_no_item_of_a_user_outlives_that_he_makes_his_file_shorter(place: Path) -> None:
+    """Root stands for him; the program is a process of its own, because the kernel would end it."""
+    pid = os.fork()
+    if pid == 0:
+        with contextlib.suppress(Exception):
+            with Board(place, "test") as board:
+                board.item("ball").put({"x": 1.0, "y": 2.0})
+                os.truncate(place / f"own+{UID}", 0)
+                board.item("ball").put({"x": 3.0, "y": 4.0})
+                board.add(Item("fresh", size=8)).put(b"f")
+            os._exit(0)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+
+
+def test_where_the_agent_makes_the_private_file_alone_anew_a_program_goes_there(folder: Path, found: None) -> None:
+    place = board_directory.provide(loaded(folder, BALL))
+    assert place is not None
+    with Board(place, "test") as board:
+        board.item("notes").put(["a"])
+        directory.retire(place / "private")
+        board_directory.provide(loaded(folder))
+        board.add(Item("fresh", size=8, shared=False)).put(b"f")
+        board.item("notes").put(["b"])
+        assert board.names() == ["ball", "notes", "fresh"]
 
 
 def test_a_file_that_is_made_shorter_while_it_is_mapped_is_told_in_a_sentence(
