@@ -1650,6 +1650,17 @@ static inline int fb_take_item_(fb_item *item, fb_place_ *place)
     return 0;
 }
 
+/* Forget what was removed or made anew; the whole board only where a file is lost in which all have items. The guard is held. */
+static inline void fb_forget_lost_(fb_board *board)
+{
+    fb_forget_gone_(board);
+    for (const fb_area_ *area = board->areas; area != NULL; area = area->next)
+        if (!area->is_peer && !area->always_wakes && !fb_is_there_(area)) {
+            fb_give_up_(board);
+            return;
+        }
+}
+
 /* Examine what is not as it was remembered, and give the place of an item: 0 or -errno. */
 static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_place_ **found)
 {
@@ -1665,8 +1676,7 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
             place = fb_known_(item, robot);
         }
         if (failed == -ESTALE && ++lost < 3) { /* made anew since it was opened; or that file alone is gone, and stays so */
-            if (!fb_forget_gone_(board))
-                fb_give_up_(board);
+            fb_forget_lost_(board);
             continue;
         }
         if (failed != 0) {
@@ -1675,8 +1685,7 @@ static inline int fb_settle_(fb_item *item, const char *robot, bool to_put, fb_p
         }
         const uint64_t generation = fb_load_(place->generation);
         if (fb_is_lost_(generation)) {
-            if (!fb_forget_gone_(board))
-                fb_give_up_(board);
+            fb_forget_lost_(board);
             continue;
         }
         if (generation != place->remembered) {
@@ -1993,7 +2002,7 @@ static inline int fb_youngest(fb_item *item, void *value, fb_reading *reading, c
             if (robot != NULL)
                 memcpy(robot, robots[index], sizeof robots[index]);
             outcome = 0;
-        } else if (found != 0 && found != -ENODATA && found != -ENOENT && found != -ESTALE) {
+        } else if (found != 0 && found != -ENODATA && found != -ENOENT && found != -ESTALE && !(found == -EACCES && index == 0)) {
             outcome = found;
         }
     }
@@ -2039,12 +2048,14 @@ static inline fb_taken_ **fb_taken_of_(fb_board *board, fb_area_ *area, fb_taken
             *outcome = -ENODATA;
         if (*outcome != 0) {
             free(taken);
-            *outcome = *outcome == -ENODATA ? 0 : *outcome;
+            *outcome = *outcome == -ENODATA || area->always_wakes ? 0 : *outcome;
         } else {
             *end = taken;
             end = &taken->next;
         }
     }
+    if (*outcome < 0 && *outcome != -ENOMEM && area->always_wakes) /* its one user has damaged it: to get an item of it says so */
+        *outcome = 0;
     return *outcome < 0 ? NULL : end;
 }
 

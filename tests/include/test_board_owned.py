@@ -10,13 +10,16 @@ from pathlib import Path
 
 import pytest
 
+import failover
 from agent.worker import board_directory
-from failover.boards import directory
+from failover.boards import boottime, directory
 from failover.boards.board import Board
 from failover.boards.mapping import MappedFile
+from failover.boards.received import ReceivedItems
 from failover.core.board import layout
 from failover.core.board.items import Item
 from failover.core.board.layout import wanted_of
+from failover.core.frames.frame import Portion
 from tests.agent.worker.test_board_directory import folder, loaded
 from tests.include.board_programs import tool
 
@@ -76,6 +79,39 @@ def test_its_user_puts_it_in_c_others_read_it_and_another_users_put_names_the_us
         assert words == {"map=mine", "plan=theirs", "ball=b"}
         python.item("plan").put(b"root may") if other.say("close") == "ok" else None
         assert mapper.say("get", "plan", "-").startswith("root may ")
+
+
+def test_what_its_user_damages_in_his_file_costs_c_no_other_item_and_no_lock(place: Path) -> None:
+    with tool(place, opened=False) as c, Board(place, "test") as python:
+        c.ok("user", OTHER_UID)
+        c.ok("open")
+        for name in ("map", "plan", "ball"):
+            c.ok("find", name, 8)
+        c.ok("put", "ball", "b")
+        python.item("map").put(b"mine")
+        assert c.say("get", "map", "-").startswith("mine ")
+        file = MappedFile.open(place / f"own+{UID}", writable=True)
+        at = file.records()[0].at + layout.BANKS_FIELD
+        struct.pack_into("<H", file.area, at, 99)
+        file.words[layout.GENERATION_AT // 8] += 2
+        assert "damaged" in c.say("get", "map", "-")
+        assert {word.partition("=")[0] for word in c.say("snapshot").split(" ") if word} == {"robot1/ball"}
+        file.words[layout.GENERATION_AT // 8] = layout.GONE
+        assert "made anew, or removed" in c.say("get", "map", "-")
+        with pytest.raises(failover.BoardError, match=f"written by pid {c.pid}"):
+            python.item("ball").put(b"x")
+        assert {word.partition("=")[0] for word in c.say("snapshot").split(" ") if word} == {"robot1/ball"}
+        c.ok("put", "ball", "c")
+
+
+def test_the_youngest_value_of_all_robots_is_read_where_the_user_is_not(place: Path) -> None:
+    peer = ReceivedItems.open(place / "peer-robot2")
+    peer.heard(boottime.machine_ns())
+    peer.tell_state(layout.RUN)
+    peer.take((Portion(3, 0, 1, b"theirs"),), boottime.machine_ns(), 0, 0)
+    with tool(place) as c:
+        c.ok("find", "way", 8)
+        assert "theirs" in c.say("youngest", "way")
 
 
 def test_while_the_agent_makes_the_board_anew_a_program_waits_for_it(folder: Path, place: Path) -> None:
