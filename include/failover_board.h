@@ -1288,8 +1288,8 @@ static inline int fb_search_own_(fb_board *board, const char *name, uint32_t id,
     if (whose < 0 && whose != -ENODATA)
         return whose;
     if (whose > 0 && *owner.file == '\0')
-        return fb_fail_(EACCES, "item %s is for user %s alone; no program of %s can put it: failover status says why", owner.name,
-                        owner.user, board->own->robot);
+        return fb_fail_(EACCES, "item %s is for user %s alone; no program of %s can put it: failover status says why, or its robots in "
+                        "team.toml leave %s out", owner.name, owner.user, board->own->robot, board->own->robot);
     if (whose > 0) {
         *found = fb_of_user_(board, owner.file);
         return *found == NULL ? -errno : fb_search_(*found, owner.name, 0, record);

@@ -84,8 +84,10 @@ def provide(settings: Settings, tell: Callable[[str], None] = log.warning) -> Pa
     for path in place.glob(f"{directory.PEER_PREFIX}*"):
         if path.name.removeprefix(directory.PEER_PREFIX) not in set(robots) - {me}:
             directory.dismiss(path)
-    owned = board.owned_at(me)
-    uids = _uids(owned.values(), files.former_owners(me), me, tell)  # first: a directory of users may let it wait
+    owned = board.owned
+    uids = _uids(
+        [item for item in owned.values() if item.is_at(me)], files.former_owners(me), me, tell
+    )  # first: a directory of users may let it wait
     files.retire_unfit(directory.OWN_NAME, layout.OWN, me)  # until another one is there no program sees a part of what follows
     files.have(directory.AGENT_NAME, layout.PEER, me, {0: PRIMARIES, OWNERS_NUMBER: OWNERS} if owned else {0: PRIMARIES})
     files.have_owned(me, owned, uids, tell)
@@ -110,7 +112,7 @@ def _leave(former: Path) -> None:
 
 def _kept(state: Path, board: Board, robot: str) -> list[Item]:
     """What programs have added with keep = true, without what is declared now."""
-    declared = {item.name for item in (*board.shared_by(robot).values(), *board.private_of(robot).values())}
+    declared = {item.name for some in (board.shared_by(robot), board.private_of(robot), board.owned) for item in some.values()}
     kept = kept_items.read(state)
     for item in kept:
         if item.name in declared:
@@ -140,10 +142,13 @@ class _Files:
             directory.retire(self._place / name)
 
     def have_owned(self, robot: str, items: Mapping[int, Item], uids: Mapping[str, int], tell: Callable[[str], None]) -> None:
-        """A file of each user who alone may put items, and none of former ones; and the table that says whose is what."""
+        """A file of each user who alone may put items, and none of former ones; and the table that says whose is what.
+
+        Also an item that this robot is not to have stands in the table: else each program could add one of that name.
+        """
         of_uid: dict[int, dict[int, Item]] = {}
         for number, item in items.items():
-            of_uid.setdefault(uids[item.user], {})[number] = item
+            of_uid.setdefault(uids[item.user] if item.is_at(robot) else NOBODY, {})[number] = item
         lacking = of_uid.pop(NOBODY, {})
         for path in self._place.glob(f"{USER_PREFIX}*"):
             if uid_of(path) not in of_uid:
@@ -247,12 +252,12 @@ class _Files:
         return found == (area, self._digest, boottime.boot_id(), robot, self._ranks[robot])
 
 
-def _uids(items: Iterable[Item], former: Owners, robot: str, tell: Callable[[str], None]) -> dict[str, int]:
+def _uids(items: Sequence[Item], former: Owners, robot: str, tell: Callable[[str], None]) -> dict[str, int]:
     """The numbers of the users who alone may put items; `NOBODY` for one whom this robot does not have.
 
     Where users are in a directory elsewhere, a look-up can fail for a while: who had a number keeps it until the next boot.
     """
-    items, uids = list(items), {}
+    uids: dict[str, int] = {}
     before = {owner.user: owner.uid for owner in former.values() if owner.uid is not None}
     for user in sorted({item.user for item in items}):
         uids[user], names = uid_named(user), _names(item for item in items if item.user == user)

@@ -583,7 +583,8 @@ class Board:
     def _unknown(self, name: str, robot: str) -> str:
         owner = self.ensured().owner(name)
         if owner is not None and robot == self.ensured().robot:
-            return f"item {name!r} is for user {owner.user!r} alone; no program of {robot} can put it: failover status says why"
+            why = f"failover status says why, or its robots in team.toml leave {robot} out"
+            return f"item {name!r} is for user {owner.user!r} alone; no program of {robot} can put it: {why}"
         cure = near(name, self.names()) or "; declare it in team.toml, or with board.add()"
         return f"{robot} has no item {name!r} on the board {self.ensured().directory}{cure}"
 

@@ -300,6 +300,7 @@ class Board(Struct, frozen=True):
         """Number → item, of those that stay at a robot."""
         return {number: item for number, item in enumerate(self.items) if item.is_at(robot) and not item.is_shared_by(robot)}
 
-    def owned_at(self, robot: str) -> dict[int, Item]:
-        """Number → item, of those of a robot that one user alone may put, shared or not."""
-        return {number: item for number, item in enumerate(self.items) if item.user and item.is_at(robot)}
+    @property
+    def owned(self) -> dict[int, Item]:
+        """Number → item, of those that one user alone may put, at whichever robots."""
+        return {number: item for number, item in enumerate(self.items) if item.user}

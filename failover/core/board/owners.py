@@ -17,7 +17,8 @@ class Owner(Struct, frozen=True):
     Attributes:
         number: of the item.
         user: name of the one user who may put it.
-        uid: that user's on this robot; None: no program of this robot can put it, and the agent's status says why.
+        uid: that user's on this robot; None: no program of this robot can put it. The agent's status says why, or the
+            item's robots leave this one out.
     """
 
     number: int

@@ -23,6 +23,8 @@ import pytest
 
 import failover
 from agent.main_loop.board_link import BoardLink
+from agent.main_loop.own_items import LOOK_NS
+from agent.system import clock
 from agent.worker import board_directory
 from failover.boards import directory
 from failover.boards.agents_file import AgentsFile
@@ -282,6 +284,29 @@ def test_a_file_that_its_user_has_spoilt_harms_no_other_item_and_is_whole_again_
     as_user(UID, lambda: put(place, "map", {"n": 8}))
     with Board(place, "test") as board:
         assert (board.item("map").get().value, board.item("plan").get().value) == ({"n": 8}, b"p")
+
+
+def test_an_item_whose_robots_leave_this_one_out_is_its_users_here_too(folder: Path, found: None) -> None:
+    told: list[str] = []
+    me = pwd.getpwuid(os.geteuid()).pw_name
+    items = f'[board.items.map]\nsize = 8\nuser = "{me}"\nrobots = ["robot2"]\n[board.items.mine]\nsize = 8\nuser = "{me}"\n'
+    place = board_directory.provide(loaded(folder, BALL + items), told.append)
+    assert place is not None and not told
+    assert AgentsFile(place).owners() == {"map": Owner(2, me, None), "mine": Owner(3, me, os.geteuid())}
+    with Board(place, "test") as board:
+        assert sorted(board.names()) == ["ball", "mine", "notes"]
+        item = board.add(Item("map", size=8))  # robot2's: declared alike already
+        with pytest.raises(failover.BoardError, match=r"or its robots in team\.toml leave robot1 out"):
+            item.put(b"fake")
+        file = board.ensured().own
+        with file.changing():
+            file.add(wanted_of(Item("map", size=8), file.next_id(), layout.ADDED))
+        with pytest.raises(failover.BoardError, match="leave robot1 out"):
+            item.put(b"fake")
+        assert sorted(board.names()) == ["ball", "mine", "notes"]
+    with contextlib.closing(BoardLink.open(place, 20_000_000)) as link:
+        told_items = [link.due(round_, clock.now_ns() + round_ * LOOK_NS) for round_ in range(1, 6)]
+        assert not any(b"map" in portion.value for told_ in told_items for portion in told_)
 
 
 @needs_root
