@@ -517,6 +517,8 @@ class MainLoop:
             if name in before and set(before[name].keys) - set(robots[name].keys):
                 self._frames.forget_older(name)
         if {name: robot.keyless for name, robot in robots.items()} == {name: robot.keyless for name, robot in before.items()}:
+            if self._board is not None:
+                self._open_board()  # the worker has looked at each file, and made anew what a user had damaged
             return  # other keys of the connections, which are the worker's
         members = settings.team.roster()
         self._beats.know(settings.peers)

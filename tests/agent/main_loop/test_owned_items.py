@@ -8,14 +8,20 @@ import select
 import struct
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from agent.main_loop.board_link import BoardLink
+from agent.main_loop.loop import MainLoop
 from agent.main_loop.own_items import LOOK_NS, UNREADABLE, OwnItems
 from agent.system import clock
 from agent.worker import board_directory
+from failover.boards import directory
 from failover.boards.board import Board
 from failover.boards.mapping import MappedFile
 from failover.core.board import layout
@@ -185,3 +191,20 @@ def test_a_board_without_such_items_is_read_with_two_calls_a_round_as_ever(
         files = 3 if owned else 1
         assert calls.count("pread") <= 2 * files and len(calls) == calls.count("pread")
         assert owned or len(calls) == 2
+
+
+def test_a_file_that_was_made_anew_with_other_keys_of_the_team_is_sent_from_then_on(folder: Path, place: Path) -> None:
+    settings = loaded(folder)
+    one: Any = SimpleNamespace(_settings=settings, _me="robot1", _has_board=True, _media=SimpleNamespace(round_ns=ROUND_NS))
+    one._attend = one._neglect = one._note_urgent = lambda *_: None
+    one._frames = SimpleNamespace(forget_older=lambda _: None)
+    one._close_board, one._open_board = partial(MainLoop._close_board, one), partial(MainLoop._open_board, one)
+    one._board = None
+    one._open_board()
+    directory.retire(place / f"own+{UID}")
+    board_directory.provide(settings)
+    with Board(place, "test") as board:
+        board.item("map").put(b"anew")
+    MainLoop._take_team(one, {name: replace(robot, next_key="k" * 40) for name, robot in settings.team.robots.items()})
+    assert sent(one._board, 1)[MAP] == b"anew"
+    one._close_board()
