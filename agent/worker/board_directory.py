@@ -103,6 +103,24 @@ def provide(settings: Settings, tell: Callable[[str], None] = log.warning) -> Pa
     return place
 
 
+def damaged_files(place: Path) -> list[str]:
+    """A sentence for each user who has damaged his file since it was made."""
+    owners: Owners = {}
+    with contextlib.suppress(BoardError):
+        owners = AgentsFile(place).owners() or {}
+    told = []
+    for uid, user in sorted({(owner.uid, owner.user) for owner in owners.values() if owner.uid is not None}):
+        try:
+            with contextlib.closing(UnmappedFile.open(place / f"{USER_PREFIX}{uid}")) as file:
+                file.table()
+        except (BoardError, OSError) as error:
+            told.append(
+                f"user {user!r} has damaged the file of that user's items, which are not sent ({error}): end that program, and "
+                "restart the agent, which makes the file anew"
+            )
+    return told
+
+
 def _leave(former: Path) -> None:
     """The robot had no board before: tell its tasks that the schedule is beside the board now."""
     directory.dismiss(former / SCHEDULE_NAME)

@@ -161,6 +161,14 @@ class Worker(Switchboard):
         if self._board_place is not None:
             await self._provide_board()
 
+    def notices(self) -> list[str]:
+        """See `agent.worker.hub.Switchboard.notices`; besides which users have damaged their files of the board."""
+        if self._board_place is None:
+            return super().notices()
+        from agent.worker import board_directory  # here: a team without a board does not load it
+
+        return [*super().notices(), *board_directory.damaged_files(self._board_place)]
+
     async def _provide_board(self) -> None:
         self._board_troubles.clear()
         if not self.settings.team.board.items and not os.path.lexists(self._runtime / LINK_NAME):

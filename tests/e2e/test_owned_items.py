@@ -136,3 +136,8 @@ def test_its_users_program_puts_it_at_whichever_robot_it_runs_and_no_other_user_
         before = at("robot2")
         robots.until(lambda: at("robot2") > before + 20, "more of it")
         assert at("robot2") < 10**6
+        os.truncate(board_of(second) / f"own+{MAPPER.pw_uid}", 100)
+        said = f"user '{MAPPER.pw_name}' has damaged the file of that user's items, which are not sent"
+        robots.until(
+            lambda: any(note.startswith(said) for note in second.status()["notes"]), "the agent to run on, and to say so"
+        )

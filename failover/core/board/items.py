@@ -237,6 +237,8 @@ def _check_words(item: Item) -> None:
             names.check_component(item.writer)
         except NameFormatError as error:
             raise ItemError(f"writer: {error}", "writer") from error
+    if item.user.isdecimal():
+        raise ItemError(f"user {item.user[:80]!r} is a number: name the user, whose number each robot looks up", "user")
     if not _is_visible(item.user) or set(item.user) & set("/:") or len(item.user.encode(errors="replace")) > USER_SIZE_MAX:
         raise ItemError(f"user {item.user[:80]!r} cannot be the name of a user; see getent passwd", "user")
 

@@ -261,7 +261,11 @@ def test_a_file_that_its_user_has_spoilt_harms_no_other_item_and_is_whole_again_
             assert board.item("plan").get().value == b"p"
 
     as_user(OTHER, another)
+    said = board_directory.damaged_files(place)
+    assert len(said) == 1 and said[0].startswith(f"user '{MAPPER}' has damaged the file of that user's items, which are not sent")
+    assert "it has 100 bytes" in said[0]
     board_directory.provide(loaded(folder))
+    assert board_directory.damaged_files(place) == []
 
     def damage() -> None:
         file = MappedFile.open(place / f"own+{UID}", writable=True)

@@ -48,6 +48,7 @@ def test_an_item_knows_its_type_and_its_size() -> None:
         ({"name": "a", "size": 4, "robots": "robot1"}, "robots", "no list"),
         ({"name": "a", "size": 4, "writer": "mapper"}, "writer", "cannot name a component"),
         ({"name": "a", "size": 4, "user": 3}, "user", "user 3 is no str"),
+        ({"name": "a", "size": 4, "user": "1001"}, "user", "user '1001' is a number: name the user"),
         *[
             ({"name": "a", "size": 4, "user": user}, "user", "cannot be the name")
             for user in ("a b", "a/b", "a:b", "a\n", "u" * 65)
