@@ -1,7 +1,7 @@
 """A file of a board, read and written without a mapping.
 
 Who may write the file may make it shorter at any time. The kernel ends a process that touches a lost page of a mapping
-(SIGBUS); a read only comes back short. So the agent maps no file that a program may write.
+(SIGBUS); a read only comes back short. So the agent maps no file of a board that a program may write.
 """
 
 from __future__ import annotations
