@@ -17,7 +17,8 @@ from agent.config import Settings
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
 from agent.worker.components.run_records import Records
-from checkpoint.store.store import Store, open_store
+from checkpoint.store.contract import SnapshotStore
+from checkpoint.store.store import open_store
 from failover.client.control import Control
 from failover.core import vote_record as core_vote_record
 from failover.core.types import EPOCH_SAID_MAX, PEERS_MAX, Record, State
@@ -77,7 +78,7 @@ def _mended(record: Record, epoch: int, *, has_left: bool) -> Record:
     return Record(record.name, epoch, state=state, spec=record.spec, begun=record.begun or has_left)
 
 
-def _later(store: Store | None, name: str, epoch: int) -> list[tuple[int, int]]:
+def _later(store: SnapshotStore | None, name: str, epoch: int) -> list[tuple[int, int]]:
     """Generation and number of the snapshots captured under later epochs."""
     positions = store.positions(name) if store is not None else ()
     return [(one.generation, one.sequence) for one in positions if one.generation // (PEERS_MAX + 1) > epoch]

@@ -51,7 +51,8 @@ from checkpoint.runtime import allocator
 from checkpoint.snapshot.required_files import Need, names_of_contents, needs
 from checkpoint.store import lost_copies
 from checkpoint.store.content_store import FOLDER as CONTENTS_FOLDER
-from checkpoint.store.store import Store, open_store
+from checkpoint.store.contract import SnapshotStore
+from checkpoint.store.store import open_store
 from checkpoint.store.xor_cache_budget import PageBudget
 from failover.boards import LINK_NAME
 from failover.config.quantities import size_bytes
@@ -232,7 +233,7 @@ class Worker(Switchboard):
         await self._process_pool.close()
         self._store.close()
 
-    async def _open_store(self) -> Store:
+    async def _open_store(self) -> SnapshotStore:
         """Have the store to ourselves; an earlier life of the agent that still ends is waited for."""
         for _ in range(STORE_TRIES):
             try:
@@ -515,11 +516,11 @@ NOTICES_SHOWN: Final = 10
 """Of the store's latest findings."""
 
 
-def _held(store: Store) -> tuple[Held, ...]:
+def _held(store: SnapshotStore) -> tuple[Held, ...]:
     return tuple(Held(name, store.positions(name)[-HISTORY_MAX:], _keeps_state(store, name)) for name in store.components())
 
 
-def _keeps_state(store: Store, name: str) -> bool:
+def _keeps_state(store: SnapshotStore, name: str) -> bool:
     """Whether the newest snapshot is of a program that keeps its state; False also where it cannot be read now."""
     newest = newest_of(store, name)
     return newest is not None and newest.engine == COOPERATIVE

@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from msgspec import Struct
 from msgspec.structs import replace
 
 from checkpoint.errors import ChainError, FormatError, StoreError
@@ -33,6 +32,7 @@ from checkpoint.store import inventory
 from checkpoint.store.atomic_files import WholeFiles, disk_trouble
 from checkpoint.store.chain_files import ChainFiles, entry_of
 from checkpoint.store.content_store import Contents
+from checkpoint.store.contract import Kept
 from checkpoint.store.disk import FILE_MODE, Disk, lock_exclusively
 from checkpoint.store.fold_rules import fold_is_due, held_at_once
 from checkpoint.store.index import SUFFIXES, Entry, Shelf, file_name, folder_name, order_of_name
@@ -58,26 +58,8 @@ NOTICES_KEPT = 100
 NOTHING_OLD = Retention()
 
 
-class Kept(Struct, frozen=True):
-    """The store's content for one component, for people.
-
-    Attributes:
-        positions: that the rules may go back to; ``olds``: whole checkpoints besides, kept for people.
-        size: bytes of all files; ``newest_s``, ``oldest_s``: when the first and the last of them came, in seconds since 1970.
-    """
-
-    positions: int
-    olds: int
-    size: int
-    newest_s: float
-    oldest_s: float
-
-
 class Store:
-    """The snapshots on one machine. Methods may be called from any thread; one process at a time.
-
-    Made by ``open_store``. Every method raises StoreError when the disk fails; what the store already held is intact.
-    """
+    """The snapshots on one machine, as `checkpoint.store.contract` says. Made by ``open_store``; one process at a time."""
 
     def __init__(self, root: Path, disk: Disk, lock: int, retention: Retention, budget: PageBudget) -> None:
         self._root = root

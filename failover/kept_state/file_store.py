@@ -26,6 +26,7 @@ from checkpoint.store.store import open_store
 from failover.errors import NotCommittedError, StateTakenError, TaskError
 
 if TYPE_CHECKING:
+    from checkpoint.store.contract import SnapshotStore
     from failover.kept_state.state import KeptState
 
 log = logging.getLogger("failover.task")
@@ -67,7 +68,7 @@ class StateFile:
         self.component = component
         self.folder = folder
         try:
-            self._store = open_store(folder, disk)
+            self._store: SnapshotStore = open_store(folder, disk)
         except StoreError as error:
             if "another process" in str(error):
                 raise StateTakenError(

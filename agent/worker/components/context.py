@@ -17,7 +17,7 @@ from agent.worker.components.paths import Places
 from agent.worker.components.resume_order import ResumeOrder
 from agent.worker.components.run_records import Records
 from checkpoint.linux.spawn.inherited_limits import Inheritance
-from checkpoint.store.store import Store
+from checkpoint.store.contract import SnapshotStore
 from failover.core.events import Event
 from failover.core.types import COMMITTED, Launch
 
@@ -37,7 +37,7 @@ class Surroundings(Struct):
     """
 
     places: Places
-    store: Store
+    store: SnapshotStore
     records: Records
     tell: Callable[[Event], None]
     silence_ns: Callable[[str], Coroutine[Any, Any, int]]

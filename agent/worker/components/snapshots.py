@@ -19,7 +19,7 @@ from checkpoint.keeper.messages import Unchanged, close_all, content_of
 from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
 from checkpoint.store import lost_copies
-from checkpoint.store.store import Store
+from checkpoint.store.contract import SnapshotStore
 from failover.core import acts, events
 
 log = logging.getLogger("failover.component")
@@ -103,7 +103,7 @@ class Snapshots(Struct, frozen=True):
                 await asyncio.to_thread(store.drop, self.name)
 
 
-def newest_of(store: Store, name: str) -> Snapshot | None:
+def newest_of(store: SnapshotStore, name: str) -> Snapshot | None:
     """The newest snapshot of a component here, without its pages; None where there is none that can be read."""
     chain: list[int] = []
     if not store.positions(name):

@@ -26,7 +26,7 @@ from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, P
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
     from agent.worker.components.statistics import Commits, Figures, Memory, Resumed
     from agent.worker.components.supervisor import Supervisor
-    from checkpoint.store.store import Kept, Store
+    from checkpoint.store.contract import Kept, SnapshotStore
 
 NANOSECONDS_A_MILLISECOND: Final = 1_000_000
 
@@ -80,7 +80,7 @@ class WorkerView(Struct, frozen=True):
     notices: list[str]
     interfaces: list[dict[str, object]]
     supervisors: Mapping[str, Supervisor] = field(default_factory=dict)
-    store: Store | None = None
+    store: SnapshotStore | None = None
     memory: Memory | None = None
     arriving: Callable[[str], list[dict[str, Any]]] = lambda _: []
 
@@ -268,7 +268,9 @@ def _waiting_output(view: ComponentView, waiting: int) -> tuple[str, ...]:
     )
 
 
-def _component(view: ComponentView, supervisor: Supervisor | None, settings: Settings, store: Store | None) -> dict[str, Any]:
+def _component(
+    view: ComponentView, supervisor: Supervisor | None, settings: Settings, store: SnapshotStore | None
+) -> dict[str, Any]:
     figures = supervisor.figures if supervisor is not None else None
     running = supervisor.component if supervisor is not None else None
     newest = view.positions[0] if view.positions else None

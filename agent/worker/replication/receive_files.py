@@ -22,7 +22,7 @@ from agent.worker.replication.transfer import Refusal
 from checkpoint.errors import StoreError
 from checkpoint.snapshot.required_files import Need
 from checkpoint.store.content_store import DIGEST_SIZE, digest_of_file
-from checkpoint.store.store import Store
+from checkpoint.store.contract import SnapshotStore
 from failover.core.wire.messages import Belonging, Belongings, Content, Lacking
 
 PATH_MAX: Final = 4096
@@ -58,7 +58,7 @@ class Limits(Struct, frozen=True):
 class Stock:
     """The files here, and the `Desk` for contents that come in. One for an agent; lives in its loop, reads files in threads."""
 
-    def __init__(self, store: Store, limits: Limits, robot: str, admits: Callable[[str, str], str]) -> None:
+    def __init__(self, store: SnapshotStore, limits: Limits, robot: str, admits: Callable[[str, str], str]) -> None:
         """
         Args:
             robot: own name, for the sentences.

@@ -22,7 +22,7 @@ from checkpoint.keeper.messages import close_all
 from checkpoint.model import OutputPiece, Position, Snapshot
 from checkpoint.sentences import in_words
 from checkpoint.snapshot import carried_files, format, untrusted
-from checkpoint.store.store import Store
+from checkpoint.store.contract import SnapshotStore
 from failover.core.acts import Accept, Admit, Discard, Show
 from failover.core.events import Event, Stored, StoreFailed
 from failover.core.types import COMMITTED
@@ -74,7 +74,7 @@ class Deposit:
 
     def __init__(
         self,
-        store: Store,
+        store: SnapshotStore,
         places: Places,
         tell: Callable[[Event], None],
         kept: Callable[[Offer, Snapshot], None],

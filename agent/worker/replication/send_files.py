@@ -25,7 +25,7 @@ from agent.worker.replication.transfer import Arriving, Shipper
 from checkpoint.errors import CheckpointError
 from checkpoint.snapshot.required_files import Need
 from checkpoint.store.content_store import digest_of_descriptor
-from checkpoint.store.store import Store
+from checkpoint.store.contract import SnapshotStore
 from failover.core.wire.messages import BELONGINGS_MAX, Belonging, Belongings, Bulk, Content, Lacking
 
 ANSWER_S: Final = 60.0
@@ -219,7 +219,7 @@ def named_needs(needs: list[Need]) -> str:
 class Sources:
     """Where this robot's own copy of a file is: brought here before, at its path, or only in the program that has it mapped."""
 
-    def __init__(self, store: Store, ask: Callable[[str, Need], Awaitable[int]]) -> None:
+    def __init__(self, store: SnapshotStore, ask: Callable[[str, Need], Awaitable[int]]) -> None:
         """
         Args:
             ask: the component's keeper, for the descriptor of a file without a path any more, or that only the program may read.

@@ -15,8 +15,8 @@ from agent.worker.replication.transfer import Shipper, digest_of
 from checkpoint.errors import CheckpointError
 from checkpoint.model import Position
 from checkpoint.snapshot.required_files import Need, needs
+from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.index import Entry
-from checkpoint.store.store import Store
 from failover.core.acts import CancelShip, Ship
 from failover.core.events import Event, ShipEnded, UnderWay
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Offer
@@ -29,7 +29,7 @@ class Dispatch:
 
     def __init__(
         self,
-        store: Store,
+        store: SnapshotStore,
         shipper: Shipper,
         tell: Callable[[Event], None],
         hindrance: Callable[[], str] = lambda: "",
