@@ -85,6 +85,10 @@ class BridgeError(FailoverError):
     """Programs of another middleware cannot be reached, or asked for what a bridge has not; the message says what to do."""
 
 
+class ArchiveError(FailoverError):
+    """An archive of checkpoints cannot be reached, or holds not what was sealed; the message names the object and the cure."""
+
+
 class ItemError(FailoverError):
     """An item of the board is declared in a way that cannot work; nothing was changed.
 

@@ -112,7 +112,7 @@ def test_run_explains_itself_when_it_is_asked(words: list[str]) -> None:
     assert all(f"./run {verb}" in ran.stdout for verb in ("demo", "test", "setup", "table", "fuzz", "audit"))
 
 
-def test_run_tries_once_for_each_list_to_install_the_tools_of_the_audit_for_the_tests(tmp_path: Path) -> None:
+def test_run_tries_once_for_each_list_to_install_what_has_an_environment_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "venv").mkdir()
     python = tmp_path / "python"
     python.write_text(f"#!/bin/sh\necho tried >>{tmp_path}/tries\nexit 1\n")
@@ -127,9 +127,11 @@ def test_run_tries_once_for_each_list_to_install_the_tools_of_the_audit_for_the_
         assert ran.returncode == 0, ran.stderr
         return (tmp_path / "tries").read_text().count("tried")
 
-    assert [tries(do) for do in ("make_audit_once why", "make_audit_once why", "make_audit why")] == [1, 1, 2]
+    own = "audit requirements-audit.txt why"
+    assert [tries(do) for do in (f"make_own_once {own}", f"make_own_once {own}", f"make_own {own}")] == [1, 1, 2]
+    assert tries("make_own_once s3-servers requirements-s3-servers.txt why") == 3, "another list is tried"
     (tmp_path / "venv/audit").mkdir()
-    assert tries("cksum requirements-audit.txt >$venv/audit/made; make_audit why") == 3, "its Python is missing"
+    assert tries(f"cksum requirements-audit.txt >$venv/audit/made; make_own {own}") == 4, "its Python is missing"
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,12 @@ from msgspec.structs import replace
 from checkpoint.errors import ChainError, FormatError
 from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
+from checkpoint.snapshot.byte_sources import Source
 from checkpoint.snapshot.canonical_state import header_of
+from checkpoint.snapshot.frames import Sink
 from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
-from checkpoint.store.base_on_disk import stored_chain
+from checkpoint.store.base_on_disk import stored_base, stored_chain
 from checkpoint.store.disk import DiskFile
 from checkpoint.store.fold_rules import newest_output
 from checkpoint.store.folding import Folding
@@ -103,6 +105,21 @@ class ChainFiles:
     def _write(self, folded: Snapshot, write: Callable[[DiskFile], int]) -> Entry:
         final = self._root / folder_name(folded.component) / file_name(header_of(folded))
         return entry_of(final, folded, self._files.write(final, write))
+
+
+def fold_to(file: Sink, *sources: Source) -> None:
+    """Write the state that a chain leads to as one base, to an empty file; nothing is set out of use here.
+
+    Raises:
+        FormatError, ChainError: a file of it is damaged, or it is no chain.
+        OSError: the file does not take it.
+    """
+    if len(sources) > 1 and not any(map(format.is_of_several_processes, sources)):
+        with stored_base(*sources) as stored:
+            Folding(stored, replace(stored.outline, output=newest_output(stored.outline.output))).write(file)
+    else:
+        whole = chain.fold([format.decode(source) for source in sources])
+        format.encode(replace(whole, output=newest_output(whole.output)), file)
 
 
 def entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:

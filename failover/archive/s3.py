@@ -1,0 +1,176 @@
+"""Objects in a bucket of S3, or of a server that speaks its protocol. The only ``obstore`` import, of the extra ``s3``.
+
+The keys come from where every such program has them: the environment (AWS_ACCESS_KEY_ID …), the role of a machine, and
+``~/.aws/credentials``, which the library leaves to us.
+
+Sources: PutObject with If-None-Match, and the 5 GB that one put takes: S3's API reference; the file: AWS CLI's user guide.
+"""
+
+from __future__ import annotations
+
+import configparser
+import contextlib
+import mmap
+import os
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+from failover.archive.objects import Readable, Stored
+from failover.errors import ArchiveError
+
+PUT_SIZE_MAX: Final = 5 << 30
+CONNECT: Final = timedelta(seconds=10)
+SILENT: Final = timedelta(seconds=60)
+"""Without a byte from the server."""
+WHOLE: Final = timedelta(hours=6)
+"""Of one request: 5 GB at 2 Mbit/s."""
+TRIES_MAX: Final = 3
+TRYING: Final = timedelta(seconds=60)
+REGION: Final = "us-east-1"
+"""Where no other is named: servers other than S3 have none, and the signature needs one."""
+
+KEYS: Final = {
+    "aws_access_key_id": "access_key_id",
+    "aws_secret_access_key": "secret_access_key",
+    "aws_session_token": "session_token",
+}
+
+
+class S3Objects:
+    """The objects below a prefix of a bucket, as `failover.archive.objects.ObjectStore` says."""
+
+    def __init__(self, bucket: str, prefix: str, endpoint: str = "") -> None:
+        """
+        Args:
+            endpoint: URL of the server; "": what the environment says (AWS_ENDPOINT_URL), else S3 itself.
+
+        Raises:
+            ArchiveError: the library is not installed, or cannot use these settings.
+        """
+        try:
+            import obstore
+            from obstore import exceptions, store
+        except ImportError as error:
+            raise ArchiveError(
+                "an archive in S3 needs the library obstore, which is not installed: pip install 'failover[s3]'"
+            ) from error
+        self._library, self._errors = obstore, exceptions
+        self._place = f"s3://{bucket}/{prefix}".rstrip("/")
+        named = {"endpoint": endpoint} if endpoint else {}
+        region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or REGION
+        with self._told("be used"):
+            self._store = store.S3Store(
+                bucket,
+                prefix=prefix or None,
+                region=region,
+                checksum_algorithm="sha256",
+                disable_bulk_delete=True,  # not every server has it
+                client_options={
+                    "allow_http": (endpoint or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://"),
+                    "connect_timeout": CONNECT,
+                    "read_timeout": SILENT,
+                    "timeout": WHOLE,
+                },
+                retry_config={"max_retries": TRIES_MAX, "retry_timeout": TRYING},
+                **named,
+                **_keys_of_file(),
+            )
+
+    def put(self, name: str, content: BinaryIO) -> bool:
+        """See `ObjectStore.put`. The server compares a digest of the content."""
+        size = os.fstat(content.fileno()).st_size
+        if size > PUT_SIZE_MAX:
+            raise ArchiveError(f"{name} has {size} bytes: S3 takes {PUT_SIZE_MAX} at once; use a folder as the archive")
+        try:
+            with self._told(f"take {name}"), mmap.mmap(content.fileno(), size, prot=mmap.PROT_READ) as mapped:
+                self._library.put(self._store, name, memoryview(mapped), mode="create")  # not copied: the file's own pages
+        except _FoundError:
+            return False
+        return True
+
+    def size(self, name: str) -> int | None:
+        """See `ObjectStore.size`."""
+        with contextlib.suppress(_MissingError), self._told(f"say whether it has {name}"):
+            return int(self._library.head(self._store, name)["size"])
+        return None
+
+    def open(self, name: str, first: int = 0) -> Readable:
+        """See `ObjectStore.open`."""
+        with self._told(f"give {name}"):
+            return _Body(self, name, iter(self._library.get(self._store, name, options={"range": {"offset": first}})))
+
+    def listed(self, folder: str) -> Iterator[Stored]:
+        """See `ObjectStore.listed`."""
+        with self._told("list its objects"):
+            found = [
+                Stored(one["path"], one["size"], one["last_modified"].timestamp())
+                for part in self._library.list(self._store, folder)
+                for one in part
+            ]
+        yield from sorted(found, key=lambda one: one.name)
+
+    def remove(self, name: str) -> None:
+        """See `ObjectStore.remove`."""
+        with contextlib.suppress(_MissingError), self._told(f"remove {name}"):
+            self._library.delete(self._store, name)
+
+    @contextlib.contextmanager
+    def _told(self, tried: str) -> Iterator[None]:
+        """Turn what the library says into one sentence."""
+        try:
+            yield
+        except (self._errors.BaseError, ValueError, OSError) as error:
+            is_found = isinstance(error, self._errors.AlreadyExistsError | self._errors.PreconditionError)
+            kind = (
+                _FoundError
+                if is_found
+                else _MissingError
+                if isinstance(error, self._errors.NotFoundError | FileNotFoundError)
+                else ArchiveError
+            )
+            said = str(error).partition("\n")[0].rstrip(" :")
+            raise kind(f"the archive {self._place} did not {tried}: {said}") from error
+
+
+class _FoundError(ArchiveError):
+    """There is an object of that name."""
+
+
+class _MissingError(ArchiveError):
+    """There is no object of that name."""
+
+
+class _Body:
+    """An object's content as it arrives."""
+
+    def __init__(self, objects: S3Objects, name: str, parts: Iterator[Any]) -> None:
+        self._objects, self._name, self._parts = objects, name, parts
+        self._rest = memoryview(b"")
+
+    def read(self, size: int, /) -> bytes:
+        """See `failover.archive.objects.Readable`."""
+        if not self._rest:
+            with self._objects._told(f"give all of {self._name}"):
+                self._rest = memoryview(next(self._parts, b""))
+        taken, self._rest = self._rest[:size], self._rest[size:]
+        return bytes(taken)
+
+    def close(self) -> None:
+        """Ask for no more."""
+        self._parts = iter(())
+
+
+def _keys_of_file() -> dict[str, str]:
+    """What ``~/.aws/credentials`` says, where the environment says nothing."""
+    if os.environ.get("AWS_ACCESS_KEY_ID"):
+        return {}
+    path = Path(os.environ.get("AWS_SHARED_CREDENTIALS_FILE") or Path.home() / ".aws" / "credentials")
+    found = configparser.RawConfigParser()
+    try:
+        found.read(path)
+    except (configparser.Error, UnicodeDecodeError) as error:
+        raise ArchiveError(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
+    profile = os.environ.get("AWS_PROFILE") or "default"
+    return {ours: found[profile][theirs] for theirs, ours in KEYS.items() if found.has_option(profile, theirs)}

@@ -1,0 +1,171 @@
+"""The contract of the place of an archive, `failover.archive.objects`: one suite for a folder and for two servers of S3."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from failover.archive.archive import object_store
+from failover.archive.objects import FolderObjects, ObjectStore, Readable
+from failover.errors import ArchiveError
+from tests import s3_servers
+
+NAME = "lab/@%2Flab%2Fr1%2Fmapper/0001-0002-00ff.base.sealed"
+
+
+@pytest.fixture(scope="module", params=["folder", *s3_servers.KINDS])
+def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """Where the objects lie, and the server's URL."""
+    directory = tmp_path_factory.mktemp("objects") / "place"
+    directory.mkdir()
+    if request.param == "folder":
+        yield str(directory), ""
+        return
+    with s3_servers.server(request.param, directory) as url:
+        yield f"s3://{s3_servers.BUCKET}", url
+
+
+@pytest.fixture
+def objects(place: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ObjectStore:
+    """An empty one: each test has a prefix, or a folder, of its own."""
+    for name, value in s3_servers.environment().items():
+        monkeypatch.setenv(name, value)
+    where = f"{place[0]}/{tmp_path.name}"
+    if not place[1]:
+        Path(where).mkdir()
+    return object_store(where, place[1])
+
+
+@pytest.fixture
+def content(tmp_path: Path) -> Iterator[BinaryIO]:
+    with (tmp_path / "content").open("w+b") as file:
+        file.write(os.urandom(3 << 20))
+        file.flush()
+        yield file
+
+
+def whole(source: Readable) -> bytes:
+    with closing(source):
+        return b"".join(iter(lambda: source.read(1 << 16), b""))
+
+
+def test_what_was_put_is_given_back_whole_and_from_any_byte_on(objects: ObjectStore, content: BinaryIO) -> None:
+    content.seek(0)
+    sent = content.read()
+    assert objects.size(NAME) is None
+    assert objects.put(NAME, content)
+    assert objects.size(NAME) == len(sent)
+    assert whole(objects.open(NAME)) == sent
+    for first in (1, 1 << 20, len(sent) - 1):
+        assert whole(objects.open(NAME, first)) == sent[first:]
+
+
+def test_the_first_put_of_a_name_wins(objects: ObjectStore, content: BinaryIO, tmp_path: Path) -> None:
+    assert objects.put(NAME, content)
+    with (tmp_path / "other").open("w+b") as other:
+        other.write(b"another content")
+        other.flush()
+        assert not objects.put(NAME, other)
+    content.seek(0)
+    assert whole(objects.open(NAME)) == content.read()
+
+
+def test_of_puts_at_the_same_time_one_wins(objects: ObjectStore, tmp_path: Path) -> None:
+    won: list[bytes] = []
+    ready = threading.Barrier(4)
+
+    def put(content: bytes) -> None:
+        with (tmp_path / content.decode()).open("w+b") as file:
+            file.write(content * 1000)
+            file.flush()
+            ready.wait()
+            if objects.put(NAME, file):
+                won.append(content)
+
+    threads = [threading.Thread(target=put, args=(name.encode(),)) for name in ("one", "two", "three", "four")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(won) == 1
+    assert whole(objects.open(NAME)) == won[0] * 1000
+
+
+def test_objects_are_listed_by_folder_in_the_order_of_their_names(objects: ObjectStore, content: BinaryIO) -> None:
+    assert list(objects.listed("lab")) == []
+    for name in ("lab/b/2", "lab/b/1", "lab/a/3", "laboratory/a/4"):
+        objects.put(name, content)
+    assert [one.name for one in objects.listed("lab")] == ["lab/a/3", "lab/b/1", "lab/b/2"]
+    assert [one.name for one in objects.listed("lab/b")] == ["lab/b/1", "lab/b/2"]
+    (one,) = objects.listed("lab/a")
+    assert one.size == 3 << 20 and one.at_s > 1_000_000_000
+
+
+def test_what_was_removed_can_be_put_again(objects: ObjectStore, content: BinaryIO) -> None:
+    objects.remove(NAME)
+    objects.put(NAME, content)
+    objects.remove(NAME)
+    assert objects.size(NAME) is None and list(objects.listed("lab")) == []
+    with pytest.raises(ArchiveError, match="mapper"):
+        objects.open(NAME)
+    assert objects.put(NAME, content)
+
+
+def test_a_place_that_is_not_there_is_named_in_one_sentence(
+    place: tuple[str, str], content: BinaryIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in s3_servers.environment().items():
+        monkeypatch.setenv(name, value)
+    where = "s3://no-such-bucket/x" if place[1] else str(tmp_path / "not-mounted")
+    objects = object_store(where, place[1])
+    for act in (lambda: objects.put(NAME, content), lambda: list(objects.listed("lab"))):
+        with pytest.raises(ArchiveError, match=where) as refusal:
+            act()
+        assert "\n" not in str(refusal.value)
+
+
+def test_a_server_that_does_not_answer_is_named(content: BinaryIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("obstore")
+    for name, value in s3_servers.environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("failover.archive.s3.TRIES_MAX", 0)
+    objects = object_store("s3://robots/lab", "http://127.0.0.1:1")
+    with pytest.raises(ArchiveError, match=r"s3://robots/lab did not take .*127\.0\.0\.1:1") as refusal:
+        objects.put(NAME, content)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_folder_leaves_nothing_aside_and_names_lead_nowhere_else(tmp_path: Path, content: BinaryIO) -> None:
+    objects = FolderObjects(tmp_path)
+    objects.put("lab/a", content)
+    objects.put("lab/a", content)
+    assert sorted(path.name for path in (tmp_path / "lab").iterdir()) == ["a"]
+    with pytest.raises(ArchiveError, match="names no object"):
+        objects.put("lab/../../b", content)
+
+
+def test_the_keys_are_those_of_the_users_file_where_the_environment_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("obstore")
+    from failover.archive import s3
+
+    path = tmp_path / "credentials"
+    path.write_text("[default]\naws_access_key_id = a\naws_secret_access_key = b%\n[other]\naws_access_key_id = c\n")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(path))
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID", raising=False)
+    assert s3._keys_of_file() == {"access_key_id": "a", "secret_access_key": "b%"}
+    monkeypatch.setenv("AWS_PROFILE", "other")
+    assert s3._keys_of_file() == {"access_key_id": "c"}
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "mine")
+    assert s3._keys_of_file() == {}
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    path.write_text("no section")
+    with pytest.raises(ArchiveError, match="credentials cannot be read"):
+        s3._keys_of_file()

@@ -1,0 +1,256 @@
+"""An archive over a folder: what was sealed comes back, and nothing else is taken for it."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+import pytest
+from blake3 import blake3
+
+from checkpoint.errors import FormatError
+from checkpoint.model import Snapshot
+from checkpoint.snapshot import format
+from checkpoint.snapshot.required_files import Need
+from checkpoint.store import chain
+from checkpoint.store.chain_files import fold_to
+from failover.archive import sealed
+from failover.archive.archive import Archive
+from failover.archive.objects import FolderObjects
+from failover.core.types import ComponentSpec
+from failover.errors import ArchiveError
+from tests.checkpoint.snapshots import COMPONENT, family, history, page, pages_of, snapshot
+
+pytest.importorskip("cryptography")
+
+KEY = bytes(range(32))
+NAME = "lab/@x/1.base.sealed"
+
+
+@contextmanager
+def file_of(content: bytes) -> Iterator[BinaryIO]:
+    with tempfile.TemporaryFile() as file:
+        file.write(content)
+        file.flush()
+        yield file
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    path = tmp_path / "place"
+    path.mkdir()
+    return path
+
+
+def archive(place: Path, key: bytes = KEY, team: str = "lab") -> Archive:
+    return Archive(FolderObjects(place), key, team, place.parent)
+
+
+def put(archive: Archive, made: Snapshot, spec: bytes = b"") -> str:
+    with file_of(format.encode_bytes(made)) as file:
+        return archive.put(file, "r1", spec)[0]
+
+
+def fetched(archive: Archive, number: int = 0, component: str = COMPONENT) -> Snapshot:
+    with tempfile.TemporaryFile() as file:
+        archive.fetch(archive.copies(component)[number], file)
+        return format.decode(file)
+
+
+# --- Seals -----------------------------------------------------------------------------------------------------------
+
+
+def seal(content: bytes, name: str = NAME, key: bytes = KEY) -> bytes:
+    with io.BytesIO() as file:
+        size = sealed.seal(key, name, iter([content[:7], content[7:]]), file)
+        assert size == len(file.getvalue())
+        return file.getvalue()
+
+
+def opened(content: bytes, name: str = NAME, key: bytes = KEY) -> bytes:
+    return b"".join(sealed.unsealed(key, name, io.BytesIO(content)))
+
+
+def check_end(content: bytes) -> None:
+    last = sealed.last_frame(len(content))
+    sealed.check_end(KEY, NAME, content[: sealed.HEAD_SIZE], len(content), content[last:])
+
+
+@pytest.mark.parametrize("size", [0, 1, sealed.FRAME_SIZE - 1, sealed.FRAME_SIZE, sealed.FRAME_SIZE + 1, 3 * sealed.FRAME_SIZE])
+def test_what_was_sealed_comes_back(size: int) -> None:
+    content = os.urandom(size)
+    closed = seal(content)
+    assert opened(closed) == content
+    assert size < 8 or content[:8] not in closed
+    check_end(closed)
+
+
+def test_two_seals_of_one_content_share_no_byte_beyond_chance() -> None:
+    assert seal(b"secret")[: sealed.HEAD_SIZE] != seal(b"secret")[: sealed.HEAD_SIZE]
+
+
+def test_every_change_is_refused() -> None:
+    closed = seal(os.urandom(sealed.FRAME_SIZE + 100))
+    frame = sealed.FRAME_SIZE + sealed.TAG_SIZE
+    one, two = closed[sealed.HEAD_SIZE : sealed.HEAD_SIZE + frame], closed[sealed.HEAD_SIZE + frame :]
+    head = closed[: sealed.HEAD_SIZE]
+    wrong = {
+        "cut at a frame": head + one,
+        "cut in a frame": closed[:-1],
+        "without a frame": head + two,
+        "frames exchanged": head + two + one,
+        "longer": closed + b"x",
+        "a frame twice": head + one + one + two,
+        "nothing": b"",
+        "only a head": head,
+        "another kind of file": b"x" * 5000,
+    }
+    for at in [*range(sealed.HEAD_SIZE), *random.Random(1).sample(range(sealed.HEAD_SIZE, len(closed)), 8), len(closed) - 1]:
+        wrong[f"a bit at {at}"] = closed[:at] + bytes([closed[at] ^ 1]) + closed[at + 1 :]
+    for why, content in wrong.items():
+        with pytest.raises(ArchiveError):
+            raise AssertionError(f"{why}: {len(opened(content))} bytes were taken")
+
+
+def test_another_key_and_another_name_are_refused() -> None:
+    closed = seal(b"secret")
+    for name, key in ((NAME, bytes(32)), ("lab/@x/2.base.sealed", KEY)):
+        with pytest.raises(ArchiveError, match="sealed with another archive key"):
+            opened(closed, name, key)
+
+
+def test_the_end_proves_the_size() -> None:
+    closed = seal(os.urandom(2 * sealed.FRAME_SIZE + 100))
+    for wrong in (closed[:-1], closed[: sealed.last_frame(len(closed))], closed[:-1] + bytes([closed[-1] ^ 1])):
+        with pytest.raises(ArchiveError):
+            check_end(wrong)
+
+
+# --- The key ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_key_is_made_once_and_read_by_its_owner_alone(tmp_path: Path) -> None:
+    with pytest.raises(ArchiveError, match="failover archive key makes one"):
+        sealed.read_key(tmp_path)
+    path = sealed.new_key(tmp_path)
+    assert path.stat().st_mode & 0o777 == 0o600 and len(sealed.read_key(tmp_path)) == 32
+    with pytest.raises(ArchiveError, match="exists"):
+        sealed.new_key(tmp_path)
+    path.chmod(0o640)
+    with pytest.raises(ArchiveError, match="chmod 600"):
+        sealed.read_key(tmp_path)
+    path.chmod(0o600)
+    for wrong in (b"", b"ab" * 31, b"x" * 64, b"\xff\xfe"):
+        path.write_bytes(wrong)
+        with pytest.raises(ArchiveError, match="is no archive key"):
+            sealed.read_key(tmp_path)
+
+
+# --- Checkpoints -----------------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_comes_back_with_its_specification(place: Path) -> None:
+    base = history(1)[0]
+    spec = msgspec.msgpack.encode(ComponentSpec(COMPONENT, home="r1"))
+    name = put(archive(place), base, spec)
+    (copy,) = archive(place).copies()
+    assert copy.name == name and copy.component == COMPONENT
+    assert (copy.epoch, copy.generation, copy.sequence) == (1, 1, 1)
+    with tempfile.TemporaryFile() as file:
+        label = archive(place).fetch(copy, file)
+        assert pages_of(format.decode(file)) == pages_of(base)
+    assert label.robot == "r1" and msgspec.msgpack.decode(label.spec, type=ComponentSpec).home == "r1"
+    assert list(place.parent.iterdir()) == [place], "nothing is left aside"
+
+
+def test_a_second_put_of_a_checkpoint_sends_nothing(place: Path) -> None:
+    base = history(1)[0]
+    name = put(archive(place), base)
+    before = (place / name).stat()
+    assert put(archive(place), base) == name
+    assert (place / name).stat() == before
+
+
+@pytest.mark.parametrize("made", [history(5), family(4)], ids=["one process", "several processes"])
+def test_a_chain_is_archived_as_one_base(made: tuple[Snapshot, ...], place: Path, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{number}" for number in range(len(made))]
+    for path, one in zip(paths, made, strict=True):
+        path.write_bytes(format.encode_bytes(one))
+    with tempfile.TemporaryFile() as file:
+        fold_to(file, *paths)
+        file.flush()
+        archive(place).put(file, "r1")
+    base = fetched(archive(place), component=made[0].component)
+    assert base.is_base and base.position == made[-1].position
+    assert pages_of(base) == pages_of(chain.fold(made))
+
+
+def test_a_delta_is_no_checkpoint(place: Path) -> None:
+    with pytest.raises(FormatError, match="no whole checkpoint"):
+        put(archive(place), history(2)[1])
+
+
+def test_only_the_newest_copies_of_a_component_stay(place: Path) -> None:
+    for sequence in range(1, 6):
+        put(archive(place), snapshot({1: page(str(sequence))}, sequence=sequence))
+    put(archive(place), snapshot({1: page("other")}, component="/lab/other"))
+    assert archive(place).thin(COMPONENT, 2) == 3
+    assert [copy.sequence for copy in archive(place).copies(COMPONENT)] == [5, 4]
+    assert fetched(archive(place)).contents[:1] == b"5"
+    assert len(archive(place).copies()) == 3
+
+
+def test_the_owner_of_the_place_cannot_pass_one_checkpoint_off_as_another(place: Path) -> None:
+    old, new = (put(archive(place), snapshot({1: page(str(number))}, sequence=number)) for number in (1, 2))
+    (place / new).write_bytes((place / old).read_bytes())
+    with pytest.raises(ArchiveError, match="altered"):
+        fetched(archive(place))
+    assert fetched(archive(place), 1).contents[:1] == b"1"
+    for file in place.rglob("*.sealed"):
+        assert b"mapper" not in file.read_bytes()
+
+
+def test_what_arrived_otherwise_than_it_was_sent_is_found_at_once(place: Path) -> None:
+    class Losing(FolderObjects):
+        def put(self, name: str, content: BinaryIO) -> bool:
+            is_new = super().put(name, content)
+            with (place / name).open("r+b") as file:
+                file.truncate(os.fstat(file.fileno()).st_size - 1)
+            return is_new
+
+    with pytest.raises(ArchiveError, match="was put into the archive with"), file_of(format.encode_bytes(history(1)[0])) as file:
+        Archive(Losing(place), KEY, "lab", place.parent).put(file, "r1")
+
+
+def test_another_team_and_another_key_read_nothing(place: Path) -> None:
+    put(archive(place), history(1)[0])
+    assert archive(place, team="other").copies() == []
+    with pytest.raises(ArchiveError, match="another archive key"):
+        fetched(archive(place, key=bytes(32)))
+
+
+def test_files_that_a_program_needs_are_kept_once_under_names_that_tell_nothing(place: Path) -> None:
+    content = os.urandom(3_000_000)
+    digest = blake3(content).digest()
+    need = Need("/opt/mapper", len(content), digest)
+    assert archive(place).lacks(digest)
+    with pytest.raises(ArchiveError, match=r"/opt/mapper.* is not in the archive"), tempfile.TemporaryFile() as file:
+        archive(place).fetch_content(need, file)
+    with file_of(content) as file:
+        archive(place).put_content(digest, file)
+    assert not archive(place).lacks(digest)
+    assert not [path for path in place.rglob("*") if digest.hex() in path.name]
+    with tempfile.TemporaryFile() as file:
+        archive(place).fetch_content(need, file)
+        file.seek(0)
+        assert file.read() == content
+    with file_of(b"changed"), pytest.raises(ArchiveError, match="changed meanwhile"), file_of(b"changed") as file:
+        archive(place).put_content(digest, file)
+    assert archive(place).copies() == []
