@@ -23,6 +23,7 @@ from checkpoint.snapshot.carried_files import is_carriable
 from failover.config import strict_toml
 from failover.config import team as team_directory
 from failover.config.quantities import size_bytes, span_ms
+from failover.config.store import StoreConfig
 from failover.config.team import Robot, Team
 from failover.core.types import (
     BEAT_MS_MAX,
@@ -215,6 +216,7 @@ class Config:
         wireless: interfaces that count as wireless though the kernel cannot know: an Ethernet port that leads to a radio.
         media: how frames leave over an interface, by its name.
         alerts: commands that tell an operator.
+        store: copies of checkpoints that no robot keeps.
     """
 
     robot: str = ""
@@ -250,6 +252,7 @@ class Config:
     components: dict[str, ComponentConfig] = field(default_factory=dict)
     tasks: dict[str, TaskConfig] = field(default_factory=dict)
     alerts: AlertsConfig = field(default_factory=AlertsConfig)
+    store: StoreConfig = field(default_factory=StoreConfig)
 
     @property
     def xor_cache_size(self) -> int:
@@ -392,6 +395,7 @@ def load(path: Path) -> Settings:
     _check_components(path, config, members)
     _check_tasks(path, config, members)
     _check_alerts(path, config, members)
+    _check_archive(path, config, members)
     return Settings(path, config, members, secret)
 
 
@@ -493,6 +497,13 @@ def _check_alerts(path: Path, config: Config, members: Team) -> None:
         raise ConfigError(
             f'{where}: user = {alerts.user!r} is root: commands have an ordinary user\'s rights, as user = "nobody"'
         )
+
+
+def _check_archive(path: Path, config: Config, members: Team) -> None:
+    """A witness holds nothing to archive."""
+    if config.store.s3 and members.robots[config.robot].role == "witness":
+        where = f"{path}:{strict_toml.line_of(path.read_text(), ('store',))}: store"
+        raise ConfigError(f"{where}: {config.robot} is a witness, and keeps no checkpoints; set s3 on robots or servers")
 
 
 def _check_user(where: str, user: str) -> None:

@@ -24,6 +24,7 @@ from failover.config.board import BoardConfig, ItemConfig
 from failover.config.page import PageConfig, UserConfig
 from failover.config.programs import KeyConfig
 from failover.config.rights import LdapConfig, RightsConfig, RuleConfig
+from failover.config.store import StoreConfig
 from failover.config.team import Robot
 
 ROOT = Path(__file__).parent.parent
@@ -136,6 +137,7 @@ def defaults(kind: type[Any]) -> dict[str, object]:
         ("agent.toml: one medium", MediumConfig),
         ("agent.toml: hooks of one component", HooksConfig),
         ("agent.toml: alerts", AlertsConfig),
+        ("agent.toml: store", StoreConfig),
         ("team.toml: who belongs", Robot),
         ("team.toml: the board", BoardConfig),
         ("team.toml: one item of the board", ItemConfig),

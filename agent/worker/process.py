@@ -63,6 +63,7 @@ from failover.errors import FailoverError
 
 if TYPE_CHECKING:
     from agent.worker.alerts import Alerts
+    from agent.worker.archiving import Archiving
 
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
@@ -107,6 +108,7 @@ class Worker(Switchboard):
         self._reservations = verbs.reservations
         self.connect(verbs)
         self._alerts: Alerts | None = None
+        self._archiving: Archiving | None = None
 
     async def prepare(self) -> Inventory:
         """Open the store, find what outlived the last agent."""
@@ -151,6 +153,11 @@ class Worker(Switchboard):
 
             self._alerts = Alerts(self.settings, self.verbs, self.tell, hooks)
             self._alerts.begin()
+        if self.settings.config.store.s3:
+            from agent.worker.archiving import Archiving  # here: a member without an archive does not load it
+
+            self._archiving = Archiving(self.settings, store, self._running_here, self._sources.open, self.tell)
+            self._task(self._archiving.run())
         found = await self._find_guards(records)
         await self._mend_logs(found)
         if found:
@@ -274,6 +281,9 @@ class Worker(Switchboard):
             self.supervisors[name] = Supervisor(name, self._around)
             self.supervisors[name].begin()
         return self.supervisors[name]
+
+    def _running_here(self) -> set[str]:
+        return {name for name, supervisor in self.supervisors.items() if supervisor.component is not None}
 
     async def _find_guards(self, records: Records) -> tuple[Found, ...]:
         """Find the guards that outlived the last agent, and supervise their components."""
@@ -476,7 +486,8 @@ class Worker(Switchboard):
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
         complaints = self._alerts.complaints.values() if self._alerts is not None else ()
-        notices = [*self.notices(), *complaints, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        behind = self._archiving.complaints() if self._archiving is not None else ()
+        notices = [*self.notices(), *complaints, *behind, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
         ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory(), self._arriving)
         return team_view(self.settings, self._life, told, ours)

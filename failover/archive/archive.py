@@ -182,6 +182,17 @@ class Archive:
         found.sort(key=lambda copy: copy.order, reverse=True)
         return sorted(found, key=lambda copy: copy.folder)
 
+    def named(self, name: str) -> list[Copy]:
+        """The copies of the component that is named by its name or an end of it, the newest first.
+
+        Raises:
+            ArchiveError: the name fits several.
+        """
+        fitting = [copy for copy in self.copies() if copy.component == name or copy.component.endswith("/" + name.lstrip("/"))]
+        if len(meant := sorted({copy.component for copy in fitting})) > 1:
+            raise ArchiveError(f"{name!r} could be {', '.join(meant)}; give the whole name")
+        return fitting
+
     def fetch(self, copy: Copy, file: BinaryIO) -> Label:
         """Write a checkpoint to an empty file, which holds it whole and proved afterwards.
 

@@ -401,6 +401,20 @@ VERBS: Final = (
         "failover.cli.verbs.lost:listed",
     ),
     Verb(
+        "archive",
+        "copies of checkpoints in an object store, for the day on which no robot has them",
+        """
+        Robots and servers with [store] s3 in agent.toml send sealed copies of whole checkpoints to an object store. These acts
+        make the key, list the copies, and bring one to a machine that has nothing but the team's keys (docs/archive.md).
+
+          failover archive key
+          failover archive list
+          failover archive fetch mapper --output mapper.snapshot
+        """,
+        "failover.cli.arguments.archive:archive",
+        "failover.cli.verbs.archive:listed",
+    ),
+    Verb(
         "team",
         "the robots of the team, and their keys",
         """

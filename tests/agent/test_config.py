@@ -26,6 +26,7 @@ from agent.task_config import TaskConfig, declaration
 from agent.worker.network.replication_link import new_keys
 from checkpoint.linux.spawn.inherited_limits import Inheritance
 from failover.config import team
+from failover.config.store import StoreConfig
 from failover.config.team import Robot, Role, Team
 from failover.core.types import Launch, Rule
 from failover.errors import FailoverError
@@ -54,8 +55,9 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     (task,) = documented.pop("tasks").values()
     (medium,) = documented.pop("media").values()
     assert documented.pop("alerts") == dataclasses.asdict(AlertsConfig())
+    assert documented.pop("store") == dataclasses.asdict(StoreConfig())
     defaults = dataclasses.asdict(Config())
-    del defaults["components"], defaults["tasks"], defaults["media"], defaults["alerts"]
+    del defaults["components"], defaults["tasks"], defaults["media"], defaults["alerts"], defaults["store"]
     assert documented == defaults
     assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
     assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
@@ -241,6 +243,11 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (("[alerts]", 'on_takeover = [""]'), 4, "the first word names the program"),
         (("[alerts]", 'on_takover = ["tell"]'), 5, "did you mean 'on_takeover'"),
         (("[alerts]", 'on_split = "tell"'), 5, "Expected `array`"),
+        (("[store]", 's3 = "bucket/prefix"'), 4, "s3 is 'bucket/prefix', which is no place"),
+        (("[store]", 's3 = "s3:///prefix"'), 4, "which is no place"),
+        (("[store]", 's3_endpoint = "host:9000"'), 4, 'write "https://HOST:PORT"'),
+        (("[store]", "s3_keep = 0"), 4, "s3_keep is 0; it must be at least 1"),
+        (("[store]", "s3_evry_s = 5"), 5, "did you mean 's3_every_s'"),
         (("[alerts]", 'user = "no-such-user"', 'on_split = ["tell"]'), 4, "this robot has no such user"),
     ],
 )
@@ -448,8 +455,10 @@ def test_an_agent_of_root_tells_an_operator_by_a_named_users_rights_alone(direct
             configuration.load(written(directory, "[alerts]", f'user = "{user}"', 'on_split = ["tell"]'))
 
 
-def test_a_witness_has_nothing_to_tell_of(directory: Path) -> None:
+def test_a_witness_has_nothing_to_tell_of_and_nothing_to_archive(directory: Path) -> None:
     members = {"robot1": replace(ROBOT, role="witness"), "robot2": ROBOT, "robot3": ROBOT}
     team.write(directory / "team", Team("lab", members))
     with pytest.raises(ConfigError, match="is a witness, and holds nothing to tell of"):
         configuration.load(written(directory, "[alerts]", 'user = "nobody"', 'on_split = ["tell"]'))
+    with pytest.raises(ConfigError, match="is a witness, and keeps no checkpoints"):
+        configuration.load(written(directory, "[store]", 's3 = "s3://robots"'))

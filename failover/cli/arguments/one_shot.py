@@ -52,6 +52,12 @@ def add_restore_options(room: argparse.ArgumentParser) -> None:
         action="store_true",
         help="give the program all rights that FILE asks for, also if FILE is not root's (default: its owner's at most)",
     )
+    room.add_argument(
+        "--contents",
+        metavar="DIR",
+        default="",
+        help="files of the program that this machine lacks, each named by its digest, as failover archive fetch brings them",
+    )
     add_shared_files(room)
     add_devices(room)
     what = (

@@ -341,6 +341,7 @@ def _restored(arguments: argparse.Namespace, file: int, author: Author | None) -
             all_connections=arguments.connections == CARRY,
             follow=False,
             bound=owner,
+            contents=os.path.abspath(arguments.contents) if arguments.contents else "",
         )
         with _told_how_far(arguments, keeper.pid, os.fstat(file).st_size):
             restored, _ = keeper.ask(order, Restored, (file,))

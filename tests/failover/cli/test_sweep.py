@@ -120,7 +120,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: str) -> int:
     statuses = []
     for asked in ([], ["--json"]):
         verb, rest = argv[:1], argv[1:]
-        with_acts = verb in (("team",), ("board",), ("bridge",), ("task",), ("rights",), ("program",), ("lost",))
+        with_acts = verb in (("team",), ("board",), ("bridge",), ("task",), ("rights",), ("program",), ("lost",), ("archive",))
         statuses.append(main.main([*argv, *asked] if with_acts else [*verb, *asked, *rest]))
         said = capsys.readouterr()
         if asked:
@@ -243,6 +243,23 @@ def test_with_copies_that_lost_and_are_not_there(act: str, capsys: pytest.Captur
         assert told(capsys, "lost", act, "mapper", "--state", at) == main.FAILED
 
 
+@pytest.mark.parametrize("act", ["list", "fetch"])
+def test_with_an_archive_that_cannot_be_opened(act: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("team").mkdir()
+    asked = [act, "mapper", *(["--output", "new"] if act == "fetch" else [])]
+    places = (["--place", str(Path.cwd() / "nowhere")], ["--place", "here"], ["--place", "s3://"], ["--place", ""])
+    for options in (*places, [*places[0], "--endpoint", "nowhere"]):
+        assert told(capsys, "archive", *asked, *options, "--directory", "team") == main.FAILED
+    Path("team/team.toml").write_text('team = "lab"\n')
+    for content in (b"", b"junk", b"ab" * 32):
+        Path("team/keys").mkdir(exist_ok=True)
+        Path("team/keys/archive.key").write_bytes(content)
+        Path("team/keys/archive.key").chmod(0o600)
+        assert told(capsys, "archive", *asked, *places[0], "--directory", "team") == main.FAILED
+    assert told(capsys, "archive", "key", "--directory", "team") == main.FAILED
+    assert not Path("new").exists() and not Path("nowhere").exists()
+
+
 def test_the_full_screen_without_a_terminal_or_its_library(capsys: pytest.CaptureFixture[str]) -> None:
     assert told(capsys, "top") == main.FAILED
 
@@ -257,6 +274,19 @@ def test_with_a_command_line_that_is_none(argv: list[str], capsys: pytest.Captur
 
 def test_the_sweep_leaves_no_verb_out() -> None:
     without = {"restore", "inspect", "capture", "check", "team", "board", "completion"}
-    without |= {"page", "bridge", "simulate", "ps", "task", "trace", "wait-activation", "rights", "program", "lost", "top"}
+    without |= {
+        "page",
+        "bridge",
+        "simulate",
+        "ps",
+        "task",
+        "trace",
+        "wait-activation",
+        "rights",
+        "program",
+        "lost",
+        "archive",
+        "top",
+    }
     swept = {*UNDER_AN_AGENT, *without, *(act[0] for act in DRIVERS)}
     assert {verb.name for verb in parser.VERBS} - swept == {"demo"}

@@ -1,0 +1,122 @@
+"""The archive's process: folds, seals, sends and proves what the worker gives it, one thing at a time. Ends when the worker does.
+
+Started as `python -P -m agent.archive.process CONFIG DESCRIPTOR`, with all modules of Python: the library for S3 needs some that
+`agent.system.child_main` leaves out. It yields to everything else on the robot, and the kernel takes its memory first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import msgspec
+
+from agent import config as configuration
+from agent.archive.messages import Done, KeepCheckpoint, KeepContent, Look, Request
+from agent.config import Settings
+from agent.errors import AgentError
+from agent.main_loop.vote_record import VoteRecordFile
+from checkpoint.errors import CheckpointError
+from checkpoint.keeper.messages import Channel, ChannelError, close_all
+from checkpoint.sentences import in_words
+from checkpoint.store.chain_files import fold_to
+from failover.archive import sealed
+from failover.archive.archive import Archive, object_store
+from failover.core import vote_record
+from failover.errors import FailoverError
+
+NICE: Final = 10
+"""A tenth of what an ordinary process gets where both want the processor: it yields, and still comes on where all are busy."""
+
+OOM_SCORE: Final = "800"
+
+
+class Archivist:
+    """Carries requests out. What it needs of the place and the key is looked for at each: both may come later."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._aside = Path(settings.config.state_directory)
+        self._archive: Archive | None = None
+
+    def answer(self, request: Request, descriptors: tuple[int, ...]) -> Done:
+        """Do what is asked, or say why it cannot be done."""
+        try:
+            return self._done(request, descriptors)
+        except (CheckpointError, FailoverError, AgentError) as error:
+            return Done(refusal=str(error))
+        except OSError as error:
+            return Done(refusal=f"the archive's process cannot write below {self._aside}: {in_words(error)}")
+
+    def _done(self, request: Request, descriptors: tuple[int, ...]) -> Done:
+        archive = self._opened()
+        match request:
+            case Look():
+                return Done(lacking=tuple(digest for digest in request.digests if archive.lacks(digest)))
+            case KeepContent():
+                with open(descriptors[0], "rb", buffering=0, closefd=False) as content:
+                    return Done(size=archive.put_content(request.digest, content))
+            case KeepCheckpoint():
+                with self._whole(descriptors) as checkpoint:
+                    name, size = archive.put(checkpoint, self._settings.config.robot, self._spec(request.component))
+                archive.thin(request.component, self._settings.config.store.s3_keep)
+                return Done(name=name, size=size)
+
+    def _opened(self) -> Archive:
+        if self._archive is None:
+            store, team = self._settings.config.store, self._settings.team.team
+            key = sealed.read_key(Path(self._settings.config.team_directory))
+            self._archive = Archive(object_store(store.s3, store.s3_endpoint), key, team, self._aside)
+        return self._archive
+
+    @contextlib.contextmanager
+    def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:
+        """A file of the state that a chain leads to, as one base."""
+        if len(chain) == 1:
+            with open(chain[0], "rb", buffering=0, closefd=False) as base:
+                yield base
+            return
+        with tempfile.TemporaryFile(dir=self._aside) as file:
+            fold_to(file, *chain)
+            file.flush()
+            yield file
+
+    def _spec(self, component: str) -> bytes:
+        """How a component is started and by which rules it lives, as this member has it on record."""
+        directory, robot = Path(self._settings.config.state_directory), self._settings.config.robot
+        records = vote_record.decode(VoteRecordFile(directory, robot).read().core).records
+        spec = next((one.spec for one in records if one.name == component), None)
+        return msgspec.msgpack.encode(spec) if spec is not None else b""
+
+
+def main() -> int:
+    """Answer until the worker has gone."""
+    path, descriptor = sys.argv[1:3]
+    channel: Channel[Request] = Channel(socket.socket(fileno=int(descriptor)), Request)
+    os.nice(NICE)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(OOM_SCORE)
+    try:
+        archivist = Archivist(configuration.load(Path(path)))
+    except AgentError as error:
+        print(f"failover archive: {error}", file=sys.stderr)
+        return 1
+    while True:
+        try:
+            request, descriptors = channel.receive()
+            try:
+                channel.send(archivist.answer(request, descriptors))
+            finally:
+                close_all(descriptors)
+        except (ChannelError, KeyboardInterrupt):
+            return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,163 @@
+"""archive key, list, fetch: checkpoints in an object store, for a machine that has nothing but the team's keys."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import tomllib
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import msgspec
+
+from checkpoint.errors import UNDECODABLE
+from checkpoint.snapshot import format
+from checkpoint.snapshot.required_files import Need, needs
+from checkpoint.store.content_store import CONTENT_MODE, digest_of_file, path_in
+from failover.archive import sealed
+from failover.archive.archive import Archive, Copy, object_store
+from failover.cli.output import render, team_tree
+from failover.config import team as team_directory
+from failover.config.store import StoreConfig
+from failover.errors import ArchiveError
+
+CONFIG: Final = Path("/etc/failover/agent.toml")
+CONTENTS_SUFFIX: Final = ".contents"
+NAMED: Final = 3
+"""Files that a sentence names."""
+
+
+def key(arguments: argparse.Namespace) -> int:
+    """Make the team's archive key."""
+    path = sealed.new_key(Path(arguments.directory))
+    if arguments.json:
+        render.as_json({"file": str(path)})
+    else:
+        print(f"{path} is the archive key: carry it to the same place at every robot and server, and keep a copy elsewhere")
+    return 0
+
+
+def listed(arguments: argparse.Namespace) -> int:
+    """List the copies, the newest of each component first."""
+    place, archive = _archive(arguments)
+    copies = archive.named(arguments.name) if arguments.name else archive.copies()
+    if arguments.json:
+        render.as_json({"place": place, "copies": [_told(copy) for copy in copies]})
+        return 0
+    if not copies:
+        of_name = f" of {arguments.name}" if arguments.name else ""
+        print(f"no checkpoint{of_name} is in the archive {place}")
+        return 0
+    lines = [(copy.component, str(copy.epoch), str(copy.sequence), _when(copy), team_tree.size(copy.size)) for copy in copies]
+    render.table(("component", "epoch", "number", "archived", "size"), lines)
+    return 0
+
+
+def fetch(arguments: argparse.Namespace) -> int:
+    """Bring one copy here, and the files that its program needs and this machine lacks."""
+    place, archive = _archive(arguments)
+    copy = _meant(archive, place, arguments)
+    output = Path(arguments.output)
+    contents = output.with_name(output.name + CONTENTS_SUFFIX)
+    with _told_of(output), new_file(output) as file:
+        label = archive.fetch(copy, file)
+        outline = format.read_outline(file.fileno())
+        brought = _bring(archive, needs(outline), contents)
+    if arguments.json:
+        told = {"component": outline.component, "file": str(output), "robot": label.robot, "brought": brought}
+        render.as_json(_told(copy) | told | {"contents": str(contents) if brought else ""})
+        return 0
+    print(f"{output} holds {outline.component} as {label.robot} archived it at {_when(copy)}")
+    if brought:
+        print(f"{contents} holds {len(brought)} of its files that this machine lacks: {', '.join(brought[:NAMED])}")
+    print(f"failover restore {output}{f' --contents {contents}' if brought else ''} starts it")
+    return 0
+
+
+def _archive(arguments: argparse.Namespace) -> tuple[str, Archive]:
+    """The archive that is meant: as said, else as agent.toml says."""
+    place, endpoint = arguments.place, arguments.endpoint
+    if place is None:
+        config = StoreConfig()
+        with contextlib.suppress(OSError, *UNDECODABLE):
+            config = msgspec.convert(tomllib.loads(CONFIG.read_text()).get("store", {}), StoreConfig)
+        place, endpoint = config.s3, endpoint if endpoint is not None else config.s3_endpoint
+    try:
+        StoreConfig(s3=place, s3_endpoint=endpoint or "")
+    except ValueError as error:
+        raise ArchiveError(str(error)) from error
+    if not place:
+        raise ArchiveError(f"no archive is named: {CONFIG} has no s3 in [store]; name it by --place s3://BUCKET/PREFIX")
+    directory = Path(arguments.directory)
+    team = team_directory.read(directory).team
+    return place, Archive(object_store(place, endpoint or ""), sealed.read_key(directory), team, Path("."))
+
+
+def _meant(archive: Archive, place: str, arguments: argparse.Namespace) -> Copy:
+    fitting = archive.named(arguments.name)
+    if arguments.object:
+        fitting = [copy for copy in fitting if copy.name == arguments.object]
+    if not fitting:
+        which = f"{arguments.object} of {arguments.name}" if arguments.object else f"checkpoint of {arguments.name}"
+        raise ArchiveError(f"the archive {place} has no {which}; failover archive list shows those there are")
+    return fitting[0]
+
+
+def _bring(archive: Archive, wanted: tuple[Need, ...], contents: Path) -> list[str]:
+    """Fetch the files that this machine lacks, or has in another version, as ``--contents`` of failover restore takes them.
+
+    Nothing is laid down at the paths that a snapshot names: whoever ran the program chose them.
+
+    Raises:
+        ArchiveError: one of them is not in the archive, or cannot be written.
+    """
+    lacking = {need.digest: need for need in wanted if need.digest and not _is_here(need)}
+    for digest, need in lacking.items():
+        with _told_of(contents):
+            contents.mkdir(mode=0o755, exist_ok=True)
+            path = path_in(contents, digest)
+            if not path.exists():
+                with new_file(path, CONTENT_MODE) as file:
+                    archive.fetch_content(need, file)
+    return [need.path for need in lacking.values()]
+
+
+def _is_here(need: Need) -> bool:
+    if not need.exact:
+        return os.path.lexists(need.path)
+    with contextlib.suppress(OSError):
+        return digest_of_file(need.path) == need.digest
+    return False
+
+
+@contextlib.contextmanager
+def new_file(path: Path, mode: int = 0o600) -> Iterator[BinaryIO]:
+    """A file that was not there before, and is gone again if the body fails. Raises OSError."""
+    with open(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode), "w+b") as file:
+        try:
+            yield file
+            os.fsync(file.fileno())
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+
+
+@contextlib.contextmanager
+def _told_of(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ArchiveError(f"cannot write {path}: {error.strerror}; free some space, or name another place") from error
+
+
+def _told(copy: Copy) -> dict[str, object]:
+    """One copy as JSON."""
+    told = {"component": copy.component, "epoch": copy.epoch, "generation": copy.generation, "sequence": copy.sequence}
+    return told | {"size": copy.size, "at": copy.at_s, "object": copy.name}
+
+
+def _when(copy: Copy) -> str:
+    return f"{datetime.fromtimestamp(copy.at_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
