@@ -34,6 +34,8 @@ wait for the next one (restart_grace_s), and move nothing. The command `failover
                                                              /etc/failover/team/keys/ROBOT.secret, mode 600
   failover-agent mend /lab/robot1/mapper --epoch 12          a record whose epoch leaves none above it (failover status says so)
                                                              gets a lower one; says what that costs, and asks
+  failover-agent recover /lab/robot1/mapper                  fetch a component that no robot holds any more from the archive into
+                                                             this robot's store
 """
 
 EPILOG: Final = """
@@ -54,6 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
         settings = configuration.load(config)
         if command == "mend":
             return _mend(settings, arguments)
+        if command == "recover":
+            return _recover(settings, arguments)
         if command == "check":
             _check_pair(settings)
             _check_rights(Path(settings.config.team_directory))
@@ -82,6 +86,15 @@ def _mend(settings: configuration.Settings, arguments: list[str]) -> int:
     if not wanted.component or wanted.epoch is None:
         raise AgentError("mend needs a component and the epoch that its record is to have: failover-agent mend NAME --epoch N")
     return mend(settings, wanted.component, wanted.epoch, agreed=wanted.yes)
+
+
+def _recover(settings: configuration.Settings, arguments: list[str]) -> int:
+    from agent.recover import recover
+
+    wanted = command_line().parse_args(arguments)
+    if not wanted.component:
+        raise AgentError("recover needs a component: failover-agent recover NAME; failover archive list shows those there are")
+    return recover(settings, wanted.component)
 
 
 def _check_pair(settings: configuration.Settings) -> None:
@@ -153,11 +166,12 @@ def command_line() -> argparse.ArgumentParser:
         "command",
         nargs="?",
         default="run",
-        choices=("run", "check", "keypair", "mend"),
+        choices=("run", "check", "keypair", "mend", "recover"),
         help="run (the default); check reads the configuration and says what it found; keypair prints a new pair as JSON; mend "
-        "lowers the epoch that is on record here for COMPONENT, while the agent is stopped",
+        "lowers the epoch that is on record here for COMPONENT, recover fetches COMPONENT from the archive, both while the agent "
+        "is stopped",
     )
-    parser.add_argument("component", nargs="?", default="", metavar="COMPONENT", help="of mend: its whole name")
+    parser.add_argument("component", nargs="?", default="", metavar="COMPONENT", help="of mend and recover: its name")
     parser.add_argument("--epoch", type=int, metavar="N", help="of mend: the epoch that its record is to have")
     parser.add_argument("--yes", action="store_true", help="of mend: do not ask for confirmation")
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, metavar="FILE", help=f"default {DEFAULT_CONFIG}")

@@ -42,8 +42,8 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
         AgentError: the agent runs, or the program does; no such record; not ours to change.
     """
     directory = Path(settings.config.state_directory)
-    _check_right(directory)
-    _check_stopped(settings, name)
+    check_right(directory)
+    check_stopped(settings, name)
     record_file = VoteRecordFile(directory, settings.config.robot)
     before = core_vote_record.decode(record_file.read().core)
     record = next((one for one in before.records if one.name == name), None)
@@ -84,7 +84,7 @@ def _later(store: SnapshotStore | None, name: str, epoch: int) -> list[tuple[int
     return [(one.generation, one.sequence) for one in positions if one.generation // (PEERS_MAX + 1) > epoch]
 
 
-def _check_right(directory: Path) -> None:
+def check_right(directory: Path) -> None:
     """Root has the right, and a user who runs an agent that is not root's."""
     try:
         owner = directory.stat().st_uid
@@ -94,14 +94,14 @@ def _check_right(directory: Path) -> None:
         raise AgentError(f"cannot mend a record in {directory}: it belongs to uid {owner}; ask root")
 
 
-def _check_stopped(settings: Settings, name: str) -> None:
+def check_stopped(settings: Settings, name: str) -> None:
     runtime = Path(settings.config.runtime_directory)
     try:
         Control.open(runtime / "control.sock").close()
     except NoAgentError:
         pass
     else:
-        raise AgentError(f"the agent of {settings.config.robot} runs; stop it first, at every member that is to be mended")
+        raise AgentError(f"the agent of {settings.config.robot} runs; stop it first")
     if Records(runtime / "running").epoch(name):
         raise AgentError(
             f"{name} runs at {settings.config.robot}, or did until it was killed; start the agent and failover release it "

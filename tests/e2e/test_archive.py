@@ -18,7 +18,7 @@ from failover.archive import sealed
 from tests import s3_servers
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
-from tests.e2e.test_deaths import COUNT, kill, revived
+from tests.e2e.test_deaths import COUNT, kill, parts, revived
 
 pytest.importorskip("cryptography")
 
@@ -26,6 +26,7 @@ pytestmark = [pytest.mark.root, pytest.mark.timeout(900)]
 
 KEEP = 2
 PATIENCE_S = 240.0
+BOOTS_FAST = "boot_patience_s = 1\n"
 
 T = TypeVar("T")
 
@@ -144,6 +145,55 @@ def test_an_archive_that_is_behind_is_told_with_the_cure_and_nothing_waits_for_i
         until(lambda: not behind(first), "the archive to have caught up")
         why = robots.failover(first, "why", "count").stdout
         assert "its checkpoints do not reach the archive" in why and "its checkpoints reach the archive again" in why
+
+
+@pytest.mark.slow
+def test_a_team_that_lost_every_disk_recovers_a_component_from_its_archive(tmp_path: Path) -> None:
+    place = tmp_path / "disk"
+    place.mkdir()
+    with robots.two_robots(tmp_path, BOOTS_FAST + settings(str(place))) as (first, second):
+        give_key(first, second)
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
+        robots.until_protected(first)
+        until(lambda: newest(place), "a copy")
+        counted, copied = len(robots.numbers(first)), newest(place)
+        until(lambda: newest(place) > copied, "a later copy")
+        for robot in (first, second):
+            robots.keep_on(robot)
+            kill(robot, ("main_loop", "worker", "guard"))
+        for robot in (first, second):
+            until(lambda robot=robot: is_gone(robot), "everything of it to have ended")  # type: ignore[misc]
+            for name in ("state", "run"):
+                shutil.rmtree(robot.directory / name)
+        said = recovered(second, "count")
+        assert "robot2 holds /demo/robot1/count as robot1 archived it, epoch 1; start the agent" in said
+        for robot in (first, second):
+            robots.start_agent(robot)
+        until(lambda: robots.answers(first) and robots.answers(second), "both agents to answer")
+        robots.until_taken_over(second)
+        until(lambda: robots.numbers(second)[-1] > counted, "it to go on")
+        robots.until_protected(second)
+        numbers = robots.numbers(second)
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "each number once, in order"
+
+
+def newest(place: Path) -> str:
+    """The name of the newest copy; "" where there is none."""
+    return max((path.name for path in place.glob("*/@*/*.sealed")), default="")
+
+
+def is_gone(robot: RobotMachine) -> bool:
+    """Whether nothing of its agent and of its programs is left."""
+    is_running = any(b"print(i, flush=True)" in command_of(pid) for pid in robot.processes())
+    return not is_running and not any(parts(robot, name) for name in ("main_loop", "worker", "guard", "keeper"))
+
+
+def recovered(robot: RobotMachine, name: str) -> str:
+    """What failover-agent recover says at a robot whose agent is stopped."""
+    command = [sys.executable, "-m", "agent.main", "recover", name, "--config", str(robot.directory / "agent.toml")]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
 
 
 def test_the_process_of_an_archive_may_die_and_ends_with_its_worker(tmp_path: Path) -> None:

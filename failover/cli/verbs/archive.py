@@ -65,14 +65,16 @@ def fetch(arguments: argparse.Namespace) -> int:
     with _told_of(output), new_file(output) as file:
         label = archive.fetch(copy, file)
         outline = format.read_outline(file.fileno())
-        brought = _bring(archive, needs(outline), contents)
+        brought, missing = _bring(archive, needs(outline), contents)
     if arguments.json:
-        told = {"component": outline.component, "file": str(output), "robot": label.robot, "brought": brought}
+        told = {"component": outline.component, "file": str(output), "robot": label.robot, "brought": brought, "missing": missing}
         render.as_json(_told(copy) | told | {"contents": str(contents) if brought else ""})
         return 0
     print(f"{output} holds {outline.component} as {label.robot} archived it at {_when(copy)}")
     if brought:
         print(f"{contents} holds {len(brought)} of its files that this machine lacks: {', '.join(brought[:NAMED])}")
+    for path in missing:
+        print(f"it needs {path}, which is neither here nor in the archive: install it first")
     print(f"failover restore {output}{f' --contents {contents}' if brought else ''} starts it")
     return 0
 
@@ -106,23 +108,28 @@ def _meant(archive: Archive, place: str, arguments: argparse.Namespace) -> Copy:
     return fitting[0]
 
 
-def _bring(archive: Archive, wanted: tuple[Need, ...], contents: Path) -> list[str]:
+def _bring(archive: Archive, wanted: tuple[Need, ...], contents: Path) -> tuple[list[str], list[str]]:
     """Fetch the files that this machine lacks, or has in another version, as ``--contents`` of failover restore takes them.
 
     Nothing is laid down at the paths that a snapshot names: whoever ran the program chose them.
 
+    Returns:
+        The paths of those that came, and of those that the archive lacks, too.
+
     Raises:
-        ArchiveError: one of them is not in the archive, or cannot be written.
+        ArchiveError: one of them does not arrive whole, or cannot be written.
     """
     lacking = {need.digest: need for need in wanted if need.digest and not _is_here(need)}
-    for digest, need in lacking.items():
+    missing = [need.path for digest, need in lacking.items() if archive.lacks(digest)]
+    brought = {digest: need for digest, need in lacking.items() if need.path not in missing}
+    for digest, need in brought.items():
         with _told_of(contents):
             contents.mkdir(mode=0o755, exist_ok=True)
             path = path_in(contents, digest)
             if not path.exists():
                 with new_file(path, CONTENT_MODE) as file:
                     archive.fetch_content(need, file)
-    return [need.path for need in lacking.values()]
+    return [need.path for need in brought.values()], missing
 
 
 def _is_here(need: Need) -> bool:

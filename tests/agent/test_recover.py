@@ -1,0 +1,124 @@
+"""``failover-agent recover``: a component comes from the archive into a robot's store, or nothing is changed."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from agent.main import main
+from agent.main_loop.vote_record import VoteRecordFile
+from checkpoint.snapshot import format
+from checkpoint.store.store import open_store
+from failover.archive import sealed
+from failover.archive.archive import Archive
+from failover.archive.objects import FolderObjects
+from failover.core import vote_record as core_vote_record
+from failover.core.types import ComponentSpec, Launch, Record, State, VoteRecord
+from tests.agent.test_mend import config
+from tests.checkpoint.snapshots import page, pages_of, snapshot
+
+__all__ = ["config"]
+
+pytest.importorskip("cryptography")
+
+COMPONENT = "/lab/robot9/planner"
+SPEC = ComponentSpec(COMPONENT, home="robot9", launch=Launch(("mapper",)), owner=1000)
+
+
+@pytest.fixture
+def place(config: Path) -> Path:
+    """An archive with two checkpoints, which the configuration names."""
+    place = config.parent / "place"
+    place.mkdir()
+    with config.open("a") as file:
+        file.write(f'[store]\ns3 = "{place}"\n')
+    sealed.new_key(config.parent / "team")
+    for sequence in (1, 2):
+        with tempfile.TemporaryFile() as file:
+            file.write(format.encode_bytes(snapshot({1: page(str(sequence))}, sequence=sequence, component=COMPONENT)))
+            file.flush()
+            key = sealed.read_key(config.parent / "team")
+            Archive(FolderObjects(place), key, "lab", config.parent).put(file, "robot9", msgspec.msgpack.encode(SPEC))
+    return place
+
+
+def records(config: Path) -> tuple[Record, ...]:
+    return core_vote_record.decode(VoteRecordFile(config.parent / "state", "robot1").read().core).records
+
+
+def recover(config: Path, *words: str) -> int:
+    return main(["recover", *words, "--config", str(config)])
+
+
+def test_the_newest_copy_is_in_the_store_and_on_record(config: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = records(config)
+    assert recover(config, "planner") == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"robot1 holds {COMPONENT} as robot9 archived it, epoch 1; start the agent")
+    assert "needs /usr/bin/mapper, which is neither here nor in the archive" in said
+    *others, record = records(config)
+    assert tuple(others) == before
+    assert record == Record(COMPONENT, 1, state=State.STANDBY, spec=SPEC, begun=True)
+    store = open_store(config.parent / "state" / "store")
+    try:
+        assert pages_of(store.load(COMPONENT)) == {1: page("2")}
+    finally:
+        store.close()
+    assert recover(config, "planner") == 1
+    assert "is on record at robot1" in capsys.readouterr().err and records(config)[-1] == record
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        ("nothing named", "recover needs a component"),
+        ("not there", "has no checkpoint of mapper"),
+        ("altered", "was altered, cut off or sealed with another archive key"),
+        ("another key", "was altered, cut off or sealed with another archive key"),
+        ("no key", "failover archive key makes one"),
+        ("no place", "mount the disk"),
+        ("store in use", "another process has it open"),
+    ],
+)
+def test_what_cannot_be_recovered_changes_nothing(
+    spoil: str, said: str, config: Path, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = records(config)
+    key = sealed.key_path(config.parent / "team")
+    words = {"nothing named": (), "not there": ("mapper",)}.get(spoil, ("planner",))
+    held = open_store(config.parent / "state" / "store") if spoil == "store in use" else None
+    match spoil:
+        case "altered":
+            newest = max(place.rglob("*.sealed"))
+            newest.write_bytes(newest.read_bytes()[:-1])
+        case "another key" | "no key":
+            key.unlink()
+            if spoil == "another key":
+                sealed.new_key(config.parent / "team")
+        case "no place":
+            place.rename(place.with_name("elsewhere"))
+    assert recover(config, *words) == 1
+    told = capsys.readouterr()
+    assert said in told.err and told.err.startswith("failover-agent: ") and told.out == ""
+    assert records(config) == before
+    if held is not None:
+        held.close()
+    store = open_store(config.parent / "state" / "store")
+    assert store.components() == ()
+    store.close()
+
+
+def test_without_an_archive_there_is_nothing_to_recover_from(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert recover(config, "planner") == 1
+    assert "names no archive" in capsys.readouterr().err
+
+
+def test_a_vote_record_of_none_gets_its_first_record(config: Path, place: Path) -> None:
+    record_file = VoteRecordFile(config.parent / "state", "robot1")
+    record_file.read()
+    record_file.keep(core_vote_record.encode(VoteRecord()))
+    assert recover(config, COMPONENT) == 0
+    assert [one.name for one in records(config)] == [COMPONENT]
