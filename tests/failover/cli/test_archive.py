@@ -1,0 +1,124 @@
+"""failover archive key, list, fetch: as a person types them, with a real program that is captured, archived and started again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from checkpoint.snapshot import format
+from checkpoint.snapshot.required_files import needs
+from failover.archive import sealed
+from failover.archive.archive import Archive
+from failover.archive.objects import FolderObjects
+from failover.cli import main
+from tests.checkpoint.snapshots import COMPONENT, page, snapshot
+
+pytest.importorskip("cryptography")
+
+
+@pytest.fixture
+def team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A team directory as a new machine has it, with an archive key."""
+    directory = tmp_path / "team"
+    directory.mkdir()
+    (directory / "team.toml").write_text('team = "lab"\n')
+    (tmp_path / "place").mkdir()
+    assert main.main(["archive", "key", "--directory", str(directory)]) == 0
+    assert f"{directory}/keys/archive.key is the archive key: carry it" in capsys.readouterr().out
+    return directory
+
+
+def archive(team: Path) -> Archive:
+    return Archive(FolderObjects(team.parent / "place"), sealed.read_key(team), "lab", team.parent)
+
+
+def put(team: Path, content: bytes) -> None:
+    with tempfile.TemporaryFile() as file:
+        file.write(content)
+        file.flush()
+        archive(team).put(file, "robot1")
+
+
+def asked(team: Path, act: str, *words: str) -> int:
+    return main.main(["archive", act, *words, "--directory", str(team), "--place", str(team.parent / "place")])
+
+
+def answer(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return told
+
+
+def test_the_copies_are_listed_the_newest_first(team: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(team, "list") == 0
+    assert "no checkpoint is in the archive" in capsys.readouterr().out
+    for sequence in (1, 2):
+        put(team, format.encode_bytes(snapshot({1: page("x")}, sequence=sequence)))
+    put(team, format.encode_bytes(snapshot({1: page("x")}, component="/lab/robot2/mapper")))
+    assert asked(team, "list") == 0
+    said = capsys.readouterr().out
+    assert COMPONENT in said and "/lab/robot2/mapper" in said
+    assert asked(team, "list", "robot1/mapper", "--json") == 0
+    assert [copy["sequence"] for copy in answer(capsys)["copies"]] == [2, 1]
+    assert asked(team, "list", "mapper") == main.FAILED
+    assert "could be /lab/robot1/mapper, /lab/robot2/mapper; give the whole name" in capsys.readouterr().err
+
+
+def test_a_copy_is_fetched_whole_or_not_at_all(team: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for sequence in (1, 2):
+        put(team, format.encode_bytes(snapshot({1: page(str(sequence))}, sequence=sequence)))
+    output = tmp_path / "mapper.snapshot"
+    assert asked(team, "fetch", "mapper", "--output", str(output), "--json") == 0
+    told = answer(capsys)
+    assert (told["sequence"], told["robot"], told["missing"]) == (2, "robot1", ["/usr/bin/mapper"])
+    assert format.decode(output).contents[:1] == b"2" and output.stat().st_mode & 0o777 == 0o600
+    assert asked(team, "fetch", "mapper", "--output", str(output)) == main.FAILED
+    assert "File exists" in capsys.readouterr().err and format.decode(output).contents[:1] == b"2"
+    older, newer = sorted((team.parent / "place").rglob("*.sealed"))
+    newer.write_bytes(newer.read_bytes()[:-1])
+    other = tmp_path / "other"
+    assert asked(team, "fetch", "mapper", "--output", str(other)) == main.FAILED
+    assert "altered, cut off" in capsys.readouterr().err and not other.exists()
+    name = older.relative_to(team.parent / "place").as_posix()
+    assert asked(team, "fetch", "mapper", "--output", str(other), "--object", name) == 0
+    assert "it needs /usr/bin/mapper, which is neither here nor in the archive" in capsys.readouterr().out
+    assert format.decode(other).contents[:1] == b"1"
+
+
+@pytest.mark.root
+def test_a_program_starts_from_the_archive_where_its_own_files_are_gone(
+    team: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = tmp_path / "program"
+    shutil.copy(shutil.which("sleep") or "/bin/sleep", program)
+    with subprocess.Popen([program, "100000"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, cwd="/") as process:
+        captured = tmp_path / "captured"
+        assert main.main(["capture", str(process.pid), "--output", str(captured)]) == 0
+        process.kill()
+    put(team, captured.read_bytes())
+    for need in needs(format.read_outline(captured)):
+        with open(need.path, "rb") as file:
+            archive(team).put_content(need.digest, file)
+    program.unlink()
+    capsys.readouterr()
+    (copy,) = archive(team).copies()
+    output = tmp_path / "fetched"
+    assert asked(team, "fetch", copy.component, "--output", str(output), "--json") == 0
+    told = answer(capsys)
+    assert told["brought"] == [str(program)] and told["missing"] == []
+    assert main.main(["restore", str(output)]) == main.FAILED, "its program is not here"
+    assert not program.exists(), "nothing is laid down where a snapshot says"
+    capsys.readouterr()
+    assert main.main(["restore", "--json", str(output), "--contents", told["contents"]]) == 0
+    pid = answer(capsys)["pid"]
+    try:
+        assert os.readlink(f"/proc/{pid}/exe").startswith(told["contents"])
+    finally:
+        os.kill(pid, signal.SIGKILL)
