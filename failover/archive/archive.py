@@ -175,9 +175,9 @@ class Archive:
         below = f"{self._team}/{folder_name(component)}" if component else self._team
         found = []
         for stored in self._objects.listed(below):
-            _, place, file = stored.name.rsplit("/", 2)
-            order = order_of_name(file) if file.endswith(BASE_SUFFIX + SUFFIX) else None
-            if order is not None and place.startswith(FOLDER_PREFIX):
+            place, _, file = stored.name.removeprefix(f"{self._team}/").partition("/")
+            is_one = place.startswith(FOLDER_PREFIX) and "/" not in file and file.endswith(BASE_SUFFIX + SUFFIX)
+            if is_one and (order := order_of_name(file)) is not None:
                 found.append(Copy(stored.name, place, *order, stored.size, stored.at_s))
         found.sort(key=lambda copy: copy.order, reverse=True)
         return sorted(found, key=lambda copy: copy.folder)

@@ -14,6 +14,7 @@ from typing import BinaryIO, Final
 import msgspec
 
 from checkpoint.errors import UNDECODABLE
+from checkpoint.sentences import visible
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import Need, needs
 from checkpoint.store.content_store import CONTENT_MODE, digest_of_file, path_in
@@ -51,7 +52,9 @@ def listed(arguments: argparse.Namespace) -> int:
         of_name = f" of {arguments.name}" if arguments.name else ""
         print(f"no checkpoint{of_name} is in the archive {place}")
         return 0
-    lines = [(copy.component, str(copy.epoch), str(copy.sequence), _when(copy), team_tree.size(copy.size)) for copy in copies]
+    lines = [
+        (visible(copy.component), str(copy.epoch), str(copy.sequence), _when(copy), team_tree.size(copy.size)) for copy in copies
+    ]
     render.table(("component", "epoch", "number", "archived", "size"), lines)
     return 0
 

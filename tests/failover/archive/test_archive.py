@@ -217,6 +217,18 @@ def test_the_owner_of_the_place_cannot_pass_one_checkpoint_off_as_another(place:
         assert b"mapper" not in file.read_bytes()
 
 
+STRANGE = ("x", "@x/y", "@x/y.base.sealed", "@x/1-2.base.sealed", "@x/1-2-3-4.delta.sealed", "@z/y/1-2-3-4.base.sealed")
+
+
+def test_other_objects_of_the_place_are_no_checkpoints(place: Path) -> None:
+    name = put(archive(place), history(1)[0])
+    for other in (*STRANGE, "contents/1-2-3-4.base.sealed", "1-2-3-4.base.sealed"):
+        path = place / "lab" / other
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    assert [copy.name for copy in archive(place).copies()] == [name]
+
+
 def test_what_arrived_otherwise_than_it_was_sent_is_found_at_once(place: Path) -> None:
     class Losing(FolderObjects):
         def put(self, name: str, content: BinaryIO) -> bool:

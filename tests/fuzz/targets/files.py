@@ -364,3 +364,50 @@ def vote_record() -> Decoder:
         return core.decode(module.VoteRecordFile(place, "robot1").read().core)
 
     return Decoder([msgspec.json.encode(whole)], call)
+
+
+def _archived(content: bytes) -> bytes:
+    """An object of an archive that holds this content."""
+    from failover.archive import sealed
+
+    with io.BytesIO() as file:
+        sealed.seal(bytes(32), "lab/@x/1.base.sealed", iter([content]), file)
+        return file.getvalue()
+
+
+@target("the owner of an archive's bucket: an object", needs="cryptography")
+def archive_object() -> Decoder:
+    from failover.archive import sealed
+
+    def call(content: bytes) -> object:
+        return b"".join(sealed.unsealed(bytes(32), "lab/@x/1.base.sealed", io.BytesIO(content)))
+
+    return Decoder([_archived(b""), _archived(b"a snapshot" * 100)], call)
+
+
+@target("who has an archive key: what an object holds before its snapshot", "msgpack", needs="cryptography")
+def archive_label() -> Decoder:
+    import msgspec
+
+    from checkpoint.snapshot import format
+    from checkpoint.store.index import file_name, folder_name
+    from failover.archive import sealed
+    from failover.archive.archive import Archive, Copy, Label
+    from failover.archive.objects import FolderObjects
+    from tests.checkpoint import snapshots
+
+    place = scratch()
+    snapshot = format.encode_bytes(snapshots.history(1)[0])
+    header = format.read_header(snapshot)
+    folder = folder_name(header.component)
+    name = f"lab/{folder}/{file_name(header)}.sealed"
+    (place / name).parent.mkdir(parents=True)
+    archive = Archive(FolderObjects(place), bytes(32), "lab", place)
+
+    def call(content: bytes) -> object:
+        with (place / name).open("wb") as file:
+            sealed.seal(bytes(32), name, iter([len(content).to_bytes(4, "little") + content + snapshot]), file)
+        with (place / "fetched").open("w+b") as file:
+            return archive.fetch(Copy(name, folder, 1, 1, 1, 0, 0.0), file)
+
+    return Decoder([msgspec.msgpack.encode(Label("r1", 1.5, b"spec"))], call)
