@@ -1,0 +1,184 @@
+"""The worker's part of an archive, with its process: which components, how often, which files, and what is said."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from blake3 import blake3
+
+from agent import config as configuration
+from agent.errors import LaneError
+from agent.worker.archiving import Archiving, Opening
+from checkpoint.keeper.messages import memfd_holding
+from checkpoint.model import Snapshot
+from checkpoint.snapshot import format
+from checkpoint.snapshot.required_files import Need
+from checkpoint.store import chain
+from checkpoint.store.store import Store, open_store
+from failover.archive import sealed
+from failover.archive.archive import Archive
+from failover.archive.objects import FolderObjects
+from failover.config import team
+from failover.config.team import Robot, Role, Team
+from failover.core.events import Event
+from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
+
+pytest.importorskip("cryptography")
+
+PATIENCE_S = 60.0
+OTHER = "/lab/robot2/planner"
+
+
+@dataclass
+class Member:
+    """A member with a store and an archive, but without an agent."""
+
+    directory: Path
+    store: Store
+    archiving: Archiving
+    running: set[str]
+    events: list[Event] = field(default_factory=list)
+
+    def archive(self) -> Archive:
+        key = sealed.read_key(self.directory / "team")
+        return Archive(FolderObjects(self.directory / "place"), key, "lab", self.directory)
+
+    def put(self, *made: Snapshot) -> None:
+        for one in made:
+            descriptor = memfd_holding(format.encode_bytes(one), "snapshot")
+            self.store.put(descriptor)
+            os.close(descriptor)
+
+    def archived(self, component: str = COMPONENT) -> list[int]:
+        """The numbers of the copies, the newest first."""
+        return [copy.sequence for copy in self.archive().copies(component)]
+
+
+async def nothing(component: str, need: Need) -> int:
+    raise LaneError(f"{need.path} is not here any more")
+
+
+@contextlib.contextmanager
+def member(
+    directory: Path, *lines: str, role: Role = "robot", bring: bool = False, opening: Opening = nothing
+) -> Iterator[Member]:
+    robots = {f"robot{place}": Robot((f"127.0.0.1:74{place}0",), f"127.0.0.1:74{place}1") for place in (1, 2, 3)}
+    robots["robot1"] = replace(robots["robot1"], role=role)
+    team.write(directory / "team", Team("lab", robots))
+    sealed.new_key(directory / "team")
+    for name in ("place", "state"):
+        (directory / name).mkdir()
+    path = directory / "agent.toml"
+    path.write_text(
+        f'robot = "robot1"\nteam_directory = "{directory}/team"\nstate_directory = "{directory}/state"\ninsecure = true\n'
+        f'bring = {str(bring).lower()}\n[store]\ns3 = "{directory}/place"\ns3_every_s = 1\n' + "\n".join(lines)
+    )
+    made = open_store(directory / "state" / "store")
+    running: set[str] = set()
+    events: list[Event] = []
+    try:
+        archiving = Archiving(configuration.load(path), made, lambda: running, opening, events.append)
+        yield Member(directory, made, archiving, running, events)
+    finally:
+        made.close()
+
+
+def run(member: Member, work: Callable[[], Awaitable[None]]) -> None:
+    """Do some work while copies are made."""
+
+    async def both() -> None:
+        copying = asyncio.create_task(member.archiving.run())
+        try:
+            await work()
+        finally:
+            copying.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await copying
+
+    asyncio.run(both())
+
+
+async def until(condition: Callable[[], Any]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+def test_a_robot_archives_what_runs_here_and_a_server_all_that_it_keeps(tmp_path: Path) -> None:
+    for role, wanted in (("robot", [COMPONENT]), ("server", [COMPONENT, OTHER])):
+        (tmp_path / role).mkdir()
+        with member(tmp_path / role, role=role) as one:
+            one.put(snapshot({1: page("x")}), snapshot({1: page("y")}, component=OTHER))
+            one.running.add(COMPONENT)
+
+            async def work(one: Member = one, wanted: list[str] = wanted) -> None:
+                await until(lambda: not one.archiving.complaints() and len(one.archive().copies()) >= len(wanted))
+
+            run(one, work)
+            assert [copy.component for copy in one.archive().copies()] == wanted
+
+
+def test_a_chain_becomes_one_checkpoint_and_older_copies_go(tmp_path: Path) -> None:
+    made = history(5)
+    with member(tmp_path, "s3_keep = 2") as one:
+        one.put(*made[:3])
+        one.running.add(COMPONENT)
+
+        async def work() -> None:
+            await until(lambda: one.archived() == [3])
+            one.put(made[3])
+            await until(lambda: one.archived() == [4, 3])
+            one.put(made[4])
+            await until(lambda: one.archived() == [5, 4])
+
+        run(one, work)
+        with (tmp_path / "fetched").open("w+b") as file:
+            one.archive().fetch(one.archive().copies()[0], file)
+            assert pages_of(format.decode(file)) == pages_of(chain.fold(made))
+        assert one.events == []
+
+
+def test_the_files_of_a_program_go_along_and_one_that_cannot_be_had_is_told(tmp_path: Path) -> None:
+    content = os.urandom(100_000)
+    asked: list[str] = []
+    is_here = False
+
+    async def opening(component: str, need: Need) -> int:
+        asked.append(need.path)
+        if not is_here:
+            raise LaneError(f"{need.path} is not here any more")
+        return memfd_holding(content, "file")
+
+    with member(tmp_path, bring=True, opening=opening) as one:
+        made = snapshot({1: page("x")})
+        executable = type(made.process.executable)("/opt/mapper", size=len(content), digest=blake3(content).digest())
+        state = msgspec.structs.replace(made, process=msgspec.structs.replace(made.process, executable=executable))
+        state = msgspec.structs.replace(state, position=chain.position_of(state, 1, 1))
+        one.put(state)
+        one.running.add(COMPONENT)
+
+        async def work() -> None:
+            nonlocal is_here
+            await until(lambda: any("/opt/mapper is not here any more" in said for said in one.archiving.complaints()))
+            assert one.archived() == [], "a checkpoint without its files would not help"
+            is_here = True
+            await until(lambda: one.archived() == [1] and not one.archiving.complaints())
+            count = len(asked)
+            one.put(msgspec.structs.replace(state, position=chain.position_of(state, 1, 2)))
+            await until(lambda: one.archived() == [2, 1])
+            assert len(asked) == count, "its files are there"
+
+        run(one, work)
+        assert not one.archive().lacks(executable.digest)
+        assert [event.sentence.partition(":")[0] for event in one.events] == [  # type: ignore[union-attr]
+            "its checkpoints do not reach the archive",
+            "its checkpoints reach the archive again",
+        ]
