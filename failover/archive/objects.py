@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -120,9 +121,10 @@ class FolderObjects:
             self._require_root()
             found = []
             for path in self._path(folder).rglob("*"):
-                if path.is_file() and not path.name.startswith(TEMPORARY_PREFIX):
+                with contextlib.suppress(FileNotFoundError):  # another member removes older copies
                     about = path.stat()
-                    found.append(Stored(path.relative_to(self._root).as_posix(), about.st_size, about.st_mtime))
+                    if stat.S_ISREG(about.st_mode) and not path.name.startswith(TEMPORARY_PREFIX):
+                        found.append(Stored(path.relative_to(self._root).as_posix(), about.st_size, about.st_mtime))
         yield from sorted(found, key=lambda one: one.name)
 
     def remove(self, name: str) -> None:
