@@ -12,6 +12,7 @@ import configparser
 import contextlib
 import mmap
 import os
+import re
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -38,6 +39,19 @@ KEYS: Final = {
 }
 
 
+_WORD: Final = re.compile(r"<Code>([^<]+)</Code>(?:.*?<Message>([^<]*)</Message>)?", re.DOTALL)
+_CURES: Final = {
+    "NoSuchBucket": "make the bucket, or correct s3 in [store]",
+    "403 Forbidden": "look at the keys of the bucket, and at what they may do",
+    "401 Unauthorized": "look at the keys of the bucket, and at what they may do",
+    "169.254.169.254": "this machine has no keys of the bucket: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    "NoSuchKey": "it was removed; take another one",
+}
+"""What shows in the library's words, and the cure. The address is where a machine's role is asked for."""
+
+ELSE: Final = "look at the server, and at the network"
+
+
 class S3Objects:
     """The objects below a prefix of a bucket, as `failover.archive.objects.ObjectStore` says."""
 
@@ -57,7 +71,7 @@ class S3Objects:
                 "an archive in S3 needs the library obstore, which is not installed: pip install 'failover[s3]'"
             ) from error
         self._library, self._errors = obstore, exceptions
-        self._place = f"s3://{bucket}/{prefix}".rstrip("/")
+        self._place = f"s3://{bucket}/{prefix}".rstrip("/") + (f" at {endpoint}" if endpoint else "")
         named = {"endpoint": endpoint} if endpoint else {}
         region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or REGION
         with self._told("be used"):
@@ -130,8 +144,14 @@ class S3Objects:
                 if isinstance(error, self._errors.NotFoundError | FileNotFoundError)
                 else ArchiveError
             )
-            said = str(error).partition("\n")[0].rstrip(" :")
-            raise kind(f"the archive {self._place} did not {tried}: {said}") from error
+            raise kind(f"the archive {self._place} did not {tried}: {_in_words(str(error))}") from error
+
+
+def _in_words(said: str) -> str:
+    """The server's own word where it gave one, else the library's, and what to do."""
+    words = _WORD.search(said)
+    first = f"{words[1]}: {words[2]}".rstrip(" :.") if words else said.partition("\n")[0].rpartition(" - ")[2].rstrip(" :")
+    return f"{first}; {next((cure for sign, cure in _CURES.items() if sign in said), ELSE)}"
 
 
 class _FoundError(ArchiveError):

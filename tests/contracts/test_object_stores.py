@@ -128,6 +128,9 @@ def test_a_place_that_is_not_there_is_named_in_one_sentence(
         with pytest.raises(ArchiveError, match=where) as refusal:
             act()
         assert "\n" not in str(refusal.value)
+        assert str(refusal.value).endswith(
+            "make the bucket, or correct s3 in [store]" if place[1] else "mount the disk, or make it"
+        )
 
 
 def test_a_server_that_does_not_answer_is_named(content: BinaryIO, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +139,7 @@ def test_a_server_that_does_not_answer_is_named(content: BinaryIO, monkeypatch: 
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("failover.archive.s3.TRIES_MAX", 0)
     objects = object_store("s3://robots/lab", "http://127.0.0.1:1")
-    with pytest.raises(ArchiveError, match=r"s3://robots/lab did not take .*127\.0\.0\.1:1") as refusal:
+    with pytest.raises(ArchiveError, match=r"s3://robots/lab at http://127\.0\.0\.1:1 did not .*; look at the server") as refusal:
         objects.put(NAME, content)
     assert "\n" not in str(refusal.value)
 
