@@ -150,7 +150,7 @@ class S3Objects:
 def _in_words(said: str) -> str:
     """The server's own word where it gave one, else the library's, and what to do."""
     words = _WORD.search(said)
-    first = f"{words[1]}: {words[2]}".rstrip(" :.") if words else said.partition("\n")[0].rpartition(" - ")[2].rstrip(" :")
+    first = f"{words[1]}: {words[2] or ''}".rstrip(" :.") if words else said.partition("\n")[0].rpartition(" - ")[2].rstrip(" :")
     return f"{first}; {next((cure for sign, cure in _CURES.items() if sign in said), ELSE)}"
 
 

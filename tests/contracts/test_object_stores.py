@@ -144,6 +144,26 @@ def test_a_server_that_does_not_answer_is_named(content: BinaryIO, monkeypatch: 
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        (
+            "Generic: PUT http://x - Server returned non-2xx status code: 403 Forbidden: <Code>AccessDenied</Code>",
+            "AccessDenied; look at the keys",
+        ),
+        (
+            "Generic: in 3 ms - HTTP error: error sending request\n\nDebug source",
+            "HTTP error: error sending request; look at the server",
+        ),
+        ("<Error><Code>NoSuchBucket</Code>\n<Message>None.</Message>", "NoSuchBucket: None; make the bucket"),
+    ],
+)
+def test_what_a_server_says_is_told_with_a_cure(said: str, told: str) -> None:
+    from failover.archive import s3
+
+    assert s3._in_words(said).startswith(told)
+
+
 def test_a_folder_leaves_nothing_aside_and_names_lead_nowhere_else(tmp_path: Path, content: BinaryIO) -> None:
     objects = FolderObjects(tmp_path)
     objects.put("lab/a", content)
