@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import time
@@ -148,21 +149,30 @@ class Archive:
         return len(gone)
 
     def _kept(self, name: str, parts: Iterator[bytes]) -> int:
-        there = self._objects.size(name)
+        there, is_ours = self._objects.size(name), False
         if there is None:
             with tempfile.TemporaryFile(dir=self._aside) as file:
                 there = sealed.seal(self._key, name, parts, file)
                 file.flush()
-                if not self._objects.put(name, file):  # another member was first
+                is_ours = self._objects.put(name, file)
+                if not is_ours:  # another member was first
                     there = self._objects.size(name) or 0
-        self._prove(name, there)
+        try:
+            self._prove(name, there)
+        except ArchiveError:
+            if is_ours:  # its name is free for another try
+                with contextlib.suppress(ArchiveError):
+                    self._objects.remove(name)
+            raise
         return there
 
     def _prove(self, name: str, size: int) -> None:
         """Read the ends of an object back: as long as it should be, under this key, with its last frame."""
         found = self._objects.size(name)
         if found != size:
-            raise ArchiveError(f"{name} was put into the archive with {size} bytes, and has {found or 0} there; it is put again")
+            raise ArchiveError(
+                f"{name} was put into the archive with {size} bytes, and has {found or 0} there; the next try is a new one"
+            )
         with closing(self._objects.open(name)) as source:
             head = sealed.exactly(source, sealed.HEAD_SIZE)
         with closing(self._objects.open(name, sealed.last_frame(size))) as source:

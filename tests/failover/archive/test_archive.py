@@ -239,6 +239,8 @@ def test_what_arrived_otherwise_than_it_was_sent_is_found_at_once(place: Path) -
 
     with pytest.raises(ArchiveError, match="was put into the archive with"), file_of(format.encode_bytes(history(1)[0])) as file:
         Archive(Losing(place), KEY, "lab", place.parent).put(file, "r1")
+    assert archive(place).copies() == []
+    assert put(archive(place), history(1)[0]) == archive(place).copies()[0].name, "the next try is a new one"
 
 
 def test_another_team_and_another_key_read_nothing(place: Path) -> None:
