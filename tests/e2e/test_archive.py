@@ -117,13 +117,14 @@ def goes_on(snapshot: str) -> int:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
         try:
-            said = [process.stdout.readline().strip() for _ in range(60)]
+            said = [process.stdout.readline().strip() for _ in range(200)]
         finally:
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(PATIENCE_S)
-    counted = [int(line) for line in said if line.isdecimal()]
-    assert len(counted) > 40, said
+    words = max((at for at, line in enumerate(said) if not line.isdecimal()), default=-1)  # the command's own, between its lines
+    counted = [int(line) for line in said[words + 1 :]]
+    assert len(counted) > 100, said
     assert counted == list(range(counted[0], counted[0] + len(counted))), "each number once, in order"
     return counted[0]
 
