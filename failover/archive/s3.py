@@ -24,9 +24,9 @@ from failover.errors import ArchiveError
 PUT_SIZE_MAX: Final = 5 << 30
 CONNECT: Final = timedelta(seconds=10)
 SILENT: Final = timedelta(seconds=60)
-"""Without a byte from the server."""
-WHOLE: Final = timedelta(hours=6)
-"""Of one request: 5 GB at 2 Mbit/s."""
+"""Without a byte from the server, which answers a put only when it has all of it."""
+LEAST_RATE: Final = 250_000
+"""Bytes each second: a put or a get that is slower fails. 5 GB may take 6 hours."""
 TRIES_MAX: Final = 3
 TRYING: Final = timedelta(seconds=60)
 REGION: Final = "us-east-1"
@@ -65,43 +65,51 @@ class S3Objects:
         """
         try:
             import obstore
-            from obstore import exceptions, store
+            from obstore import exceptions
         except ImportError as error:
             raise ArchiveError(
                 "an archive in S3 needs the library obstore, which is not installed: pip install 'failover[s3]'"
             ) from error
         self._library, self._errors = obstore, exceptions
         self._place = f"s3://{bucket}/{prefix}".rstrip("/") + (f" at {endpoint}" if endpoint else "")
-        named = {"endpoint": endpoint} if endpoint else {}
         region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or REGION
+        self._settings: dict[str, Any] = {
+            "prefix": prefix or None,
+            "region": region,
+            "checksum_algorithm": "sha256",
+            "disable_bulk_delete": True,  # not every server has it
+            "retry_config": {"max_retries": TRIES_MAX, "retry_timeout": TRYING},
+            **({"endpoint": endpoint} if endpoint else {}),
+            **_keys_of_file(),
+        }
+        self._bucket = bucket
+        self._is_open = (endpoint or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://")
+        self._store = self._client(PUT_SIZE_MAX, read_timeout=SILENT)
+
+    def _client(self, size: int, **limits: timedelta) -> Any:
+        """The library's store, for requests of at most so many bytes."""
+        from obstore.store import S3Store
+
+        whole = SILENT + timedelta(seconds=size / LEAST_RATE)
+        options: Any = {"allow_http": self._is_open, "connect_timeout": CONNECT, "timeout": whole, **limits}
         with self._told("be used"):
-            self._store = store.S3Store(
-                bucket,
-                prefix=prefix or None,
-                region=region,
-                checksum_algorithm="sha256",
-                disable_bulk_delete=True,  # not every server has it
-                client_options={
-                    "allow_http": (endpoint or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://"),
-                    "connect_timeout": CONNECT,
-                    "read_timeout": SILENT,
-                    "timeout": WHOLE,
-                },
-                retry_config={"max_retries": TRIES_MAX, "retry_timeout": TRYING},
-                **named,
-                **_keys_of_file(),
-            )
+            return S3Store(self._bucket, client_options=options, **self._settings)
 
     def put(self, name: str, content: BinaryIO) -> bool:
         """See `ObjectStore.put`. The server compares a digest of the content."""
         size = os.fstat(content.fileno()).st_size
         if size > PUT_SIZE_MAX:
             raise ArchiveError(f"{name} has {size} bytes: S3 takes {PUT_SIZE_MAX} at once; use a folder as the archive")
+        client = self._client(size)  # of its own: the library's read_timeout would run while the content is sent
+        mapped = mmap.mmap(content.fileno(), size, prot=mmap.PROT_READ)
         try:
-            with self._told(f"take {name}"), mmap.mmap(content.fileno(), size, prot=mmap.PROT_READ) as mapped:
-                self._library.put(self._store, name, memoryview(mapped), mode="create")  # not copied: the file's own pages
+            with self._told(f"take {name}"):
+                self._library.put(client, name, memoryview(mapped), mode="create")  # not copied: the file's own pages
         except _FoundError:
             return False
+        finally:
+            with contextlib.suppress(BufferError):  # after a timeout the library still has it for a while
+                mapped.close()
         return True
 
     def size(self, name: str) -> int | None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import timedelta
 from pathlib import Path
 from typing import BinaryIO
 
@@ -162,6 +166,55 @@ def test_what_a_server_says_is_told_with_a_cure(said: str, told: str) -> None:
     from failover.archive import s3
 
     assert s3._in_words(said).startswith(told)
+
+
+@contextlib.contextmanager
+def slow_server(pause_s: float, answers: bool = True) -> Iterator[str]:
+    """A server of one connection that pauses before it reads each 64 kB of what is put."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def serve() -> None:
+            with contextlib.suppress(OSError), listening.accept()[0] as one, one.makefile("rb") as arriving:
+                size = 0
+                while (line := arriving.readline().lower()) != b"\r\n":
+                    size = int(line.partition(b":")[2]) if line.startswith(b"content-length:") else size
+                while size > 0:
+                    time.sleep(pause_s)
+                    size -= len(arriving.read(min(size, 1 << 16)))
+                if answers:
+                    one.sendall(b'HTTP/1.1 200 OK\r\nETag: "x"\r\nContent-Length: 0\r\nConnection: close\r\n\r\n')
+                gone.wait()
+
+        gone = threading.Event()
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+        finally:
+            gone.set()
+            thread.join()
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    pytest.importorskip("obstore")
+    for name, value in s3_servers.environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("failover.archive.s3.SILENT", timedelta(seconds=0.5))
+    monkeypatch.setattr("failover.archive.s3.TRIES_MAX", 0)
+    return monkeypatch
+
+
+def test_a_put_may_take_longer_than_a_server_may_be_silent(impatient: pytest.MonkeyPatch, content: BinaryIO) -> None:
+    content.truncate(16 << 20)  # more than the kernel takes of a connection that nobody reads
+    with slow_server(0.01) as url:
+        assert object_store("s3://robots/lab", url).put(NAME, content)
+
+
+def test_a_put_that_is_never_answered_is_told_in_one_sentence(impatient: pytest.MonkeyPatch, content: BinaryIO) -> None:
+    impatient.setattr("failover.archive.s3.LEAST_RATE", 1 << 40)
+    with slow_server(0.0, answers=False) as url, pytest.raises(ArchiveError, match=r"s3://robots/lab at .* did not take "):
+        object_store("s3://robots/lab", url).put(NAME, content)
 
 
 def test_a_folder_leaves_nothing_aside_and_names_lead_nowhere_else(tmp_path: Path, content: BinaryIO) -> None:
