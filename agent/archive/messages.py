@@ -6,7 +6,7 @@ from msgspec import Struct
 
 
 class Look(Struct, frozen=True, tag=True):
-    """Which of these contents does the archive lack? ``digests``: blake3, 32 bytes each."""
+    """Which of these contents does the archive lack, or hold harmed? ``digests``: blake3, 32 bytes each."""
 
     digests: tuple[bytes, ...]
 

@@ -27,7 +27,7 @@ from checkpoint.keeper.messages import Channel, ChannelError, close_all
 from checkpoint.sentences import in_words
 from checkpoint.store.chain_files import fold_to
 from failover.archive import sealed
-from failover.archive.archive import Archive, object_store
+from failover.archive.archive import Archive, object_store, require_room
 from failover.core import vote_record
 from failover.errors import FailoverError
 
@@ -38,12 +38,11 @@ OOM_SCORE: Final = "800"
 
 
 class Archivist:
-    """Carries requests out. What it needs of the place and the key is looked for at each: both may come later."""
+    """Carries requests out. The place, the key and the bucket's keys are looked for at each: they may come later, and change."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._aside = Path(settings.config.state_directory)
-        self._archive: Archive | None = None
 
     def answer(self, request: Request, descriptors: tuple[int, ...]) -> Done:
         """Do what is asked, or say why it cannot be done."""
@@ -58,22 +57,20 @@ class Archivist:
         archive = self._opened()
         match request:
             case Look():
-                return Done(lacking=tuple(digest for digest in request.digests if archive.lacks(digest)))
+                return Done(lacking=tuple(digest for digest in request.digests if not archive.holds_whole(digest)))
             case KeepContent():
                 with open(descriptors[0], "rb", buffering=0, closefd=False) as content:
                     return Done(size=archive.put_content(request.digest, content))
             case KeepCheckpoint():
                 with self._whole(descriptors) as checkpoint:
                     name, size = archive.put(checkpoint, self._settings.config.robot, self._spec(request.component))
-                archive.thin(request.component, self._settings.config.store.s3_keep)
+                archive.thin(request.component, self._settings.config.store.s3_keep, but=name)
                 return Done(name=name, size=size)
 
     def _opened(self) -> Archive:
-        if self._archive is None:
-            store, team = self._settings.config.store, self._settings.team.team
-            key = sealed.read_key(Path(self._settings.config.team_directory))
-            self._archive = Archive(object_store(store.s3, store.s3_endpoint), key, team, self._aside)
-        return self._archive
+        store, team = self._settings.config.store, self._settings.team.team
+        key = sealed.read_key(Path(self._settings.config.team_directory))
+        return Archive(object_store(store.s3, store.s3_endpoint), key, team, self._aside)
 
     @contextlib.contextmanager
     def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:
@@ -82,6 +79,7 @@ class Archivist:
             with open(chain[0], "rb", buffering=0, closefd=False) as base:
                 yield base
             return
+        require_room(self._aside, 2 * sum(os.fstat(one).st_size for one in chain))  # folded, and sealed
         with tempfile.TemporaryFile(dir=self._aside) as file:
             fold_to(file, *chain)
             file.flush()

@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -31,6 +31,12 @@ CONTENTS: Final = "contents"
 PART_SIZE: Final = 1 << 20
 LABEL_SIZE_MAX: Final = sealed.FRAME_SIZE - 4
 """Bytes: it lies in the first frame."""
+
+STAMP_MS_MAX: Final = 253_402_300_799_999
+"""The last millisecond of the year 9999."""
+
+RESERVE_SIZE: Final = 256 << 20
+"""Bytes of a disk that stay free for the checkpoints of the standbys."""
 
 _NAMES: Final = "failover-archive-1 names of contents"
 """Context of the digests by which contents are named: who has not the key cannot tell which programs a team runs."""
@@ -64,21 +70,24 @@ class Label(Struct, frozen=True):
 
 
 class Copy(Struct, frozen=True):
-    """One checkpoint in the archive, as its object's name says.
+    """One checkpoint in the archive, as its object's name says. An object with another name than it was sealed for does not open.
 
     Attributes:
-        folder: of the component, `checkpoint.store.index.folder_name`.
+        folder: of the component, `checkpoint.store.index.folder_name`; ``file``: of the checkpoint, in a store.
+        stamp_ms: when it was sealed, since 1970; at least 1 more than the newest copy before it has. A new life of a component
+            begins at epoch 1, and is newer all the same.
         epoch, generation, sequence: of the checkpoint.
-        size: bytes of the object; ``at_s``: when it came, seconds since 1970.
+        size: bytes of the object.
     """
 
     name: str
     folder: str
+    file: str
+    stamp_ms: int
     epoch: int
     generation: int
     sequence: int
     size: int
-    at_s: float
 
     @property
     def component(self) -> str:
@@ -86,9 +95,14 @@ class Copy(Struct, frozen=True):
         return unquote(self.folder.removeprefix(FOLDER_PREFIX))
 
     @property
-    def order(self) -> tuple[int, int, int]:
+    def order(self) -> tuple[int, int, int, int]:
         """Later is greater."""
-        return self.epoch, self.generation, self.sequence
+        return self.stamp_ms, self.epoch, self.generation, self.sequence
+
+    @property
+    def at_s(self) -> float:
+        """When it was sealed, seconds since 1970."""
+        return self.stamp_ms / 1000
 
 
 class Archive:
@@ -108,7 +122,7 @@ class Archive:
     # Keeping
 
     def put(self, checkpoint: BinaryIO, robot: str, spec: bytes = b"") -> tuple[str, int]:
-        """Keep a whole checkpoint, unless it is there; prove that it arrived.
+        """Keep a whole checkpoint, unless it is there unharmed; prove that it arrived.
 
         Args:
             checkpoint: a file of the disk, of one base.
@@ -124,59 +138,86 @@ class Archive:
         header = format.verify(checkpoint.fileno())
         if not header.is_base:
             raise FormatError("a delta is not archived: it is no whole checkpoint")
-        name = f"{self._team}/{folder_name(header.component)}/{file_name(header)}{SUFFIX}"
-        label = msgspec.msgpack.encode(Label(robot, time.time(), spec))
+        file, before = file_name(header), self.copies(header.component)
+        for copy in before:
+            if copy.file == file and not self._refusal(copy.name, copy.size):
+                return copy.name, copy.size
+        now_s = time.time()
+        stamp_ms = min(max([int(1000 * now_s), *(copy.stamp_ms + 1 for copy in before[:1])]), STAMP_MS_MAX)
+        name = f"{self._team}/{folder_name(header.component)}/{stamp_ms:012x}-{file}{SUFFIX}"
+        label = msgspec.msgpack.encode(Label(robot, now_s, spec))
         if len(label) > LABEL_SIZE_MAX:
             raise ArchiveError(f"the specification of {header.component} has {len(spec)} bytes: {LABEL_SIZE_MAX} is the limit")
-        before = len(label).to_bytes(4, "little") + label
-        return name, self._kept(name, _joined(before, checkpoint))
+        return name, self._kept(name, _joined(len(label).to_bytes(4, "little") + label, checkpoint), _size(checkpoint))
 
     def lacks(self, digest: bytes) -> bool:
         """Whether the content of this digest is not here."""
         return self._objects.size(self._content_name(digest)) is None
 
-    def put_content(self, digest: bytes, content: BinaryIO) -> int:
-        """Keep a file that programs need, by its blake3 digest; the size of its object. Raises as `put`."""
-        if digest_of_descriptor(content.fileno()) != digest:
-            raise ArchiveError(f"a file was to be archived as {digest.hex()}, and has another content; it was changed meanwhile")
-        return self._kept(self._content_name(digest), _joined(b"", content))
+    def holds_whole(self, digest: bytes) -> bool:
+        """Whether the content of this digest is here, with both ends of its object unharmed."""
+        name = self._content_name(digest)
+        size = self._objects.size(name)
+        return size is not None and not self._refusal(name, size)
 
-    def thin(self, component: str, keep: int) -> int:
-        """Remove all but the newest checkpoints of a component; how many went."""
-        gone = self.copies(component)[keep:]
+    def put_content(self, digest: bytes, content: BinaryIO) -> int:
+        """Keep a file that programs need, by its blake3 digest; the size of its object. Raises as `put`.
+
+        An object of it that was harmed is replaced.
+        """
+        name, found = self._content_name(digest), blake3()
+        there = self._objects.size(name)
+        if there is not None:
+            if not self._refusal(name, there):
+                return there
+            self._objects.remove(name)
+
+        def prove() -> None:
+            if found.digest() != digest:
+                raise ArchiveError(
+                    f"a file was to be archived as {digest.hex()}, and has another content; it was changed meanwhile"
+                )
+
+        return self._kept(name, _seen(_joined(b"", content), found.update), _size(content), prove)
+
+    def thin(self, component: str, keep: int, but: str = "") -> int:
+        """Remove all but the newest checkpoints of a component, and never the object of this name; how many went."""
+        gone = [copy for copy in self.copies(component)[keep:] if copy.name != but]
         for copy in reversed(gone):
             self._objects.remove(copy.name)
         return len(gone)
 
-    def _kept(self, name: str, parts: Iterator[bytes]) -> int:
-        there, is_ours = self._objects.size(name), False
-        if there is None:
-            with tempfile.TemporaryFile(dir=self._aside) as file:
-                there = sealed.seal(self._key, name, parts, file)
-                file.flush()
-                is_ours = self._objects.put(name, file)
-                if not is_ours:  # another member was first
-                    there = self._objects.size(name) or 0
-        try:
-            self._prove(name, there)
-        except ArchiveError:
-            if is_ours:  # its name is free for another try
+    def _kept(self, name: str, parts: Iterator[bytes], size: int, prove: Callable[[], None] = lambda: None) -> int:
+        """Seal parts of so many bytes, prove them, and put them; the size of the object."""
+        require_room(self._aside, size)
+        with tempfile.TemporaryFile(dir=self._aside) as file:
+            there = sealed.seal(self._key, name, parts, file)
+            prove()
+            file.flush()
+            is_ours = self._objects.put(name, file)
+            if not is_ours:  # another member was first
+                there = self._objects.size(name) or 0
+        if refusal := self._refusal(name, there):
+            if is_ours:  # it would count among those that are kept
                 with contextlib.suppress(ArchiveError):
                     self._objects.remove(name)
-            raise
+            raise ArchiveError(f"{name} was put into the archive, and does not come back from it: {refusal}; it is put again")
         return there
 
-    def _prove(self, name: str, size: int) -> None:
-        """Read the ends of an object back: as long as it should be, under this key, with its last frame."""
+    def _refusal(self, name: str, size: int) -> str:
+        """Why an object is not whole; "" where its size and its two ends prove it: this key, this name, the last frame."""
         found = self._objects.size(name)
-        if found != size:
-            raise ArchiveError(
-                f"{name} was put into the archive with {size} bytes, and has {found or 0} there; the next try is a new one"
-            )
+        if found != size or size < sealed.HEAD_SIZE + sealed.TAG_SIZE:
+            return f"it was sent with {size} bytes, and has {found or 0} there"
         with closing(self._objects.open(name)) as source:
             head = sealed.exactly(source, sealed.HEAD_SIZE)
         with closing(self._objects.open(name, sealed.last_frame(size))) as source:
-            sealed.check_end(self._key, name, head, size, sealed.exactly(source, sealed.FRAME_SIZE + sealed.TAG_SIZE))
+            last = sealed.exactly(source, sealed.FRAME_SIZE + sealed.TAG_SIZE)
+        try:
+            sealed.check_end(self._key, name, head, size, last)
+        except ArchiveError as error:
+            return str(error)
+        return ""
 
     # Asking
 
@@ -185,10 +226,11 @@ class Archive:
         below = f"{self._team}/{folder_name(component)}" if component else self._team
         found = []
         for stored in self._objects.listed(below):
-            place, _, file = stored.name.removeprefix(f"{self._team}/").partition("/")
-            is_one = place.startswith(FOLDER_PREFIX) and "/" not in file and file.endswith(BASE_SUFFIX + SUFFIX)
-            if is_one and (order := order_of_name(file)) is not None:
-                found.append(Copy(stored.name, place, *order, stored.size, stored.at_s))
+            place, _, words = stored.name.removeprefix(f"{self._team}/").partition("/")
+            stamp, _, file = words.removesuffix(SUFFIX).partition("-")
+            is_one = place.startswith(FOLDER_PREFIX) and "/" not in words and words.endswith(BASE_SUFFIX + SUFFIX)
+            if is_one and (stamp_ms := _stamp(stamp)) is not None and (order := order_of_name(file)) is not None:
+                found.append(Copy(stored.name, place, file, stamp_ms, *order, stored.size))
         found.sort(key=lambda copy: copy.order, reverse=True)
         return sorted(found, key=lambda copy: copy.folder)
 
@@ -225,7 +267,7 @@ class Archive:
             header = format.verify(file.fileno())
         except FormatError as error:
             raise ArchiveError(f"{copy.name} in the archive is no whole checkpoint: {error}") from error
-        if file_name(header) + SUFFIX != copy.name.rpartition("/")[2] or folder_name(header.component) != copy.folder:
+        if file_name(header) != copy.file or folder_name(header.component) != copy.folder:
             raise ArchiveError(f"{copy.name} in the archive holds another checkpoint than its name says")
         return label
 
@@ -244,6 +286,39 @@ class Archive:
     def _content_name(self, digest: bytes) -> str:
         keyed = blake3(self._key + digest, derive_key_context=_NAMES).hexdigest()
         return f"{self._team}/{CONTENTS}/{keyed}{SUFFIX}"
+
+
+def require_room(folder: Path, size: int) -> None:
+    """Refuse to begin what could take a disk the room that checkpoints need.
+
+    Raises:
+        ArchiveError: it has not so many bytes and `RESERVE_SIZE`.
+        OSError: it does not say.
+    """
+    disk = os.statvfs(folder)
+    free = disk.f_bavail * disk.f_frsize
+    if free < size + RESERVE_SIZE:
+        raise ArchiveError(
+            f"the disk of {folder} has {free >> 20} MB free: a copy needs {(size >> 20) + 1} MB, and "
+            f"{RESERVE_SIZE >> 20} MB stay free for checkpoints; free some space"
+        )
+
+
+def _stamp(word: str) -> int | None:
+    """The milliseconds that a name begins with; None if it is no such name."""
+    with contextlib.suppress(ValueError):
+        return stamp if 0 <= (stamp := int(word, 16)) <= STAMP_MS_MAX else None
+    return None
+
+
+def _size(file: BinaryIO) -> int:
+    return os.fstat(file.fileno()).st_size
+
+
+def _seen(parts: Iterator[bytes], see: Callable[[bytes], object]) -> Iterator[bytes]:
+    for part in parts:
+        see(part)
+        yield part
 
 
 def _joined(before: bytes, file: BinaryIO) -> Iterator[bytes]:

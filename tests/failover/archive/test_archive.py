@@ -9,11 +9,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from types import SimpleNamespace
+from typing import Any, BinaryIO
 
 import msgspec
 import pytest
 from blake3 import blake3
+from msgspec.structs import replace
 
 from checkpoint.errors import FormatError
 from checkpoint.model import Snapshot
@@ -22,7 +24,7 @@ from checkpoint.snapshot.required_files import Need
 from checkpoint.store import chain
 from checkpoint.store.chain_files import fold_to
 from failover.archive import sealed
-from failover.archive.archive import Archive
+from failover.archive.archive import STAMP_MS_MAX, Archive
 from failover.archive.objects import FolderObjects
 from failover.core.types import ComponentSpec
 from failover.errors import ArchiveError
@@ -207,6 +209,82 @@ def test_only_the_newest_copies_of_a_component_stay(place: Path) -> None:
     assert len(archive(place).copies()) == 3
 
 
+def test_a_new_life_of_a_component_is_newer_than_all_copies_of_the_old_one(place: Path) -> None:
+    for sequence in (1, 2, 3):
+        put(archive(place), replace(snapshot({1: page("old")}, sequence=sequence, generation=40 * 65), epoch=40))
+    name = put(archive(place), snapshot({1: page("new")}))
+    assert archive(place).thin(COMPONENT, 3, but=name) == 1
+    assert [(copy.epoch, copy.sequence) for copy in archive(place).copies(COMPONENT)] == [(1, 1), (40, 3), (40, 2)]
+    assert fetched(archive(place)).contents[:3] == b"new"
+
+
+def test_a_clock_that_is_behind_makes_no_copy_older_than_those_before(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = put(archive(place), snapshot({1: page("1")}))
+    monkeypatch.setattr("failover.archive.archive.time", SimpleNamespace(time=lambda: 1000.0))
+    second = put(archive(place), snapshot({1: page("2")}, sequence=2))
+    newest, older = archive(place).copies()
+    assert (newest.name, older.name) == (second, first) and newest.stamp_ms == older.stamp_ms + 1
+    with tempfile.TemporaryFile() as file:
+        assert archive(place).fetch(newest, file).at_s == 1000.0
+
+
+def test_what_was_just_put_stays_whatever_the_owner_of_the_place_names_newer(place: Path) -> None:
+    name = put(archive(place), history(1)[0])
+    for number in range(3):
+        (place / name).with_name(f"{STAMP_MS_MAX:012x}-9-9-{number}-0.base.sealed").touch()
+    assert archive(place).thin(COMPONENT, 2, but=name) == 1
+    assert name in [copy.name for copy in archive(place).copies()]
+    later = put(archive(place), history(2)[0])
+    assert later == name, "it is there"
+
+
+@pytest.mark.parametrize("size", [0, 10, -5])
+def test_a_copy_that_was_harmed_is_put_anew(size: int, place: Path) -> None:
+    name = put(archive(place), history(1)[0])
+    content = (place / name).read_bytes()
+    (place / name).write_bytes(content[:size])
+    again = put(archive(place), history(1)[0])
+    assert again != name and archive(place).copies()[0].name == again
+    assert pages_of(fetched(archive(place))) == pages_of(history(1)[0])
+
+
+@pytest.mark.parametrize("size", [0, 10, -5])
+def test_a_needed_file_that_was_harmed_is_replaced(size: int, place: Path) -> None:
+    content = os.urandom(3000)
+    digest = blake3(content).digest()
+    with file_of(content) as file:
+        archive(place).put_content(digest, file)
+        (stored,) = place.rglob("*.sealed")
+        stored.write_bytes(stored.read_bytes()[:size])
+        assert not archive(place).holds_whole(digest)
+        archive(place).put_content(digest, file)
+    assert archive(place).holds_whole(digest)
+    with tempfile.TemporaryFile() as file:
+        archive(place).fetch_content(Need("/opt/mapper", len(content), digest), file)
+
+
+def test_a_needed_file_that_changes_while_it_is_sealed_leaves_no_object(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = os.urandom(3000)
+    digest = blake3(content).digest()
+    real = sealed.seal
+
+    def changed(*arguments: Any) -> int:
+        os.pwrite(file.fileno(), b"other", 10)
+        return real(*arguments)
+
+    monkeypatch.setattr(sealed, "seal", changed)
+    with file_of(content) as file, pytest.raises(ArchiveError, match="changed meanwhile"):
+        archive(place).put_content(digest, file)
+    assert archive(place).lacks(digest)
+
+
+def test_a_disk_that_is_nearly_full_takes_no_copy(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("failover.archive.archive.RESERVE_SIZE", 1 << 60)
+    with pytest.raises(ArchiveError, match=r"MB free: a copy needs 1 MB, and .* stay free for checkpoints; free some space"):
+        put(archive(place), history(1)[0])
+    assert archive(place).copies() == []
+
+
 def test_the_owner_of_the_place_cannot_pass_one_checkpoint_off_as_another(place: Path) -> None:
     old, new = (put(archive(place), snapshot({1: page(str(number))}, sequence=number)) for number in (1, 2))
     (place / new).write_bytes((place / old).read_bytes())
@@ -217,12 +295,15 @@ def test_the_owner_of_the_place_cannot_pass_one_checkpoint_off_as_another(place:
         assert b"mapper" not in file.read_bytes()
 
 
-STRANGE = ("x", "@x/y", "@x/y.base.sealed", "@x/1-2.base.sealed", "@x/1-2-3-4.delta.sealed", "@z/y/1-2-3-4.base.sealed")
+STRANGE = (
+    *("x", "@x/y", "@x/y.base.sealed", "@x/1-1-2.base.sealed", "@x/1-1-2-3-4.delta.sealed", "@z/y/1-1-2-3-4.base.sealed"),
+    *("@x/z-1-2-3-4.base.sealed", "@x/-1-1-2-3-4.base.sealed", "@x/ffffffffffffffff-1-2-3-4.base.sealed", "@x/1-1-2-3-4.base"),
+)
 
 
 def test_other_objects_of_the_place_are_no_checkpoints(place: Path) -> None:
     name = put(archive(place), history(1)[0])
-    for other in (*STRANGE, "contents/1-2-3-4.base.sealed", "1-2-3-4.base.sealed"):
+    for other in (*STRANGE, "contents/1-1-2-3-4.base.sealed", "1-1-2-3-4.base.sealed"):
         path = place / "lab" / other
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
@@ -237,7 +318,10 @@ def test_what_arrived_otherwise_than_it_was_sent_is_found_at_once(place: Path) -
                 file.truncate(os.fstat(file.fileno()).st_size - 1)
             return is_new
 
-    with pytest.raises(ArchiveError, match="was put into the archive with"), file_of(format.encode_bytes(history(1)[0])) as file:
+    with (
+        pytest.raises(ArchiveError, match="does not come back from it: it was sent with"),
+        file_of(format.encode_bytes(history(1)[0])) as file,
+    ):
         Archive(Losing(place), KEY, "lab", place.parent).put(file, "r1")
     assert archive(place).copies() == []
     assert put(archive(place), history(1)[0]) == archive(place).copies()[0].name, "the next try is a new one"
@@ -265,6 +349,8 @@ def test_files_that_a_program_needs_are_kept_once_under_names_that_tell_nothing(
         archive(place).fetch_content(need, file)
         file.seek(0)
         assert file.read() == content
-    with file_of(b"changed"), pytest.raises(ArchiveError, match="changed meanwhile"), file_of(b"changed") as file:
+    (stored,) = place.rglob("*.sealed")
+    stored.unlink()
+    with pytest.raises(ArchiveError, match="changed meanwhile"), file_of(b"changed") as file:
         archive(place).put_content(digest, file)
     assert archive(place).copies() == []

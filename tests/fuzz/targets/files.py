@@ -400,7 +400,7 @@ def archive_label() -> Decoder:
     snapshot = format.encode_bytes(snapshots.history(1)[0])
     header = format.read_header(snapshot)
     folder = folder_name(header.component)
-    name = f"lab/{folder}/{file_name(header)}.sealed"
+    name = f"lab/{folder}/1-{file_name(header)}.sealed"
     (place / name).parent.mkdir(parents=True)
     archive = Archive(FolderObjects(place), bytes(32), "lab", place)
 
@@ -408,6 +408,6 @@ def archive_label() -> Decoder:
         with (place / name).open("wb") as file:
             sealed.seal(bytes(32), name, iter([len(content).to_bytes(4, "little") + content + snapshot]), file)
         with (place / "fetched").open("w+b") as file:
-            return archive.fetch(Copy(name, folder, 1, 1, 1, 0, 0.0), file)
+            return archive.fetch(Copy(name, folder, file_name(header), 1, 1, 1, 1, 0), file)
 
     return Decoder([msgspec.msgpack.encode(Label("r1", 1.5, b"spec"))], call)
