@@ -13,6 +13,7 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable, Collection
 from typing import Final
@@ -37,6 +38,17 @@ BEHIND_ROUNDS: Final = 3
 SAID_MAX: Final = 3
 """Components that the status names; of more it says how many."""
 
+REFUSED_MAX: Final = 3
+"""Files of one component that the archive may refuse in one round; then its checkpoint has its turn."""
+
+PATIENCE_S: Final = 600.0
+LEAST_RATE: Final = 100_000
+DIGEST_S: Final = 10.0
+"""How long the process may take for an answer: some time, what it reads and sends at so many bytes each second, each digest."""
+
+END_S: Final = 10.0
+"""How long it may take to end once it is killed."""
+
 log = logging.getLogger("failover.archive")
 
 Opening = Callable[[str, Need], Awaitable[int]]
@@ -53,7 +65,7 @@ class _Shelf(Struct):
     Attributes:
         position: of the newest copy; None: none was made by this worker.
         since_s: when that was made, or the component was first seen here; monotonic.
-        trouble: why the last try failed; "" if it did not.
+        trouble: why the last try failed, wholly or for a file that it needs; "" if it did not.
     """
 
     since_s: float
@@ -83,16 +95,21 @@ class Archiving:
         self._shelves: dict[str, _Shelf] = {}
         self._child: subprocess.Popen[bytes] | None = None
         self._dialogue: Dialogue | None = None
+        self._busy_with = ""
 
     async def run(self) -> None:
         """Make copies until cancelled."""
         try:
             while True:
                 for name in self._wanted():
+                    self._busy_with = name
                     await self._copy(name)
+                self._busy_with = ""
                 await asyncio.sleep(self._config.s3_every_s)
         finally:
-            self._end_child()
+            self._hang_up()
+            if self._child is not None:
+                threading.Thread(target=self._child.wait, daemon=True).start()  # the kernel may hold it: nobody waits for it
 
     def complaints(self) -> list[str]:
         """For the status: what is not in the archive as it should be."""
@@ -101,10 +118,12 @@ class Archiving:
         for name in self._wanted():
             shelf = self._shelves.setdefault(name, _Shelf(now_s))
             age_s = now_s - shelf.since_s
-            if self._is_current(name, shelf) or not (shelf.trouble or age_s > BEHIND_ROUNDS * every_s):
+            is_late = age_s > BEHIND_ROUNDS * every_s and not self._is_current(name, shelf)
+            if not (shelf.trouble or is_late):
                 continue
             since = f"its newest copy is {age_s:.0f} s old" if shelf.position else f"it has had no copy for {age_s:.0f} s"
-            why = shelf.trouble or "a copy is on its way"
+            is_waiting = self._busy_with not in ("", name)
+            why = shelf.trouble or (f"it waits behind {self._busy_with}" if is_waiting else "a copy is on its way")
             behind.append(
                 f"ARCHIVE BEHIND: {name}: {since}: {why}; it is protected by its standby as before; next try within {every_s} s"
             )
@@ -121,70 +140,116 @@ class Archiving:
     async def _copy(self, name: str) -> None:
         """Make one copy of a component, unless it is as it was; never raises."""
         shelf = self._shelves.setdefault(name, _Shelf(time.monotonic()))
-        if self._is_current(name, shelf):
+        if self._is_current(name, shelf) and not shelf.trouble:
             return
         try:
-            if self._settings.config.bring:
-                await self._copy_files(name, shelf)
-            begun_s = time.monotonic()
-            chain = tuple(await asyncio.to_thread(self._store.open_chain, name))
-            try:
-                position = format.read_header(chain[-1]).position
-                done = await self._ask(KeepCheckpoint(name), chain)
-            finally:
-                close_all(chain)
+            lacking = await self._copy_files(name, shelf) if self._settings.config.bring else []
+            if not self._is_current(name, shelf):
+                await self._copy_checkpoint(name, shelf)
         except TROUBLE as error:
-            self._fail(name, shelf, str(error))
+            self._fail(name, shelf, "its checkpoints do not reach the archive", str(error))
+            return
+        if lacking:
+            one = lacking[0] + (f", and {len(lacking) - 1} more" if len(lacking) > 1 else "")
+            self._fail(
+                name, shelf, "its checkpoints reach the archive without files", f"a file that it needs is not there: {one}"
+            )
             return
         if shelf.trouble:
             self._tell(Noticed(name, "its checkpoints reach the archive again"))
-        shelf.position, shelf.since_s, shelf.trouble = position, begun_s, ""
+        shelf.trouble = ""
+
+    async def _copy_checkpoint(self, name: str, shelf: _Shelf) -> None:
+        """Raises CheckpointError, AgentError, OSError."""
+        begun_s = time.monotonic()
+        chain = tuple(await asyncio.to_thread(self._store.open_chain, name))
+        try:
+            position = format.read_header(chain[-1]).position
+            done = await self._ask(KeepCheckpoint(name), chain)
+        finally:
+            close_all(chain)
+        shelf.position, shelf.since_s = position, begun_s
         log.debug("%s is in the archive: %s, %d bytes", name, done.name, done.size)
 
-    async def _copy_files(self, name: str, shelf: _Shelf) -> None:
-        """The files that its program needs, each once.
+    async def _copy_files(self, name: str, shelf: _Shelf) -> list[str]:
+        """The files that its program needs, each once; why those that lack are not there.
 
         Raises:
-            CheckpointError, AgentError, OSError: one of them is not here, or does not arrive.
+            CheckpointError, AgentError, OSError: the archive does not answer, or the checkpoint cannot be read.
         """
         outline = await asyncio.to_thread(newest_of, self._store, name)
         brings_data = self._settings.component(name).bring_data
         wanted = {need.digest: need for need in needs(outline, opened=brings_data)} if outline is not None else {}
         unknown = tuple(digest for digest in wanted if digest and digest not in shelf.has)
         if not unknown:
-            return
+            return []
         lacking = (await self._ask(Look(unknown))).lacking
+        shelf.has.update(set(unknown) - set(lacking))
+        troubles: list[str] = []
+        refused = 0
         for digest in lacking:
-            descriptor = await self._open_need(name, wanted[digest])
+            try:
+                descriptor = await self._open_need(name, wanted[digest])
+            except TROUBLE as error:
+                troubles.append(str(error))
+                continue
             try:
                 await self._ask(KeepContent(digest), (descriptor,))
+                shelf.has.add(digest)
+            except TROUBLE as error:
+                troubles.append(f"{wanted[digest].path}: {error}")
+                refused += 1
             finally:
                 os.close(descriptor)
-        shelf.has.update(unknown)
+            if refused == REFUSED_MAX:
+                break
+        return troubles
 
-    def _fail(self, name: str, shelf: _Shelf, trouble: str) -> None:
+    def _fail(self, name: str, shelf: _Shelf, what: str, trouble: str) -> None:
         if not shelf.trouble:
-            log.warning("%s does not reach the archive: %s", name, trouble)
-            self._tell(Noticed(name, f"its checkpoints do not reach the archive: {trouble}"))
+            log.warning("%s: %s: %s", name, what, trouble)
+            self._tell(Noticed(name, f"{what}: {trouble}"))
         shelf.trouble = trouble
 
     async def _ask(self, request: Request, descriptors: tuple[int, ...] = ()) -> Done:
         """Have the process do something.
 
         Raises:
-            AgentError: it cannot be done, or the process ended.
+            AgentError: it cannot be done, or the process ended, or it took too long and was ended.
         """
-        answer, more = await self._opened().ask(request, descriptors)
+        size = sum(os.fstat(one).st_size for one in descriptors)
+        limit_s = PATIENCE_S + size / LEAST_RATE + (DIGEST_S * len(request.digests) if isinstance(request, Look) else 0.0)
+        dialogue = await self._opened()
+        try:
+            async with asyncio.timeout(limit_s):
+                answer, more = await dialogue.ask(request, descriptors)
+        except TimeoutError as error:
+            self._hang_up()
+            raise NotArchivedError(
+                f"the archive's process did not answer for {limit_s:.0f} s and was ended; see that its place answers"
+            ) from error
         close_all(more)
         if not isinstance(answer, Done) or answer.refusal:
             raise NotArchivedError(answer.refusal)
         return answer
 
-    def _opened(self) -> Dialogue:
-        """The conversation with the process, which is started if there is none."""
+    async def _opened(self) -> Dialogue:
+        """The conversation with the process, which is started if there is none.
+
+        Raises:
+            AgentError: the last one does not end.
+        """
         if self._dialogue is not None and self._dialogue.open:
             return self._dialogue
-        self._end_child()
+        self._hang_up()
+        if self._child is not None:
+            try:
+                await asyncio.to_thread(self._child.wait, END_S)
+            except subprocess.TimeoutExpired as error:
+                raise NotArchivedError(
+                    f"the archive's process {self._child.pid} was killed and does not end: the kernel waits for its place; "
+                    "see that the disk or the server of the folder answers"
+                ) from error
         ours, theirs = pair()
         with theirs:
             command = [sys.executable, "-P", "-m", "agent.archive.process", str(self._settings.path), str(theirs.fileno())]
@@ -192,10 +257,9 @@ class Archiving:
         self._dialogue = Dialogue(ours, Done, NotArchivedError, "the archive's process")
         return self._dialogue
 
-    def _end_child(self) -> None:
+    def _hang_up(self) -> None:
         if self._dialogue is not None:
             self._dialogue.close()
+            self._dialogue = None
         if self._child is not None:
             self._child.kill()
-            self._child.wait()
-        self._dialogue = self._child = None

@@ -5,9 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
+import subprocess
+import tempfile
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -168,7 +172,7 @@ def test_the_files_of_a_program_go_along_and_one_that_cannot_be_had_is_told(tmp_
         async def work() -> None:
             nonlocal is_here
             await until(lambda: any("/opt/mapper is not here any more" in said for said in one.archiving.complaints()))
-            assert one.archived() == [], "a checkpoint without its files would not help"
+            await until(lambda: one.archived() == [1])
             is_here = True
             await until(lambda: one.archived() == [1] and not one.archiving.complaints())
             count = len(asked)
@@ -179,6 +183,75 @@ def test_the_files_of_a_program_go_along_and_one_that_cannot_be_had_is_told(tmp_
         run(one, work)
         assert not one.archive().lacks(executable.digest)
         assert [event.sentence.partition(":")[0] for event in one.events] == [  # type: ignore[union-attr]
-            "its checkpoints do not reach the archive",
+            "its checkpoints reach the archive without files",
             "its checkpoints reach the archive again",
         ]
+
+
+def test_a_key_that_is_replaced_seals_the_next_copy(tmp_path: Path) -> None:
+    with member(tmp_path) as one:
+        one.put(history(1)[0])
+        one.running.add(COMPONENT)
+
+        async def work() -> None:
+            await until(lambda: one.archived() == [1])
+            path = sealed.key_path(tmp_path / "team")
+            path.rename(path.with_suffix(".old"))
+            sealed.new_key(tmp_path / "team")
+            one.put(history(2)[1])
+            await until(lambda: one.archived() == [2, 1])
+
+        run(one, work)
+        with tempfile.TemporaryFile() as file:
+            one.archive().fetch(one.archive().copies()[0], file)
+
+
+def test_a_process_that_hangs_is_told_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with member(tmp_path) as one:
+        one.put(history(1)[0])
+        one.running.add(COMPONENT)
+
+        async def work() -> None:
+            await until(lambda: one.archived() == [1])
+            child = one.archiving._child
+            assert child is not None
+            os.kill(child.pid, signal.SIGSTOP)
+            monkeypatch.setattr("agent.worker.archiving.PATIENCE_S", 0.5)
+            one.put(history(2)[1])
+            await until(lambda: any("s and was ended; see that" in said for said in one.archiving.complaints()))
+            monkeypatch.setattr("agent.worker.archiving.PATIENCE_S", 600.0)
+            await until(lambda: one.archived() == [2, 1] and not one.archiving.complaints())
+            assert child.returncode == -signal.SIGKILL and one.archiving._child is not child
+
+        run(one, work)
+
+
+def test_a_process_that_does_not_end_when_it_is_killed_is_told_and_no_second_one_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stuck(subprocess.Popen[bytes]):
+        def kill(self) -> None:
+            """The kernel holds it."""
+
+    started: list[Stuck] = []
+
+    def start(*arguments: Any, **keywords: Any) -> Stuck:
+        started.append(Stuck(["sleep", "1000"]))
+        return started[-1]
+
+    monkeypatch.setattr("agent.worker.archiving.subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start}))
+    monkeypatch.setattr("agent.worker.archiving.END_S", 0.1)
+    with member(tmp_path) as one:
+        one.put(history(1)[0])
+        one.running.add(COMPONENT)
+
+        async def work() -> None:
+            await until(lambda: any("was killed and does not end" in said for said in one.archiving.complaints()))
+
+        try:
+            run(one, work)
+        finally:
+            for process in started:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+        assert len(started) == 1
