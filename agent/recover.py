@@ -61,11 +61,12 @@ def recover(settings: Settings, name: str) -> int:
             tempfile.TemporaryFile(dir=directory) as file,
         ):
             component, label = _fetched(archive, copies[0], file, before, settings)
+            spec = _spec(label)
             missing = _keep_files(archive, store, file, directory)
             store.put(file.fileno())
     except (CheckpointError, OSError) as error:
         raise AgentError(f"cannot recover {name}: {in_words(error)}; nothing is on record of it") from error
-    record = Record(component, copies[0].epoch, state=State.STANDBY, spec=_spec(label), begun=True)
+    record = Record(component, copies[0].epoch, state=State.STANDBY, spec=spec, begun=True)
     record_file.keep(core_vote_record.encode(msgspec.structs.replace(before, records=(*before.records, record))))
     robot, epoch = settings.config.robot, copies[0].epoch
     print(f"{robot} holds {component} as {label.robot} archived it, epoch {epoch}; start the agent, and see failover status")

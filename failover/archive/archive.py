@@ -240,7 +240,8 @@ class Archive:
         Raises:
             ArchiveError: the name fits several.
         """
-        fitting = [copy for copy in self.copies() if copy.component == name or copy.component.endswith("/" + name.lstrip("/"))]
+        end, folder = "/" + name.lstrip("/"), folder_name(name)  # the folder: where the name was too long for an object's
+        fitting = [copy for copy in self.copies() if copy.folder == folder or copy.component.endswith(end)]
         if len(meant := sorted({copy.component for copy in fitting})) > 1:
             raise ArchiveError(f"{name!r} could be {', '.join(meant)}; give the whole name")
         return fitting
@@ -332,6 +333,9 @@ def _joined(before: bytes, file: BinaryIO) -> Iterator[bytes]:
 
 def _label(name: str, packed: bytes) -> Label:
     try:
-        return msgspec.msgpack.decode(packed, type=Label)
+        label = msgspec.msgpack.decode(packed, type=Label)
+        if not 0 <= label.at_s <= STAMP_MS_MAX / 1000:
+            raise ValueError("its time is none")
+        return label
     except UNDECODABLE as error:
         raise ArchiveError(f"{name} in the archive holds no checkpoint of this version of failover: {error}") from error

@@ -44,10 +44,13 @@ def new_key(team: Path) -> Path:
     path = key_path(team)
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
-            file.write(secrets.token_hex(KEY_SIZE) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb", buffering=0) as file:
+            try:
+                file.write(secrets.token_hex(KEY_SIZE).encode() + b"\n")
+                os.fsync(file.fileno())
+            except OSError:
+                path.unlink()  # a key that is not whole is none
+                raise
         sync_directory(path.parent)
     except FileExistsError as error:
         raise ArchiveError(

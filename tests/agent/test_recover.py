@@ -81,6 +81,7 @@ def test_the_newest_copy_is_in_the_store_and_on_record(config: Path, place: Path
         ("no key", "failover archive key makes one"),
         ("no place", "mount the disk"),
         ("store in use", "another process has it open"),
+        ("newer", "a specification that this version of failover cannot read"),
     ],
 )
 def test_what_cannot_be_recovered_changes_nothing(
@@ -98,6 +99,13 @@ def test_what_cannot_be_recovered_changes_nothing(
             key.unlink()
             if spoil == "another key":
                 sealed.new_key(config.parent / "team")
+        case "newer":
+            with tempfile.TemporaryFile() as file:
+                file.write(format.encode_bytes(snapshot({1: page("3")}, sequence=3, component=COMPONENT)))
+                file.flush()
+                Archive(FolderObjects(place), sealed.read_key(config.parent / "team"), "lab", config.parent).put(
+                    file, "robot9", b"x"
+                )
         case "no place":
             place.rename(place.with_name("elsewhere"))
     assert recover(config, *words) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import shutil
 import tomllib
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -27,6 +28,7 @@ from failover.errors import ArchiveError
 
 CONFIG: Final = Path("/etc/failover/agent.toml")
 CONTENTS_SUFFIX: Final = ".contents"
+CLOCK_S: Final = 60.0
 NAMED: Final = 3
 """Files that a sentence names."""
 
@@ -53,7 +55,8 @@ def listed(arguments: argparse.Namespace) -> int:
         print(f"no checkpoint{of_name} is in the archive {place}")
         return 0
     lines = [
-        (visible(copy.component), str(copy.epoch), str(copy.sequence), _when(copy), team_tree.size(copy.size)) for copy in copies
+        (visible(copy.component), str(copy.epoch), str(copy.sequence), _when(copy.at_s), team_tree.size(copy.size))
+        for copy in copies
     ]
     render.table(("component", "epoch", "number", "archived", "size"), lines)
     return 0
@@ -70,10 +73,19 @@ def fetch(arguments: argparse.Namespace) -> int:
         outline = format.read_outline(file.fileno())
         brought, missing = _bring(archive, needs(outline), contents)
     if arguments.json:
-        told = {"component": outline.component, "file": str(output), "robot": label.robot, "brought": brought, "missing": missing}
+        told = {
+            "component": outline.component,
+            "file": str(output),
+            "robot": label.robot,
+            "brought": brought,
+            "missing": missing,
+            "at": label.at_s,
+        }
         render.as_json(_told(copy) | told | {"contents": str(contents) if brought else ""})
         return 0
-    print(f"{output} holds {outline.component} as {label.robot} archived it at {_when(copy)}")
+    print(f"{output} holds {outline.component} as {label.robot} archived it at {_when(label.at_s)}")
+    if copy.at_s - label.at_s > CLOCK_S:
+        print(f"the clock of {label.robot} was wrong: its name says {_when(copy.at_s)}, as the copy before it was no older")
     if brought:
         print(f"{contents} holds {len(brought)} of its files that this machine lacks: {', '.join(brought[:NAMED])}")
     for path in missing:
@@ -87,8 +99,14 @@ def _archive(arguments: argparse.Namespace) -> tuple[str, Archive]:
     place, endpoint = arguments.place, arguments.endpoint
     if place is None:
         config = StoreConfig()
-        with contextlib.suppress(OSError, *UNDECODABLE):
-            config = msgspec.convert(tomllib.loads(CONFIG.read_text()).get("store", {}), StoreConfig)
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                config = msgspec.convert(tomllib.loads(CONFIG.read_text()).get("store", {}), StoreConfig)
+        except (OSError, *UNDECODABLE) as error:
+            why = (error.strerror if isinstance(error, OSError) else "") or str(error)
+            raise ArchiveError(
+                f"{CONFIG} does not say where the archive is: {why}; name it by --place s3://BUCKET/PREFIX"
+            ) from error
         place, endpoint = config.s3, endpoint if endpoint is not None else config.s3_endpoint
     try:
         StoreConfig(s3=place, s3_endpoint=endpoint or "")
@@ -125,13 +143,16 @@ def _bring(archive: Archive, wanted: tuple[Need, ...], contents: Path) -> tuple[
     lacking = {need.digest: need for need in wanted if need.digest and not _is_here(need)}
     missing = [need.path for digest, need in lacking.items() if archive.lacks(digest)]
     brought = {digest: need for digest, need in lacking.items() if need.path not in missing}
-    for digest, need in brought.items():
+    if brought:
         with _told_of(contents):
-            contents.mkdir(mode=0o755, exist_ok=True)
-            path = path_in(contents, digest)
-            if not path.exists():
-                with new_file(path, CONTENT_MODE) as file:
-                    archive.fetch_content(need, file)
+            contents.mkdir(mode=0o755)  # nobody else can have put anything there
+            try:
+                for digest, need in brought.items():
+                    with new_file(path_in(contents, digest), CONTENT_MODE) as file:
+                        archive.fetch_content(need, file)
+            except BaseException:
+                shutil.rmtree(contents, ignore_errors=True)
+                raise
     return [need.path for need in brought.values()], missing
 
 
@@ -169,5 +190,5 @@ def _told(copy: Copy) -> dict[str, object]:
     return told | {"size": copy.size, "at": copy.at_s, "object": copy.name}
 
 
-def _when(copy: Copy) -> str:
-    return f"{datetime.fromtimestamp(copy.at_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
+def _when(at_s: float) -> str:
+    return f"{datetime.fromtimestamp(at_s, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import random
@@ -153,6 +154,16 @@ def test_a_key_is_made_once_and_read_by_its_owner_alone(tmp_path: Path) -> None:
         path.write_bytes(wrong)
         with pytest.raises(ArchiveError, match="is no archive key"):
             sealed.read_key(tmp_path)
+
+
+def test_a_key_that_the_disk_does_not_take_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ArchiveError, match="No space left"):
+        sealed.new_key(tmp_path)
+    assert not sealed.key_path(tmp_path).exists()
 
 
 # --- Checkpoints -----------------------------------------------------------------------------------------------------

@@ -9,12 +9,16 @@ import signal
 import subprocess
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from blake3 import blake3
+from msgspec.structs import replace
 
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
+from checkpoint.store.index import folder_name
 from failover.archive import sealed
 from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
@@ -122,3 +126,75 @@ def test_a_program_starts_from_the_archive_where_its_own_files_are_gone(
         assert os.readlink(f"/proc/{pid}/exe").startswith(told["contents"])
     finally:
         os.kill(pid, signal.SIGKILL)
+
+
+def test_a_folder_of_contents_that_is_there_already_is_not_used(
+    team: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = os.urandom(1000)
+    made = snapshot({1: page("x")})
+    executable = type(made.process.executable)("/opt/mapper", size=len(content), digest=blake3(content).digest())
+    put(team, format.encode_bytes(replace(made, process=replace(made.process, executable=executable))))
+    with tempfile.TemporaryFile() as file:
+        file.write(content)
+        file.flush()
+        archive(team).put_content(executable.digest, file)
+    output, contents = tmp_path / "mapper.snapshot", tmp_path / "mapper.snapshot.contents"
+    contents.mkdir()
+    assert asked(team, "fetch", "mapper", "--output", str(output)) == main.FAILED
+    assert f"cannot write {contents}: File exists" in capsys.readouterr().err
+    assert not output.exists() and list(contents.iterdir()) == []
+    contents.rmdir()
+    (harmed,) = (team.parent / "place").rglob("contents/*.sealed")
+    whole = harmed.read_bytes()
+    harmed.write_bytes(whole[:-1])
+    assert asked(team, "fetch", "mapper", "--output", str(output)) == main.FAILED
+    assert not output.exists() and not contents.exists()
+    harmed.write_bytes(whole)
+    assert asked(team, "fetch", "mapper", "--output", str(output)) == 0
+    assert [path.read_bytes() for path in contents.iterdir()] == [content]
+
+
+def test_a_configuration_that_cannot_be_read_is_named(
+    team: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tmp_path / "agent.toml"
+    monkeypatch.setattr("failover.cli.verbs.archive.CONFIG", config)
+    for text, said in (
+        (None, "no archive is named"),
+        ("[store", "does not say where the archive is"),
+        ('[store]\ns3 = "x"\n', "which is no place"),
+    ):
+        if text is not None:
+            config.write_text(text)
+        assert main.main(["archive", "list", "--directory", str(team)]) == main.FAILED
+        assert said in capsys.readouterr().err
+    config.write_text(f'[store]\ns3 = "{team.parent}/place"\n')
+    assert main.main(["archive", "list", "--directory", str(team)]) == 0
+
+
+def test_a_component_whose_name_was_too_long_for_an_object_is_found_by_its_name(
+    team: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ["/lab/robot1/" + "m" * 300 + end for end in ("a", "b")]
+    for name in names:
+        put(team, format.encode_bytes(snapshot({1: page("x")}, component=name)))
+    assert asked(team, "list", names[1], "--json") == 0
+    (copy,) = answer(capsys)["copies"]
+    assert folder_name(names[1]) in copy["object"]
+
+
+def test_the_time_that_a_copy_was_sealed_is_told_and_a_clock_that_was_wrong(
+    team: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        for sequence, now_s in ((1, 1_000_000_000.0), (2, 900_000_000.0)):
+            patch.setattr("failover.archive.archive.time", SimpleNamespace(time=lambda now_s=now_s: now_s))
+            put(team, format.encode_bytes(snapshot({1: page("x")}, sequence=sequence)))
+    for path in (team.parent / "place").rglob("*.sealed"):
+        os.utime(path, (0, 0))  # the owner of the place says what he likes
+    assert asked(team, "list") == 0
+    assert capsys.readouterr().out.count("2001-09-09 01:46:40 UTC") == 2
+    assert asked(team, "fetch", "mapper", "--output", str(tmp_path / "out")) == 0
+    said = capsys.readouterr().out
+    assert "as robot1 archived it at 1998-07-09 16:00:00 UTC" in said and "its name says 2001-09-09 01:46:40 UTC" in said
