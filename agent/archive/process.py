@@ -25,7 +25,9 @@ from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelError, close_all
 from checkpoint.sentences import in_words
+from checkpoint.snapshot import format
 from checkpoint.store.chain_files import fold_to
+from checkpoint.store.fold_rules import count_at_once
 from failover.archive import sealed
 from failover.archive.archive import Archive, object_store, require_room
 from failover.core import vote_record
@@ -74,16 +76,20 @@ class Archivist:
 
     @contextlib.contextmanager
     def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:
-        """A file of the state that a chain leads to, as one base."""
-        if len(chain) == 1:
-            with open(chain[0], "rb", buffering=0, closefd=False) as base:
-                yield base
-            return
-        require_room(self._aside, 2 * sum(os.fstat(one).st_size for one in chain))  # folded, and sealed
-        with tempfile.TemporaryFile(dir=self._aside) as file:
-            fold_to(file, *chain)
-            file.flush()
-            yield file
+        """A file of the state that a chain leads to, as one base; of its deltas no more are in memory than when a store folds."""
+        require_room(self._aside, 2 * sum(os.fstat(one).st_size for one in chain))  # folded, and sealed or folded again
+        deltas = list(chain[1:])
+        with contextlib.ExitStack() as files:
+            base: BinaryIO = files.enter_context(open(chain[0], "rb", buffering=0, closefd=False))
+            while deltas:
+                count = count_at_once([_pages_size(one) for one in (base.fileno(), *deltas)]) - 1
+                folded = files.enter_context(tempfile.TemporaryFile(dir=self._aside))
+                fold_to(folded, base.fileno(), *deltas[:count])
+                folded.flush()
+                base.close()
+                base = folded
+                del deltas[:count]
+            yield base
 
     def _spec(self, component: str) -> bytes:
         """How a component is started and by which rules it lives, as this member has it on record."""
@@ -91,6 +97,10 @@ class Archivist:
         records = vote_record.decode(VoteRecordFile(directory, robot).read().core).records
         spec = next((one.spec for one in records if one.name == component), None)
         return msgspec.msgpack.encode(spec) if spec is not None else b""
+
+
+def _pages_size(snapshot: int) -> int:
+    return sum(run.size for run in format.read_outline(snapshot).runs)
 
 
 def main() -> int:

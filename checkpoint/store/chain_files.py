@@ -110,6 +110,8 @@ class ChainFiles:
 def fold_to(file: Sink, *sources: Source) -> None:
     """Write the state that a chain leads to as one base, to an empty file; nothing is set out of use here.
 
+    All deltas are in memory meanwhile: `fold_rules.count_at_once`.
+
     Raises:
         FormatError, ChainError: a file of it is damaged, or it is no chain.
         OSError: the file does not take it.

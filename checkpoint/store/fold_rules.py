@@ -41,10 +41,13 @@ def fold_is_due(entries: Sequence[Entry]) -> bool:
 
 def held_at_once(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     """The beginning of a chain, with one delta at least, whose deltas' pages may be held together; files hold them compressed."""
-    sizes = [entry.pages_size for entry in entries]
-    limit = max(FOLDED_AT_ONCE_SIZE, int(FOLD_DELTA_PART * sizes[0]))
-    count = sum(total <= limit for total in accumulate(sizes[1:]))
-    return entries[: 1 + max(count, 1)]
+    return entries[: count_at_once([entry.pages_size for entry in entries])]
+
+
+def count_at_once(pages_sizes: Sequence[int]) -> int:
+    """How many of a chain's files `held_at_once` names; the first is the base."""
+    limit = max(FOLDED_AT_ONCE_SIZE, int(FOLD_DELTA_PART * pages_sizes[0]))
+    return 1 + max(sum(total <= limit for total in accumulate(pages_sizes[1:])), 1)
 
 
 def newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:

@@ -8,6 +8,7 @@ contents are sealed (`failover.archive.sealed`).
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import stat
@@ -146,4 +147,7 @@ class FolderObjects:
         try:
             yield
         except OSError as error:
-            raise ArchiveError(f"cannot {tried} in the archive {self._root}: {error.strerror}") from error
+            why = error.strerror
+            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+                why += "; the agent's service needs ReadWritePaths= for it (systemctl edit failover-agent)"
+            raise ArchiveError(f"cannot {tried} in the archive {self._root}: {why}") from error

@@ -68,7 +68,8 @@ class S3Objects:
             from obstore import exceptions
         except ImportError as error:
             raise ArchiveError(
-                "an archive in S3 needs the library obstore, which is not installed: pip install 'failover[s3]'"
+                "an archive in S3 needs the library obstore, which is not installed: pip install 'failover[s3]'; "
+                "the Debian package has archives in folders only"
             ) from error
         self._library, self._errors = obstore, exceptions
         self._place = f"s3://{bucket}/{prefix}".rstrip("/") + (f" at {endpoint}" if endpoint else "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import threading
@@ -224,6 +225,18 @@ def test_a_folder_leaves_nothing_aside_and_names_lead_nowhere_else(tmp_path: Pat
     assert sorted(path.name for path in (tmp_path / "lab").iterdir()) == ["a"]
     with pytest.raises(ArchiveError, match="names no object"):
         objects.put("lab/../../b", content)
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
+def test_a_folder_that_a_service_may_not_write_is_told_with_the_cure(
+    number: int, tmp_path: Path, content: BinaryIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: object, **keywords: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(ArchiveError, match=f"{os.strerror(number)}; the agent's service needs ReadWritePaths= for it"):
+        FolderObjects(tmp_path).put(NAME, content)
 
 
 def test_the_keys_are_those_of_the_users_file_where_the_environment_has_none(

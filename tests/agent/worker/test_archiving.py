@@ -19,6 +19,8 @@ import pytest
 from blake3 import blake3
 
 from agent import config as configuration
+from agent.archive.messages import KeepCheckpoint
+from agent.archive.process import Archivist
 from agent.errors import LaneError
 from agent.worker.archiving import Archiving, Opening
 from checkpoint.keeper.messages import memfd_holding
@@ -26,6 +28,7 @@ from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import Need
 from checkpoint.store import chain
+from checkpoint.store.chain_files import fold_to
 from checkpoint.store.store import Store, open_store
 from failover.archive import sealed
 from failover.archive.archive import Archive
@@ -186,6 +189,30 @@ def test_the_files_of_a_program_go_along_and_one_that_cannot_be_had_is_told(tmp_
             "its checkpoints reach the archive without files",
             "its checkpoints reach the archive again",
         ]
+
+
+def test_a_chain_is_folded_in_steps_where_its_deltas_are_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    together: list[int] = []
+
+    def fold(file: Any, *sources: Any) -> None:
+        together.append(len(sources))
+        fold_to(file, *sources)
+
+    monkeypatch.setattr("checkpoint.store.fold_rules.FOLDED_AT_ONCE_SIZE", 1)
+    monkeypatch.setattr("agent.archive.process.fold_to", fold)
+    made = history(5)
+    for number, one in enumerate(made):
+        (tmp_path / f"{number}").write_bytes(format.encode_bytes(one))
+    with member(tmp_path) as one, contextlib.ExitStack() as files:
+        opened = [files.enter_context((tmp_path / f"{number}").open("rb")) for number in range(len(made))]
+        archivist = Archivist(configuration.load(tmp_path / "agent.toml"))
+        assert archivist.answer(KeepCheckpoint(COMPONENT), tuple(file.fileno() for file in opened)).refusal == ""
+        assert sum(together) - len(together) == 4 and len(together) > 1, "each delta once, in several steps"
+        with tempfile.TemporaryFile() as file:
+            one.archive().fetch(one.archive().copies()[0], file)
+            assert pages_of(format.decode(file)) == pages_of(chain.fold(made))
+        assert archivist.answer(KeepCheckpoint(COMPONENT), (opened[0].fileno(),)).refusal == ""
+        assert not opened[0].closed and os.fstat(opened[0].fileno())
 
 
 def test_a_key_that_is_replaced_seals_the_next_copy(tmp_path: Path) -> None:
