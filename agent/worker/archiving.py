@@ -9,6 +9,7 @@ Loaded when it is wanted: an agent without an archive does not carry it.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import subprocess
@@ -16,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable, Collection
+from pathlib import Path
 from typing import Final
 
 from msgspec import Struct, field
@@ -30,6 +32,7 @@ from checkpoint.model import Position
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import Need, needs
 from checkpoint.store.contract import SnapshotStore
+from failover.archive.sealed import key_path
 from failover.core.events import Event, Noticed
 
 BEHIND_ROUNDS: Final = 3
@@ -63,7 +66,7 @@ class _Shelf(Struct):
     """One component's copies.
 
     Attributes:
-        position: of the newest copy; None: none was made by this worker.
+        position: of the newest copy; None: none was made by this worker with this key.
         since_s: when that was made, or the component was first seen here; monotonic.
         trouble: why the last try failed, wholly or for a file that it needs; "" if it did not.
     """
@@ -96,11 +99,13 @@ class Archiving:
         self._child: subprocess.Popen[bytes] | None = None
         self._dialogue: Dialogue | None = None
         self._busy_with = ""
+        self._key_file: tuple[int, int] | None = None
 
     async def run(self) -> None:
         """Make copies until cancelled."""
         try:
             while True:
+                await self._look_at_key()
                 for name in self._wanted():
                     self._busy_with = name
                     await self._copy(name)
@@ -110,6 +115,14 @@ class Archiving:
             self._hang_up()
             if self._child is not None:
                 threading.Thread(target=self._child.wait, daemon=True).start()  # the kernel may hold it: nobody waits for it
+
+    async def _look_at_key(self) -> None:
+        """With another key all copies are made again: what was sealed before cannot be opened with it."""
+        found = await asyncio.to_thread(_sign_of, key_path(Path(self._settings.config.team_directory)))
+        if found != self._key_file:
+            for shelf in self._shelves.values():
+                shelf.position, shelf.has = None, set()
+        self._key_file = found
 
     def complaints(self) -> list[str]:
         """For the status: what is not in the archive as it should be."""
@@ -263,3 +276,11 @@ class Archiving:
             self._dialogue = None
         if self._child is not None:
             self._child.kill()
+
+
+def _sign_of(path: Path) -> tuple[int, int] | None:
+    """What changes when a file is replaced or written; None where there is none."""
+    with contextlib.suppress(OSError):
+        about = path.stat()
+        return about.st_ino, about.st_mtime_ns
+    return None

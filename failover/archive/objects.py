@@ -147,7 +147,7 @@ class FolderObjects:
         try:
             yield
         except OSError as error:
-            why = error.strerror
+            why = error.strerror or str(error)
             if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
                 why += "; the agent's service needs ReadWritePaths= for it (systemctl edit failover-agent)"
             raise ArchiveError(f"cannot {tried} in the archive {self._root}: {why}") from error
