@@ -71,7 +71,7 @@ def recover(settings: Settings, name: str) -> int:
     robot, epoch = settings.config.robot, copies[0].epoch
     print(f"{robot} holds {component} as {label.robot} archived it, epoch {epoch}; start the agent, and see failover status")
     for path in missing:
-        print(f"{component} needs {path}, which is neither here nor in the archive: install it before it goes on here")
+        print(f"{component} needs {path}, which is neither here nor whole in the archive: install it before it goes on here")
     return 0
 
 
@@ -89,12 +89,12 @@ def _fetched(archive: Archive, copy: Copy, file: BinaryIO, before: VoteRecord, s
 
 
 def _keep_files(archive: Archive, store: SnapshotStore, checkpoint: BinaryIO, directory: Path) -> list[str]:
-    """Bring the files that the program needs and that this robot lacks; answers with those that the archive lacks, too."""
+    """Bring the files that the program needs and that this robot lacks; answers with those that are not whole in the archive."""
     missing = []
     for need in needs(format.read_outline(checkpoint.fileno())):
         if not need.digest or is_in_place(need) or store.contents.has(need.digest, need.size):
             continue
-        if archive.lacks(need.digest):
+        if not archive.holds_whole(need.digest):
             missing.append(need.path)
             continue
         with tempfile.TemporaryFile(dir=directory) as file:

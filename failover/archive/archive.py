@@ -150,10 +150,6 @@ class Archive:
             raise ArchiveError(f"the specification of {header.component} has {len(spec)} bytes: {LABEL_SIZE_MAX} is the limit")
         return name, self._kept(name, _joined(len(label).to_bytes(4, "little") + label, checkpoint), _size(checkpoint))
 
-    def lacks(self, digest: bytes) -> bool:
-        """Whether the content of this digest is not here."""
-        return self._objects.size(self._content_name(digest)) is None
-
     def holds_whole(self, digest: bytes) -> bool:
         """Whether the content of this digest is here, with both ends of its object unharmed."""
         name = self._content_name(digest)

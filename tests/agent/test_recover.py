@@ -58,7 +58,7 @@ def test_the_newest_copy_is_in_the_store_and_on_record(config: Path, place: Path
     assert recover(config, "planner") == 0
     said = capsys.readouterr().out
     assert said.startswith(f"robot1 holds {COMPONENT} as robot9 archived it, epoch 1; start the agent")
-    assert "needs /usr/bin/mapper, which is neither here nor in the archive" in said
+    assert "needs /usr/bin/mapper, which is neither here nor whole in the archive" in said
     *others, record = records(config)
     assert tuple(others) == before
     assert record == Record(COMPONENT, 1, state=State.STANDBY, spec=SPEC, begun=True)

@@ -89,7 +89,7 @@ def fetch(arguments: argparse.Namespace) -> int:
     if brought:
         print(f"{contents} holds {len(brought)} of its files that this machine lacks: {', '.join(brought[:NAMED])}")
     for path in missing:
-        print(f"it needs {path}, which is neither here nor in the archive: install it first")
+        print(f"it needs {path}, which is neither here nor whole in the archive: install it first")
     print(f"failover restore {output}{f' --contents {contents}' if brought else ''} starts it")
     return 0
 
@@ -135,13 +135,13 @@ def _bring(archive: Archive, wanted: tuple[Need, ...], contents: Path) -> tuple[
     Nothing is laid down at the paths that a snapshot names: whoever ran the program chose them.
 
     Returns:
-        The paths of those that came, and of those that the archive lacks, too.
+        The paths of those that came, and of those that are not whole in the archive.
 
     Raises:
         ArchiveError: one of them does not arrive whole, or cannot be written.
     """
     lacking = {need.digest: need for need in wanted if need.digest and not _is_here(need)}
-    missing = [need.path for digest, need in lacking.items() if archive.lacks(digest)]
+    missing = [need.path for digest, need in lacking.items() if not archive.holds_whole(digest)]
     brought = {digest: need for digest, need in lacking.items() if need.path not in missing}
     if brought:
         with _told_of(contents):

@@ -184,7 +184,7 @@ def test_the_files_of_a_program_go_along_and_one_that_cannot_be_had_is_told(tmp_
             assert len(asked) == count, "its files are there"
 
         run(one, work)
-        assert not one.archive().lacks(executable.digest)
+        assert one.archive().holds_whole(executable.digest)
         assert [event.sentence.partition(":")[0] for event in one.events] == [  # type: ignore[union-attr]
             "its checkpoints reach the archive without files",
             "its checkpoints reach the archive again",

@@ -286,7 +286,7 @@ def test_a_needed_file_that_changes_while_it_is_sealed_leaves_no_object(place: P
     monkeypatch.setattr(sealed, "seal", changed)
     with file_of(content) as file, pytest.raises(ArchiveError, match="changed meanwhile"):
         archive(place).put_content(digest, file)
-    assert archive(place).lacks(digest)
+    assert not archive(place).holds_whole(digest)
 
 
 def test_a_disk_that_is_nearly_full_takes_no_copy(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,12 +349,12 @@ def test_files_that_a_program_needs_are_kept_once_under_names_that_tell_nothing(
     content = os.urandom(3_000_000)
     digest = blake3(content).digest()
     need = Need("/opt/mapper", len(content), digest)
-    assert archive(place).lacks(digest)
+    assert not archive(place).holds_whole(digest)
     with pytest.raises(ArchiveError, match=r"/opt/mapper.* is not in the archive"), tempfile.TemporaryFile() as file:
         archive(place).fetch_content(need, file)
     with file_of(content) as file:
         archive(place).put_content(digest, file)
-    assert not archive(place).lacks(digest)
+    assert archive(place).holds_whole(digest)
     assert not [path for path in place.rglob("*") if digest.hex() in path.name]
     with tempfile.TemporaryFile() as file:
         archive(place).fetch_content(need, file)

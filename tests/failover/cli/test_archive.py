@@ -92,7 +92,7 @@ def test_a_copy_is_fetched_whole_or_not_at_all(team: Path, tmp_path: Path, capsy
     assert "altered, cut off" in capsys.readouterr().err and not other.exists()
     name = older.relative_to(team.parent / "place").as_posix()
     assert asked(team, "fetch", "mapper", "--output", str(other), "--object", name) == 0
-    assert "it needs /usr/bin/mapper, which is neither here nor in the archive" in capsys.readouterr().out
+    assert "it needs /usr/bin/mapper, which is neither here nor whole in the archive" in capsys.readouterr().out
     assert format.decode(other).contents[:1] == b"1"
 
 
@@ -131,7 +131,7 @@ def test_a_program_starts_from_the_archive_where_its_own_files_are_gone(
 def test_a_folder_of_contents_that_is_there_already_is_not_used(
     team: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = os.urandom(1000)
+    content = os.urandom(3_000_000)
     made = snapshot({1: page("x")})
     executable = type(made.process.executable)("/opt/mapper", size=len(content), digest=blake3(content).digest())
     put(team, format.encode_bytes(replace(made, process=replace(made.process, executable=executable))))
@@ -147,9 +147,12 @@ def test_a_folder_of_contents_that_is_there_already_is_not_used(
     contents.rmdir()
     (harmed,) = (team.parent / "place").rglob("contents/*.sealed")
     whole = harmed.read_bytes()
-    harmed.write_bytes(whole[:-1])
+    harmed.write_bytes(whole[:100] + bytes([whole[100] ^ 1]) + whole[101:])
     assert asked(team, "fetch", "mapper", "--output", str(output)) == main.FAILED
     assert not output.exists() and not contents.exists()
+    harmed.write_bytes(whole[:-1])
+    assert asked(team, "fetch", "mapper", "--output", str(tmp_path / "without")) == 0
+    assert "it needs /opt/mapper, which is neither here nor whole" in capsys.readouterr().out
     harmed.write_bytes(whole)
     assert asked(team, "fetch", "mapper", "--output", str(output)) == 0
     assert [path.read_bytes() for path in contents.iterdir()] == [content]
