@@ -193,6 +193,8 @@ def slow_server(pause_s: float, answers: bool = True) -> Iterator[str]:
             yield f"http://127.0.0.1:{listening.getsockname()[1]}"
         finally:
             gone.set()
+            with contextlib.suppress(OSError):
+                listening.shutdown(socket.SHUT_RDWR)  # nobody may have come
             thread.join()
 
 
