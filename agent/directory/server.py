@@ -81,8 +81,9 @@ class LdapServer:
             (ldap.OPT_X_TLS_REQUIRE_CERT, ldap.OPT_X_TLS_DEMAND),
         ):
             connection.set_option(option, value)
-        if config.ca_file:
-            connection.set_option(ldap.OPT_X_TLS_CACERTFILE, config.ca_file)
+        for option, chosen in ((ldap.OPT_X_TLS_CACERTFILE, config.ca_file), (ldap.OPT_X_TLS_CACERTDIR, "")):
+            if place := chosen or (None if config.ca_file else ldap.get_option(option)):
+                connection.set_option(option, place)  # a connection has none of its own, not even those of ldap.conf
         connection.set_option(ldap.OPT_X_TLS_NEWCTX, 0)  # last: it takes the options above
         try:
             if config.server.startswith("ldap:") and not (config.tls == "none" and is_loopback(self._host)):

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,11 +36,13 @@ class Terminal:
         return "".join(iter(self.shell.stdout.readline, "typed\n"))
 
 
+IN_A_NETWORK = ("unshare", "--net", "sh", "-c", "ip link set lo up; exec sh 2>&1")
+
+
 @contextmanager
-def terminal(folder: Path) -> Iterator[Terminal]:
+def terminal(folder: Path, command: Sequence[str] = IN_A_NETWORK) -> Iterator[Terminal]:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("FAILOVER_")}
     environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    command = ["unshare", "--net", "sh", "-c", "ip link set lo up; exec sh 2>&1"]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, cwd=folder, env=environment, stdin=pipe, stdout=pipe, text=True) as shell:
         try:

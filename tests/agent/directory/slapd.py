@@ -12,6 +12,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -22,9 +23,10 @@ AS_ORDINARY: Final = ("setpriv", f"--reuid={ORDINARY}", f"--regid={ORDINARY}", "
 
 SCHEMAS: Final = ("core", "cosine", "nis", "inetorgperson")
 PASSWORD: Final = "right for {}"
-SERVICE: Final = "cn=service,dc=lab"
+SUFFIX: Final = "dc=lab"
+SERVICE: Final = f"cn=service,{SUFFIX}"
 SECRET: Final = "of the service account"
-ADMIN, ADMIN_SECRET = "cn=admin,dc=lab", "of the administrator"
+ADMIN, ADMIN_SECRET = f"cn=admin,{SUFFIX}", "of the administrator"
 MANY: Final = 10_000
 COMMANDS: Final = ("slapd", "slapadd", "openssl")
 WHERE: Final = f"{os.environ['PATH']}:/usr/sbin"
@@ -41,8 +43,8 @@ TLSCertificateKeyFile {place}/key
 sizelimit unlimited
 database mdb
 maxsize 268435456
-suffix dc=lab
-rootdn {admin}
+suffix {suffix}
+rootdn cn=admin,{suffix}
 rootpw "{admin_secret}"
 directory {place}/entries
 index objectClass,uid,member,uniqueMember,memberUid eq
@@ -107,21 +109,32 @@ def group(name: str, *members: str) -> str:
     return "\n".join(lines)
 
 
+@dataclass(frozen=True)
+class Site:
+    """What a server holds, in LDIF, below which suffix, and where it is reached; ports of 0: any free ones."""
+
+    ldif: str
+    suffix: str = SUFFIX
+    named: str = "IP:127.0.0.1"
+    port: int = 0
+    port_tls: int = 0
+
+
 class Slapd:
     """One server. ``port``: plain and StartTLS; ``port_tls``: ldaps; ``certificate``: what its clients must trust."""
 
-    def __init__(self, place: Path, many: int, within: Sequence[str] = ()) -> None:
+    def __init__(self, place: Path, site: Site, within: Sequence[str] = ()) -> None:
         self.place = place
         self._within = tuple(within)
-        self.port, self.port_tls = _free_port(), _free_port()
+        self.port, self.port_tls = site.port or _free_port(), site.port_tls or _free_port()
         self.certificate = place / "certificate"
         self.process: subprocess.Popen[bytes] | None = None
         (place / "entries").mkdir()
-        make_certificate(place)
+        make_certificate(place, site.named)
         schemas = "\n".join(f"include /etc/ldap/schema/{name}.schema" for name in SCHEMAS)
-        text = CONFIGURATION.format(place=place, schemas=schemas, admin=ADMIN, admin_secret=ADMIN_SECRET)
+        text = CONFIGURATION.format(place=place, schemas=schemas, suffix=site.suffix, admin_secret=ADMIN_SECRET)
         (place / "slapd.conf").write_text(text)
-        (place / "people.ldif").write_text(people(many))
+        (place / "people.ldif").write_text(site.ldif)
         for path in (place, *place.iterdir()):
             if os.geteuid() == 0:
                 os.chown(path, ORDINARY, ORDINARY)
@@ -158,16 +171,21 @@ class Slapd:
             return subprocess.Popen([*become, command, *words], stdout=said, stderr=said)
 
 
+def filled(many: int, within: Sequence[str] = ()) -> contextlib.AbstractContextManager[Slapd]:
+    """`serving` the organisation of these tests, with so many groups of one user."""
+    return serving(Site(people(many)), within)
+
+
 @contextlib.contextmanager
-def filled(many: int, within: Sequence[str] = ()) -> Iterator[Slapd]:
-    """A server that serves, with so many groups of one user.
+def serving(site: Site, within: Sequence[str] = ()) -> Iterator[Slapd]:
+    """A server that serves.
 
     Args:
         within: what to put before its command line, to have it in another network.
     """
     place = Path(tempfile.mkdtemp(prefix="slapd-"))
     place.chmod(0o755)
-    server = Slapd(place, many, within)
+    server = Slapd(place, site, within)
     try:
         server.start()
         yield server
@@ -176,10 +194,10 @@ def filled(many: int, within: Sequence[str] = ()) -> Iterator[Slapd]:
         shutil.rmtree(place)
 
 
-def make_certificate(place: Path) -> None:
+def make_certificate(place: Path, name: str = "IP:127.0.0.1") -> None:
     """A key, and a certificate for this machine that vouches for itself."""
     words = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=127.0.0.1"
-    named = ["-addext", "subjectAltName=IP:127.0.0.1", "-keyout", str(place / "key"), "-out", str(place / "certificate")]
+    named = ["-addext", f"subjectAltName={name}", "-keyout", str(place / "key"), "-out", str(place / "certificate")]
     subprocess.run([*words.split(), *named], check=True, capture_output=True)
 
 
