@@ -221,9 +221,14 @@ class LocalWay:
         return self._end
 
     def _lose(self) -> None:
-        if self._end is not None:
-            self._end.close()
-            self._end = None
+        """Let the connection go; what the driver said before its end is read first, or it would do it again."""
+        if (end := self._end) is None:
+            return
+        self._end = None
+        with contextlib.closing(end), contextlib.suppress(OSError, DriverError):
+            end.setblocking(False)
+            while content := end.recv(CHUNK):
+                self._came += self._framed.take(content)
 
     def send(self, content: bytes) -> bool:
         """Send at once; False: the driver does not listen."""

@@ -144,6 +144,8 @@ class Sending:
         if over := self._over(now_ns):
             return over
         if not self._outbox.is_connected:
+            if (content := self.route.way.await_message(0)) is not None:  # said before the connection was lost
+                return self._heard(content)
             if not self._await_open(until_ns, wake):
                 return []
             now_ns = self.now_ns()
@@ -159,6 +161,10 @@ class Sending:
             if self.route.way.is_lost:  # the driver has ended, or the network is cut: it is asked anew once it is there again
                 self._disconnected()
             return []
+        return self._heard(content)
+
+    def _heard(self, content: bytes) -> list[Envelope]:
+        """What the receiver has said: the final answer, or that it is busy; [] otherwise."""
         self._heard_ns = self.now_ns()
         answer = decoded(content)
         if answer is None:

@@ -49,6 +49,9 @@ TURN_MAX: Final = 256
 UNSENT_MAX: Final = 4 << 20
 """Bytes of answers that wait for one who does not read; then the connection is closed."""
 
+LINGER_MS: Final = 1_000
+"""How long the last answers to other robots may take to leave: who misses one sends the message again."""
+
 BY_HAND_NUMBERS: Final = 1_000_000_000
 """Of messages of other robots that name no sender."""
 
@@ -206,7 +209,7 @@ class Serving:
 
         self._sockets = sockets
         context = sockets.context()
-        stack.callback(sockets.close, context)
+        stack.callback(sockets.close, context, LINGER_MS)
         self._gate = sockets.Gate(context, {name: robot.public_key for name, robot in team.robots.items()})
         self._team, address = sockets.listen_team(context, self.here)
         self._addresses.append(address)

@@ -53,9 +53,9 @@ def context() -> Context:
     return zmq.Context()
 
 
-def close(context: Context) -> None:
-    """Close all sockets of a context; nothing lingers."""
-    context.destroy(linger=0)
+def close(context: Context, linger_ms: int = 0) -> None:
+    """Close all sockets of a context, after so many ms in which what was sent may leave."""
+    context.destroy(linger=linger_ms)
 
 
 def listen_team(context: Context, here: Here, port: int = 0) -> tuple[Socket, str]:
