@@ -3,7 +3,8 @@
     came → mailbox → (paced) → method → answer
 
 A verb that begins with ``_`` is the driver's own: ``_describe`` tells its verbs, ``_graph`` who has called, ``_path`` where a
-message spent its time here, ``_subscribe`` and ``_unsubscribe`` begin and end a stream.
+message spent its time, ``_ways`` where those did that began with the same hop, ``_subscribe`` and ``_unsubscribe`` begin and end
+a stream.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -24,6 +26,7 @@ from failover.core.messaging.traffic import Traffic
 from failover.core.naming import names
 from failover.core.naming.names import Kind
 from failover.drivers.declare import Declaration, Verb
+from failover.drivers.in_hand import carrying_out
 from failover.errors import EnvelopeError, NameFormatError
 
 if TYPE_CHECKING:
@@ -31,6 +34,9 @@ if TYPE_CHECKING:
 
 PATHS_MAX: Final = 4_096
 """Messages whose way is remembered, for ``failover path``."""
+
+WAYS_MAX: Final = 64
+"""Of these, those that one answer tells: what drivers sent while they carried out one message."""
 
 SUBSCRIBERS_MAX: Final = 256
 LEASE_NS: Final = 10 * SECOND
@@ -85,6 +91,7 @@ class Actor:
             "_describe": self._describe,
             "_graph": self._graph,
             "_path": self._path,
+            "_ways": self._ways,
             "_subscribe": self._subscribe,
             "_unsubscribe": self._unsubscribe,
         }
@@ -247,7 +254,8 @@ class Actor:
     def called(self, verb: Verb, arguments: Mapping[str, Any], message: Envelope) -> Envelope:
         """The answer of one method."""
         try:
-            return answer(message, _plain(getattr(self._instance, verb.name)(**arguments)))
+            with carrying_out(message.hops):
+                return answer(message, _plain(getattr(self._instance, verb.name)(**arguments)))
         except EnvelopeError as error:
             return refusal(
                 message, "bad_result", f"{verb.name} was carried out, and no message can say what it returned: {error}"
@@ -269,7 +277,13 @@ class Actor:
         """The hops of a message that was carried out; None: this driver does not remember it."""
         wanted = message.body.get("id") if isinstance(message.body, dict) else None
         hops = self._paths.get(wanted) if isinstance(wanted, str) else None
-        return None if hops is None else [[hop.who, hop.came, hop.left] for hop in hops]
+        return None if hops is None else _told(hops)
+
+    def _ways(self, message: Envelope, _: int) -> Any:
+        """The hops of the newest messages that were carried out here and began with this hop: its name, and when it came."""
+        began = message.body.get("began") if isinstance(message.body, dict) else None
+        ways = (hops for hops in reversed(self._paths.values()) if [hops[0].who, hops[0].came] == began)
+        return [_told(hops) for hops in islice(ways, WAYS_MAX)]
 
     def _subscribe(self, message: Envelope, now_ns: int) -> Any:
         """Send a stream to who asks, for `LEASE_NS`; what comes of it: the rate, or None without such a stream."""
@@ -312,6 +326,10 @@ class Actor:
                 envelope = msgspec.structs.replace(said, to=one.to, verb=name, sender=self._declaration.path)
                 if not publish(one.whose, envelope):
                     self._subscribers.pop((one.whose, name), None)
+
+
+def _told(hops: tuple[Hop, ...]) -> list[Any]:
+    return [[hop.who, hop.came, hop.left] for hop in hops]
 
 
 def _as_merged(replaced: Envelope, said: Envelope) -> Envelope:

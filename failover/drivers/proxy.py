@@ -30,6 +30,7 @@ from failover.core.messaging.envelope import TEXT_MAX, Encoding, Envelope, Hop
 from failover.core.messaging.mailbox import WINDOW
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here, here, is_served
+from failover.drivers.in_hand import hops_so_far
 from failover.drivers.local import SCHEME
 from failover.drivers.lookup import lookup
 from failover.drivers.route import Route
@@ -230,7 +231,7 @@ class Proxy:
 
     def _envelope(self, verb: str, body: Any, deadline_s: float | None) -> Envelope:
         deadline_ms = None if deadline_s is None else deadline_s * 1_000
-        hops = (Hop(self.sender, self.now_ns()),)
+        hops = hops_so_far() or (Hop(self.sender, self.now_ns()),)
         found = Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
         envelopes.check_size(found, NUMBERS_SIZE, self._sending.encoding)
         return found

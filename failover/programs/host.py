@@ -222,7 +222,7 @@ class HostActor(Actor):
         return self._forwarded(msgspec.structs.replace(message, verb=verb.name, body=dict(arguments)))
 
     def _forwarded(self, message: Envelope) -> Envelope:
-        message = msgspec.structs.replace(message, hops=(), rest={})
+        message = msgspec.structs.replace(message, rest={})
         if self._running is None:
             text = f"no version of {self._place.name} runs now: {self._why_lost}; {message.verb} may have been carried out"
             return refusal(message, "no_version", text)

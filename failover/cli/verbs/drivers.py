@@ -15,7 +15,7 @@ import msgspec
 from failover.cli.output import graph as graph_output
 from failover.cli.output import names_tree, render
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.clocks import Bounds, ClockPair, Part, parts
+from failover.core.messaging.clocks import Bounds, ClockPair, Part, further_ways, parts
 from failover.core.messaging.envelope import MESSAGE_SIZE_MAX, Envelope, Hop
 from failover.core.messaging.traffic import Edge
 from failover.core.naming.tree import Place, Reach, Tree, robot_of
@@ -173,11 +173,17 @@ def path(arguments: argparse.Namespace) -> int:
     tree = whole_tree(place)
     hops = _remembered(place, tree, arguments.id)
     clocks = _Clocks(place, tree)
-    found = [_part(one) for one in parts(hops, clocks.offset)]
+
+    def told(way: tuple[Hop, ...]) -> list[dict[str, Any]]:
+        return [_part(one) for one in parts(way, clocks.offset)]
+
+    found, further = told(hops), [told(way) for way in further_ways(hops, _began_with(place, tree, hops[0]))]
     if arguments.json:
-        render.as_json({"id": arguments.id, "parts": found})
-    else:
-        render.painted(names_tree.PATH_COLUMNS, names_tree.path_rows(found), f"message {arguments.id}")
+        render.as_json({"id": arguments.id, "parts": found, "further": further})
+        return 0
+    render.painted(names_tree.PATH_COLUMNS, names_tree.path_rows(found), f"message {arguments.id}")
+    for way in further:
+        render.painted(names_tree.PATH_COLUMNS, names_tree.path_rows(way), f"and further to {way[-1]['who']}")
     return 0
 
 
@@ -202,6 +208,21 @@ def _remembered(here: Here, tree: Tree, wanted: str) -> tuple[Hop, ...]:
         f"none of the {asked} drivers that answered remembers a message {wanted!r}: each keeps its last 4096; "
         "failover call --json prints the id of a message"
     )
+
+
+def _began_with(here: Here, tree: Tree, first: Hop) -> list[tuple[Hop, ...]]:
+    """The ways that drivers remember of messages that began with this hop."""
+    found: list[tuple[Hop, ...]] = []
+    for place in _live(tree):
+        try:
+            with Proxy(here, place) as driver:
+                ways = driver.told("_ways", list[tuple[Hop, ...]], {"began": [first.who, first.came]}, timeout=ASK_S)
+            for way in ways:
+                envelopes.check_hops(way)
+        except (NoAnswerError, CallRefusedError, DriverError, EnvelopeError):  # also a driver of an older failover
+            continue
+        found += ways
+    return found
 
 
 def _live(tree: Tree) -> list[Place]:

@@ -100,6 +100,24 @@ def parts(hops: Sequence[Hop], offsets: Offsets) -> list[Part]:
     return found
 
 
+def further_ways(hops: Sequence[Hop], ways: Sequence[tuple[Hop, ...]]) -> list[tuple[Hop, ...]]:
+    """Of ways that began with the same hop: those that went on from this one, each to its end, in the order in which they did.
+
+    A driver that calls another one while it carries out a message has that one's stamp of arrival in both ways.
+    """
+    known = {_stations(way): way for way in ways}
+    longest = [
+        stations for stations in known if not any(stations == other[: len(stations)] for other in known if other != stations)
+    ]
+    own = _stations(hops)
+    found = [known[one] for one in longest if len(one) > len(own) and one[: len(own)] == own]
+    return sorted(found, key=lambda way: way[len(own) - 1].left_ns or 0)
+
+
+def _stations(way: Sequence[Hop]) -> tuple[tuple[str, int], ...]:
+    return tuple((hop.who, hop.came_ns) for hop in way)
+
+
 def _measured(took_ns: int) -> Bounds:
     error_ns = _widened(took_ns)
     return Bounds(max(took_ns - error_ns, 0), max(took_ns + error_ns, 0))
