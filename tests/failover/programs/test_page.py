@@ -16,7 +16,9 @@ from pathlib import Path
 import pytest
 
 from failover.cli import main
-from failover.drivers.here import Here, lives
+from failover.drivers.here import Here
+from failover.drivers.lookup import lookup
+from failover.errors import NameUnknownError
 from tests.failover.drivers.serving import until
 from tests.failover.programs.senders import RULES
 
@@ -31,12 +33,20 @@ def typed(*words: str) -> str:
     return said.getvalue()
 
 
+def is_registered(here: Here) -> bool:
+    """Whether commands find it; its lock is held a moment before."""
+    try:
+        return bool(lookup(here, PATH))
+    except NameUnknownError:
+        return False
+
+
 @contextmanager
 def running(here: Here, *words: str) -> Iterator[subprocess.Popen[bytes]]:
     """``failover program run``, until the body ends."""
     with subprocess.Popen([sys.executable, "-m", "failover", "program", "run", *words], cwd=ROOT) as process:
         try:
-            until(lambda: lives(here, PATH))
+            until(lambda: is_registered(here))
             yield process
         finally:
             process.send_signal(signal.SIGINT)
