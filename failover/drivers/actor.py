@@ -85,6 +85,8 @@ class Actor:
         self._pace = Pace(declaration.rate_hz)
         self._paths: OrderedDict[str, tuple[Hop, ...]] = OrderedDict()
         self._meant: dict[str, bool] = {}
+        self._earlier: dict[str, object] = {}
+        """Version of callers → the object whose methods they call."""
         self._subscribers: dict[tuple[Whose, str], Subscriber] = {}
         self._samples_ns: dict[str, int] = {}
         self._own: Mapping[str, Callable[[Envelope, int], Any]] = {
@@ -243,7 +245,7 @@ class Actor:
             return answer(message, own(message, message.hops[-1].came_ns))
         verb = self._declaration.verbs.get(message.verb)
         if verb is None:
-            known = ", ".join(self._declaration.verbs)
+            known = ", ".join(one.name for one in self._declaration.shown)
             return refusal(message, "unknown_verb", f"{self._declaration.path} has no verb {message.verb[:64]!r}; it has {known}")
         try:
             arguments = _arguments(verb, message.body)
@@ -255,7 +257,7 @@ class Actor:
         """The answer of one method."""
         try:
             with carrying_out(message.hops):
-                return answer(message, _plain(getattr(self._instance, verb.name)(**arguments)))
+                return answer(message, _plain(getattr(self._speaker(verb.earlier), verb.method)(**arguments)))
         except EnvelopeError as error:
             return refusal(
                 message, "bad_result", f"{verb.name} was carried out, and no message can say what it returned: {error}"
@@ -263,6 +265,14 @@ class Actor:
         except Exception as error:
             log.warning("%s of %s failed", verb.name, self._declaration.path, exc_info=error)
             return refusal(message, "failed", f"{verb.name} failed: {type(error).__name__}: {error}")
+
+    def _speaker(self, version: str) -> object:
+        """Who has the methods that callers of this version call; "": the driver."""
+        if not version:
+            return self._instance
+        if version not in self._earlier:
+            self._earlier[version] = self._declaration.earlier[version](self._instance)
+        return self._earlier[version]
 
     # --- The driver's own verbs -------------------------------------------------------------------------------------------
 

@@ -27,10 +27,11 @@ from typing import Any, Final, Literal, TypeVar, overload
 import msgspec
 from msgspec import Struct
 
+from failover.core.messaging.envelope import SPEAKS
 from failover.core.messaging.pacing import Coalesce
 from failover.core.naming import names, worlds
 from failover.errors import DriverError, NameFormatError
-from failover.kept_state.component import DECLARED, RUNNER
+from failover.kept_state.component import DECLARED, RUNNER, kept_of
 
 C = TypeVar("C")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -41,6 +42,7 @@ DRIVER: Final = "__failover_driver__"
 RATE_HZ_MAX: Final = 10_000.0
 """Above it the loop of a driver is the limit."""
 
+VERSION_SIZE_MAX: Final = 16
 VERB_SIZE_MAX: Final = 64
 VERBS_MAX: Final = 64
 
@@ -61,15 +63,31 @@ class Marked(Struct, frozen=True):
 
 
 class Verb(Struct, frozen=True):
-    """One verb of a driver. ``arguments``: a Struct of the method's arguments; what does not fit it is refused."""
+    """One verb of a driver, as messages name it: ``set``, or ``set@1`` of a caller that speaks version 1.
+
+    Attributes:
+        arguments: a Struct of the method's arguments; what does not fit it is refused.
+        earlier: the version whose class has the method; "": the driver has it.
+    """
 
     name: str
     marked: Marked
     arguments: type[Struct]
+    earlier: str = ""
+
+    @property
+    def method(self) -> str:
+        """The name of the method."""
+        return self.name.partition(SPEAKS)[0]
 
 
 class Declaration(Struct, frozen=True):
-    """What `driver` was told about a class. ``version``, ``migrations``: of the kept state, as of `failover.component`."""
+    """What `driver` was told about a class.
+
+    Attributes:
+        version, migrations: of the kept state, as of `failover.component`.
+        earlier: version of callers → the class whose verbs they call.
+    """
 
     path: str
     aliases: tuple[str, ...]
@@ -78,10 +96,16 @@ class Declaration(Struct, frozen=True):
     labels: Mapping[str, str]
     version: int = 1
     migrations: Mapping[int, Callable[[Any], Any]] | None = None
+    earlier: Mapping[str, type] = {}
+
+    @property
+    def shown(self) -> list[Verb]:
+        """The verbs without those that say in other words that a caller speaks the newest version."""
+        return [one for one in self.verbs.values() if one.earlier or SPEAKS not in one.name]
 
     def schemas(self) -> dict[str, Any]:
         """Verb → role, and the JSON schema of its arguments, for the record."""
-        return {one.name: {"role": one.marked.role} | _schema(one.arguments) for one in self.verbs.values()}
+        return {one.name: {"role": one.marked.role} | _schema(one) for one in self.shown}
 
 
 @overload
@@ -131,6 +155,8 @@ def driver(
     labels: Mapping[str, str] | None = None,
     version: int = 1,
     migrations: Mapping[int, Callable[[Any], Any]] | None = None,
+    speaks: str = "",
+    earlier: Mapping[str, type] | None = None,
 ) -> Callable[[type[C]], type[C]]:
     """Declare a class that speaks for one device; `failover.run` runs it. Attributes that are `failover.kept` survive.
 
@@ -141,6 +167,9 @@ def driver(
         rate_hz: the most commands a second that the device takes; None: as many as come.
         labels: whatever others may want to know.
         version, migrations: of the kept attributes, as of `failover.component`.
+        speaks: the version of the verbs of this class, for callers that name the one that they speak.
+        earlier: version → a class with the verbs of that version, for callers that still speak it. It is made with the driver as
+            its only argument, when the first of them calls, and calls the driver's methods.
 
     Raises:
         DriverError: the class or an argument cannot work.
@@ -162,9 +191,12 @@ def driver(
                 f"{chosen.__name__} is a component (failover.component) already: declare a class for each of the two"
             )
         verbs = _verbs(chosen)
-        if not verbs:
-            raise DriverError(f"{chosen.__name__} has no verb: write @failover.command or @failover.query above a method")
-        setattr(chosen, DRIVER, Declaration(normal, aliases, rate_hz, verbs, dict(labels or {}), version, migrations))
+        if speaks or earlier:
+            verbs |= _spoken(_verbs(chosen), _checked_versions(chosen, speaks, earlier or {}), is_earlier=False)
+        for spoken, cls in (earlier or {}).items():
+            verbs |= _spoken(_verbs(cls), spoken, is_earlier=True)
+        told = dict(labels or {}), version, migrations, dict(earlier or {})
+        setattr(chosen, DRIVER, Declaration(normal, aliases, rate_hz, verbs, *told))
         setattr(chosen, RUNNER, "failover.drivers.server:run")
         return chosen
 
@@ -194,7 +226,38 @@ def _verbs(cls: type) -> dict[str, Verb]:
                 found[name] = Verb(name, marked, _arguments(cls, name, function, marked))
     if len(found) > VERBS_MAX:
         raise DriverError(f"{cls.__name__} has {len(found)} verbs, {VERBS_MAX} are the most")
+    if not found:
+        raise DriverError(f"{cls.__name__} has no verb: write @failover.command or @failover.query above a method")
     return found
+
+
+def _spoken(verbs: Mapping[str, Verb], version: str, *, is_earlier: bool) -> dict[str, Verb]:
+    """The verbs as callers name them that speak this version."""
+    named = ((f"{name}{SPEAKS}{version}", one) for name, one in verbs.items())
+    return {name: Verb(name, one.marked, one.arguments, version if is_earlier else "") for name, one in named}
+
+
+def _checked_versions(cls: type, speaks: str, earlier: Mapping[str, type]) -> str:
+    """The version that a class speaks.
+
+    Raises:
+        DriverError: it says none, or the versions cannot be told apart in messages.
+    """
+    if not speaks:
+        raise DriverError(f'{cls.__name__} has earlier verbs and says no version of its own: write speaks="2", for example')
+    if speaks in earlier:
+        raise DriverError(f"{cls.__name__} speaks {speaks!r}, and earlier={{{speaks!r}: …}} names that, too")
+    for one in (speaks, *earlier):
+        if not one.replace(".", "").isalnum() or not one.isascii() or len(one) > VERSION_SIZE_MAX:
+            raise DriverError(
+                f"{cls.__name__}: {one!r} is no version; write letters, digits and points, {VERSION_SIZE_MAX} at most"
+            )
+    for old in earlier.values():
+        if kept_of(old):
+            raise DriverError(
+                f"{old.__name__} keeps attributes: only {cls.__name__} may; the object of an earlier version can be lost"
+            )
+    return speaks
 
 
 def _arguments(cls: type, name: str, function: Callable[..., Any], marked: Marked) -> type[Struct]:
@@ -225,8 +288,9 @@ def _arguments(cls: type, name: str, function: Callable[..., Any], marked: Marke
     return made
 
 
-def _schema(arguments: type[Struct]) -> dict[str, Any]:
+def _schema(verb: Verb) -> dict[str, Any]:
     """Name → JSON schema of each argument; {} where there is none for a type."""
+    arguments = verb.arguments
     try:
         _, components = msgspec.json.schema_components([arguments])
     except TypeError:

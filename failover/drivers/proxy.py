@@ -26,7 +26,7 @@ from msgspec import UNSET, Struct
 
 from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import TEXT_MAX, Encoding, Envelope, Hop
+from failover.core.messaging.envelope import SPEAKS, TEXT_MAX, Encoding, Envelope, Hop
 from failover.core.messaging.mailbox import WINDOW
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here, here, is_served
@@ -61,7 +61,9 @@ class _Described(Struct, frozen=True):
     verbs: dict[str, _Role] = {}
 
 
-def proxy(name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json", durable: bool = False) -> Proxy:
+def proxy(
+    name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encoding = "json", durable: bool = False, version: str = ""
+) -> Proxy:
     """The driver of that name: a path, an alias, or an address.
 
     Args:
@@ -72,13 +74,14 @@ def proxy(name: str, *, queue: int = WINDOW, sender: str = "", encoding: Encodin
         durable: what has no answer when the program ends is kept in a file, and sent when a program with this ``sender`` and
             ``durable`` runs again on this robot, before what that one posts. The file is in ``$FAILOVER_STATE``, else in the
             working directory. Each call and post then waits for the disk.
+        version: of the driver's verbs that this program speaks. "": the newest, whichever that is.
 
     Raises:
         NameFormatError, NameUnknownError, NameAmbiguousError: it names nothing, or several things.
         DriverError: it is on another robot, and no key of the team can be read here; or an argument cannot work.
     """
     place = here()
-    return Proxy(place, lookup(place, name), queue=queue, sender=sender, encoding=encoding, durable=durable)
+    return Proxy(place, lookup(place, name), queue=queue, sender=sender, encoding=encoding, durable=durable, version=version)
 
 
 class Proxy:
@@ -93,6 +96,7 @@ class Proxy:
         sender: str = "",
         encoding: Encoding = "json",
         durable: bool = False,
+        version: str = "",
     ) -> None:
         """
         Raises:
@@ -117,6 +121,7 @@ class Proxy:
         self._posting: Posting | None = Posting(self._sending) if self._sending.left_over else None
         self.left_over: tuple[concurrent.futures.Future[Any], ...] = self._posting.left_over if self._posting is not None else ()
         """Of what an earlier process of a durable sender has posted and that had no answer, in order."""
+        self._spoken = f"{SPEAKS}{version}" if version else ""
         self._lock = threading.RLock()
         self._is_closed = False
 
@@ -231,6 +236,8 @@ class Proxy:
 
     def _envelope(self, verb: str, body: Any, deadline_s: float | None) -> Envelope:
         deadline_ms = None if deadline_s is None else deadline_s * 1_000
+        if self._spoken and not verb.startswith("_"):
+            verb += self._spoken
         hops = hops_so_far() or (Hop(self.sender, self.now_ns()),)
         found = Envelope(to=self.path, verb=verb, body=body, by=self._by, reliable=True, deadline_ms=deadline_ms, hops=hops)
         envelopes.check_size(found, NUMBERS_SIZE, self._sending.encoding)
@@ -301,11 +308,12 @@ class Proxy:
             CallRefusedError: the driver has no such stream, or it failed at it.
             DriverError: it does not say which streams it has.
         """
-        if self.told("_describe", _Described).verbs.get(name, _Role()).role != "stream":
-            raise CallRefusedError(f"{self.path} has no stream {name!r}", "unknown_verb")
+        verbs, spoken = self.told("_describe", _Described).verbs, f"{name}{self._spoken}"
+        if verbs.get(spoken, verbs.get(name, _Role())).role != "stream":
+            raise CallRefusedError(f"{self.path} has no stream {spoken!r}", "unknown_verb")
         number = f"{self.sender}-{next(_NUMBERS)}"
-        asked = Envelope(to=self.path, verb="_subscribe", body={"stream": name}, sender=number, by=self._by, id=number)
-        with Streaming(Route(self.here, self.place), asked, name, self._sending.encoding) as streaming:
+        asked = Envelope(to=self.path, verb="_subscribe", body={"stream": spoken}, sender=number, by=self._by, id=number)
+        with Streaming(Route(self.here, self.place), asked, spoken, self._sending.encoding) as streaming:
             yield from streaming.values()
 
 

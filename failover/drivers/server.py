@@ -233,7 +233,7 @@ class Serving:
         )
         if len(pack(record)) <= BODY_SIZE_MAX:
             return record
-        verbs: dict[str, Any] = {name: {"role": verb.marked.role} for name, verb in declaration.verbs.items()}
+        verbs: dict[str, Any] = {verb.name: {"role": verb.marked.role} for verb in declaration.shown}
         return msgspec.structs.replace(record, verbs=verbs)
 
     def addresses_told(self) -> list[str]:

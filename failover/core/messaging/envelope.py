@@ -32,6 +32,9 @@ STAMP_MAX: Final = (1 << 63) - 1
 TEXT_MAX: Final = 512
 """Characters of ``to``, ``verb``, ``id``, ``from``, ``by``, ``re`` and of a name in ``hops``: tables keep thousands of them."""
 
+SPEAKS: Final = "@"
+"""Between a verb and the version of the receiver's verbs that the caller speaks: in no verb of a driver."""
+
 FEW: Final = 64
 """Numbers of a body that is small whatever they are."""
 
