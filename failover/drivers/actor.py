@@ -30,6 +30,7 @@ from failover.drivers.in_hand import carrying_out
 from failover.errors import EnvelopeError, NameFormatError
 
 if TYPE_CHECKING:
+    from failover.drivers.carried_out import CarriedOut
     from failover.drivers.keeping import Keeping
 
 PATHS_MAX: Final = 4_096
@@ -71,17 +72,30 @@ class Subscriber(Struct):
 class Actor:
     """One driver: its mailbox, its pace, its streams. Every instant is an argument."""
 
-    def __init__(self, instance: object, declaration: Declaration, who: str, keeping: Keeping | None = None) -> None:
+    def __init__(
+        self,
+        instance: object,
+        declaration: Declaration,
+        who: str,
+        keeping: Keeping | None = None,
+        carried_out: CarriedOut | None = None,
+    ) -> None:
         """
         Args:
             who: of this process in hops: ``robot1/NAME``.
             keeping: of a driver that keeps attributes.
+            carried_out: of one that keeps none, and has a process of its own.
         """
         self._instance = instance
         self._declaration = declaration
         self._who = who
         self._keeping = keeping
-        self._mailbox = keeping.mailbox if keeping is not None else Mailbox()
+        self._file = carried_out
+        self._unnoted: list[Envelope] = []
+        """Answers that `count` has still to note."""
+        self._mailbox = (
+            keeping.mailbox if keeping is not None else Mailbox(carried_out.streams if carried_out is not None else None)
+        )
         self._pace = Pace(declaration.rate_hz)
         self._paths: OrderedDict[str, tuple[Hop, ...]] = OrderedDict()
         self._meant: dict[str, bool] = {}
@@ -195,7 +209,9 @@ class Actor:
         if self._keeping is None:
             if is_turn:
                 self._handle(now_ns, clock)
-            return self._mailbox.committed()  # also of what expired while nothing could be handled
+            answers = self._mailbox.committed()  # also of what expired while nothing could be handled
+            self._unnoted += answers
+            return answers
         if is_turn and not self._mailbox.is_ahead:
             with self._keeping.message():
                 self._handle(now_ns, clock)
@@ -212,6 +228,8 @@ class Actor:
             if self._declaration.verbs[message.verb].marked.coalesce == "latest":
                 while (following := self._mailbox.take_same(message.verb, now_ns)) is not None:
                     run.append(following)
+        if self._file is not None and self._is_paced(message):
+            self._file.began(run)
         said = self.carried_out(run)
         left_ns = clock()
         for replaced in run[:-1]:
@@ -229,7 +247,14 @@ class Actor:
         self._mailbox.done(message, msgspec.structs.replace(said, hops=hops))
 
     def count(self) -> None:
-        """Count what came and was handled since the last time. Called once the answers have left: no sender waits for it."""
+        """Count and note what came and was handled lately. Called once the answers have left: no sender waits for it.
+
+        A driver that is killed before counts a command of which the answer has left as one in hand.
+        """
+        if self._unnoted:
+            answers, self._unnoted = self._unnoted, []
+            if self._file is not None:
+                self._file.over(answers, self._mailbox.kept)
         uncounted, self._uncounted = self._uncounted, []
         for message, at_ns, size, said in uncounted:
             if said is None:

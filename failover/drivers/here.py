@@ -8,6 +8,7 @@ Drivers of one user on one robot meet in a directory that only this user may ent
 ``Lab.robot1.PWM.calls`` a stream of messages, each after its size in four bytes
 ``Lab.robot1.PWM.hand``  a stream of JSON objects, as ``nc -U`` writes them
 ``Lab.robot1.PWM.names`` datagrams of its name service
+``Lab.robot1.PWM.done``  what it has carried out, if it keeps no state
 ======================== ============================================================================
 
 Other robots reach a driver only by CURVE keys of the team (`$FAILOVER_TEAM`, else ``/etc/failover/team``): without a key that

@@ -173,7 +173,7 @@ class PostsFile:
     def _records(self, content: bytes) -> Iterator[bytes]:
         at = safe = 0
         while at < len(content):
-            found = _record_at(content, at)
+            found = record_at(content, at)
             if found is None:
                 if at < max(safe, *_safe_behind(content, at), 0):
                     raise DriverError(f"{self.path} is damaged at byte {at}; {_CURE}")
@@ -234,7 +234,7 @@ class PostsFile:
             os.ftruncate(self._descriptor, self._size)
 
     def _append(self, record: bytes) -> None:
-        whole = _framed(record, self._safe)
+        whole = framed(record, self._safe)
         if os.pwrite(self._descriptor, whole, self._size) < len(whole):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -242,7 +242,7 @@ class PostsFile:
         """With what waits, and nothing else."""
         records = [_written(Begun(*self._whose, self.kept.boot, self._seq)), *self._waiting.values()]
         size = sum(_HEAD + len(one) for one in records)
-        content = b"".join(_framed(one, size) for one in records)
+        content = b"".join(framed(one, size) for one in records)
         new = self.path.with_suffix(".new")
         descriptor = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
         try:
@@ -314,12 +314,13 @@ def _until_ns(one: Posted, now_ns: int) -> int | None:
     return now_ns + round(left_s * NS)
 
 
-def _framed(record: bytes, safe: int) -> bytes:
+def framed(record: bytes, safe: int) -> bytes:
+    """A record as it stands in the file."""
     numbers = _NUMBERS.pack(len(record), safe)
     return numbers + xxhash.xxh3_64_digest(numbers + record) + record
 
 
-def _record_at(content: bytes, at: int) -> tuple[bytes, int] | None:
+def record_at(content: bytes, at: int) -> tuple[bytes, int] | None:
     """The record there, and how many bytes of the file are safe, as it says; None: there is no whole one."""
     if at < 0 or at + _HEAD > len(content):
         return None
@@ -332,5 +333,5 @@ def _record_at(content: bytes, at: int) -> tuple[bytes, int] | None:
 def _safe_behind(content: bytes, at: int) -> Iterator[int]:
     """How much was safe by what each record says that is whole behind a place where none is."""
     while (at := content.find(_BEGINS, at + 1)) >= 0:
-        if (found := _record_at(content, at - 1 - _HEAD)) is not None:
+        if (found := record_at(content, at - 1 - _HEAD)) is not None:
             yield found[1]

@@ -18,7 +18,7 @@ from msgspec import UNSET
 
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.envelope import Encoding, Envelope
-from failover.core.messaging.mailbox import MOVED, MS, RESEND_FIRST_NS, RESEND_MOST_NS, Outbox, Outgoing
+from failover.core.messaging.mailbox import MOVED, MS, NO_ANSWER, RESEND_FIRST_NS, RESEND_MOST_NS, Outbox, Outgoing
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here
 from failover.drivers.name_service import new_boot
@@ -215,7 +215,7 @@ class Sending:
                 for one in (*late, *lost):
                     self._file.over(one.seq)
         why = f"{self.path} has not answered, also after the deadline; it may have carried it out"
-        return late + [envelopes.refusal(one, "no_answer", why) for one in lost]
+        return late + [envelopes.refusal(one, NO_ANSWER, why) for one in lost]
 
     def _await_open(self, until_ns: int, wake: int) -> bool:
         """Whether there is a connection by then; now and then the name is looked up anew."""
@@ -345,8 +345,6 @@ class Posting:
             return
         if answer.error is UNSET:
             future.set_result(None if answer.ok is UNSET else answer.ok)
-        elif answer.error.kind == "no_answer":
-            future.set_exception(NoAnswerError(answer.error.sentence))
         else:
             future.set_exception(refused(answer))
 
@@ -364,9 +362,11 @@ class Posting:
             future.set_exception(NoAnswerError(f"{self._sending.path} has not answered: {why}; {told}"))
 
 
-def refused(answer: Envelope) -> CallRefusedError:
+def refused(answer: Envelope) -> CallRefusedError | NoAnswerError:
     """The error that an answer tells."""
     assert answer.error is not UNSET
+    if answer.error.kind == NO_ANSWER:
+        return NoAnswerError(answer.error.sentence)
     return CallRefusedError(answer.error.sentence or answer.error.kind, answer.error.kind)
 
 

@@ -30,6 +30,7 @@ from failover.core.naming.worlds import is_simulated
 from failover.drivers import local
 from failover.drivers.actor import Actor, Whose
 from failover.drivers.call_rights import CallRights
+from failover.drivers.carried_out import CarriedOut
 from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, here, hold, stem
 from failover.drivers.name_service import NameService
@@ -183,8 +184,11 @@ class Serving:
 
     def _made(self, cls: type, declaration: Declaration, who: str) -> tuple[Any, Actor]:
         """The driver, and what hands it its messages."""
-        instance = cls() if self._keeping is None else self._keeping.instance
-        return instance, Actor(instance, declaration, who, self._keeping)
+        if self._keeping is not None:
+            return self._keeping.instance, Actor(self._keeping.instance, declaration, who, self._keeping)
+        instance = cls()
+        carried_out = CarriedOut(self.here.file(declaration.path, "done"), declaration.path)
+        return instance, Actor(instance, declaration, who, carried_out=carried_out)
 
     def _open(self, declaration: Declaration, stack: contextlib.ExitStack) -> None:
         path = declaration.path

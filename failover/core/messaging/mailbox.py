@@ -9,7 +9,7 @@ Promised, of one sender to one receiver:
 * one past its deadline is not handled, and its sender is told.
 
 Not promised: any order between different senders; that an unreliable message arrives. A receiver that keeps no state may, after
-its death, handle again what it had handled and not yet answered.
+its death, handle again what it had handled and not yet answered, unless it notes that (`failover.drivers.carried_out`).
 
 How: the sender numbers its messages (`seq`) within its life (`boot`), and says in each which unanswered reliable one comes right
 before (`after`). The receiver takes a message whose number is above all it has taken, once it has taken the one before. It keeps
@@ -67,6 +67,9 @@ MOVED: Final = ("moved", "wrong_driver")
 
 AGAIN: Final = ("busy", *MOVED)
 """Kinds of errors after which a reliable message is sent again."""
+
+NO_ANSWER: Final = "no_answer"
+"""Kind of the error of a message of which is not known whether it was carried out."""
 
 ANSWER_NS: Final = 5_000 * MS
 """How long after the deadline of a message that left its answer is waited for: its receiver says then that it expired."""

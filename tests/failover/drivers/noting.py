@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 
 import failover
-
-WORK_S = 0.0
 
 
 @failover.driver("Lab/robot1/Noting", alias="noting")
 class Noting:
     def __init__(self) -> None:
         self.file = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-        os.write(self.file, b"begun\n")
 
     @failover.command
     def note(self, number: int) -> int:
         os.write(self.file, f"{number}\n".encode())
-        time.sleep(WORK_S) if WORK_S else None
         return number
 
 

@@ -385,7 +385,7 @@ def test_sigterm_ends_a_driver_after_the_message_in_hand(here: Here) -> None:
     with process() as one:
         one.send_signal(signal.SIGTERM)
         assert one.wait(LIMIT_S) == 0
-        assert sorted(path.suffix for path in here.directory.iterdir()) == [".lock"]
+        assert sorted(path.suffix for path in here.directory.iterdir()) == [".done", ".lock"]
 
 
 def test_import_of_failover_loads_no_socket(here: Here) -> None:

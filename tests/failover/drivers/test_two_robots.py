@@ -51,9 +51,10 @@ def test_an_answer_is_not_waited_for_before_its_message_has_left(lab: Lab) -> No
         way, waited = proxy._sending.route.way, []
         await_message = way.await_message
 
-        def noted(*arguments: Any) -> bytes | None:
-            waited.append(proxy._sending._outbox.is_connected)
-            return await_message(*arguments)
+        def noted(timeout_ns: int, *wake: int) -> bytes | None:
+            if timeout_ns:
+                waited.append(proxy._sending._outbox.is_connected)
+            return await_message(timeout_ns, *wake)
 
         way.await_message = noted  # type: ignore[method-assign]
         assert proxy.call("read") == {"duty": 0.0}
