@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextvars
 import json
 import threading
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -11,9 +15,8 @@ import failover
 from failover.cli import main
 from failover.core.messaging.envelope import HOPS_MAX, Hop
 from failover.drivers.here import Here
-from failover.drivers.in_hand import carrying_out, hops_so_far
-from failover.errors import CallRefusedError
-from tests.failover.drivers.serving import called, serving
+from failover.drivers.in_hand import CARRIED_MAX, carrying_out, hops_so_far
+from tests.failover.drivers.serving import called, serving, until
 
 
 @failover.driver("Lab/Lamp", alias="lamp")
@@ -68,9 +71,82 @@ def test_what_a_driver_sends_meanwhile_is_on_the_way_and_what_its_own_thread_sen
     assert hops_so_far() == ()
 
 
-def test_a_circle_of_drivers_ends_with_a_sentence(here: Here) -> None:
-    hops = tuple(Hop(f"robot1/{number}", number, number) for number in range(HOPS_MAX))
-    with serving(Lamp, here), called(here, "lamp") as lamp:
-        with carrying_out(hops), pytest.raises(CallRefusedError, match="names lead in a circle"):
-            lamp.call("shine", seconds=1)
-        assert lamp.call("shine", seconds=1) == 1
+@failover.driver("Lab/Clock", alias="clock")
+class Clock:
+    """Posts its next message to itself, and to another one that posts back."""
+
+    def __init__(self) -> None:
+        self.ticks = self.tocks = 0
+        self.tasks: list[tuple[Hop, ...]] = []
+
+    @failover.command
+    def tick(self, left: int) -> None:
+        self.ticks += 1
+        if left:
+            post("clock", "tick", left - 1)
+
+    @failover.command
+    def tock(self, left: int) -> None:
+        self.tocks += 1
+        if left:
+            post("echo", "tock", left - 1)
+
+    @failover.command
+    def begin(self, over: str) -> None:
+        async def later() -> None:
+            self.tasks.append(hops_so_far())
+            while not Path(over).exists():
+                await asyncio.sleep(0.001)
+            self.tasks.append(hops_so_far())
+
+        context = contextvars.copy_context()
+        threading.Thread(target=context.run, args=(asyncio.run, later())).start()
+        until(lambda: self.tasks)
+
+
+@failover.driver("Lab/Echo", alias="echo")
+class Echo:
+    @failover.command
+    def tock(self, left: int) -> None:
+        post("clock", "tock", left)
+
+
+PROXIES: dict[str, failover.Proxy] = {}
+
+
+def post(name: str, verb: str, left: int) -> None:
+    PROXIES[name].post(verb, left=left)
+
+
+@pytest.fixture
+def clock(here: Here) -> Iterator[tuple[Clock, failover.Proxy]]:
+    with serving(Clock, here) as clock, serving(Echo, here), called(here, "clock") as asked, called(here, "echo") as echo:
+        PROXIES.update(clock=called(here, "clock"), echo=echo)
+        with PROXIES["clock"]:
+            yield clock.instance, asked
+
+
+@pytest.mark.parametrize(("verb", "count"), [("tick", "ticks"), ("tock", "tocks")])
+def test_drivers_that_post_to_themselves_or_each_other_go_on_for_ever(
+    clock: tuple[Clock, failover.Proxy], verb: str, count: str
+) -> None:
+    driver, asked = clock
+    asked.call(verb, left=5 * HOPS_MAX)
+    until(lambda: getattr(driver, count) == 5 * HOPS_MAX + 1)
+
+
+def test_a_task_that_lives_on_begins_a_new_way_once_the_message_is_carried_out(
+    clock: tuple[Clock, failover.Proxy], tmp_path: Path
+) -> None:
+    driver, asked = clock
+    asked.call("begin", over=str(tmp_path / "over"))
+    (tmp_path / "over").touch()
+    until(lambda: len(driver.tasks) == 2)
+    assert [hop.who for hop in driver.tasks[0]] == [asked.sender, "robot1/Lab.Clock"] and driver.tasks[1] == ()
+
+
+def test_a_long_way_goes_on_as_another_one() -> None:
+    hops = tuple(Hop(f"robot1/{number}", number, number) for number in range(CARRIED_MAX))
+    for carried, found in ((hops, hops), ((*hops, Hop("robot1/more", 1)), ())):
+        with carrying_out(carried):
+            assert hops_so_far() == found
