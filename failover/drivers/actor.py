@@ -93,9 +93,10 @@ class Actor:
         self._file = carried_out
         self._unnoted: list[Envelope] = []
         """Answers that `count` has still to note."""
-        self._mailbox = (
-            keeping.mailbox if keeping is not None else Mailbox(carried_out.streams if carried_out is not None else None)
-        )
+        if keeping is not None:
+            self._mailbox = keeping.mailbox
+        else:
+            self._mailbox = Mailbox() if carried_out is None else Mailbox(carried_out.streams, carried_out.asked)
         self._pace = Pace(declaration.rate_hz)
         self._paths: OrderedDict[str, tuple[Hop, ...]] = OrderedDict()
         self._meant: dict[str, bool] = {}

@@ -25,7 +25,7 @@ a program that goes back to its last commit takes back nothing that others have 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
 
 import msgspec
@@ -322,10 +322,20 @@ class Taken(Struct):
     held: list[Arrived] = []
 
 
+Key = tuple[str, int, int]
+"""Which message: sender, its life, number."""
+
+
+def key_of(answer: Envelope) -> Key:
+    """Of the message that it answers."""
+    return answer.to, answer.boot, answer.seq
+
+
 class Mailbox:
     """The messages of one actor, which handles one at a time."""
 
-    def __init__(self, kept: Mapping[str, Stream] | None = None) -> None:
+    def __init__(self, kept: Mapping[str, Stream] | None = None, asked: Collection[Key] = ()) -> None:
+        """``asked``: messages below the numbers of ``kept`` that change nothing, and are handled again when they come again."""
         self._streams = OrderedDict(
             (sender, Stream(one.boot, one.last, one.reliable, dict(one.answers))) for sender, one in (kept or {}).items()
         )
@@ -339,6 +349,7 @@ class Mailbox:
         self.handled = 0
         """Messages told `done` so far."""
         self._free = {sender: one.reliable for sender, one in self._streams.items()}
+        self._asked = set(asked)
 
     def __len__(self) -> int:
         return len(self._queue) + self._held
@@ -378,7 +389,12 @@ class Mailbox:
         if envelope.boot < taken.boot:
             return []
         if envelope.seq <= taken.last:
-            return self._again(envelope)
+            key = envelope.sender, envelope.boot, envelope.seq
+            if key not in self._asked:
+                return self._again(envelope)
+            if not (refused := self._queued(arrived)):
+                self._asked.discard(key)
+            return refused
         if envelope.after > taken.reliable:
             self._hold(taken, arrived)
             return []
@@ -523,9 +539,9 @@ class Mailbox:
         self._streams.move_to_end(envelope.sender)
         self._packed.pop(envelope.sender, None)
         if envelope.boot == stream.boot:
-            stream.last = envelope.seq
+            stream.last = max(stream.last, envelope.seq)
             if envelope.reliable:
-                stream.reliable = envelope.seq
+                stream.reliable = max(stream.reliable, envelope.seq)
                 while stream.answers and (oldest := next(iter(stream.answers))) <= envelope.had:
                     del stream.answers[oldest]
                 stream.answers[envelope.seq] = answer
@@ -545,7 +561,7 @@ class Mailbox:
         for answer in answers:
             stream = self._streams.get(answer.to)
             if stream is not None and stream.boot == answer.boot and answer.seq in stream.answers:
-                self._free[answer.to] = answer.seq
+                self._free[answer.to] = max(answer.seq, self._free.get(answer.to, 0))
         return answers
 
 
