@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final
 
 CLONE_NEWTIME: Final = 0x80
-SHIFTS_S: Final = {"robot1": 5, "robot2": -5}
-"""What each robot's clock is ahead of the one that the test knows."""
+SHIFTS_S: Final = {"robot1": 5 * 3600, "robot2": -5}
+"""What each robot's clock is ahead of the one that the test knows: hours, as of robots that were not booted together."""
 
 PATHS: Final = ("Lab/robot1/First", "Lab/robot2/Second", "Lab/robot1/Third")
 ROLES: Final = {"first": "robot1", "second": "robot2", "third": "robot1", "ask": "robot1"}

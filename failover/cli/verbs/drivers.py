@@ -242,10 +242,11 @@ class _Clocks:
         self._asked: set[str] = set()
 
     def offset(self, who: str, other: str, at_ns: int) -> Bounds:
-        """Clock of ``other`` minus clock of ``who``."""
+        """Clock of ``other`` minus clock of ``who``, at an instant of the latter."""
         one, two = robot_of(who), robot_of(other)
         if one == two:
             return Bounds(0, 0)
+        at_ns -= self._from_here(one, at_ns).middle_ns or 0  # the pairs count by our clock
         first, second = self._from_here(one, at_ns), self._from_here(two, at_ns)
         return Bounds(_less(second.low_ns, first.high_ns), _less(second.high_ns, first.low_ns))
 
