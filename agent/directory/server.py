@@ -7,7 +7,9 @@ ldap.conf(5) for the options.
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -16,6 +18,9 @@ from agent.errors import DirectoryError
 from failover.config.rights import LdapConfig, is_loopback
 
 CLASSES: Final = "(|(objectClass=groupOfNames)(objectClass=groupOfUniqueNames)(objectClass=posixGroup)(objectClass=group))"
+SYSTEM: Final = Path("/etc/ldap/ldap.conf")
+"""Where the system says which certificates it trusts: Debian's place."""
+
 EMPTY_PASSWORD: Final = "the agent never tries an empty password: a server may accept it without a check (RFC 4513)"
 
 
@@ -78,20 +83,37 @@ class LdapServer:
             (ldap.OPT_REFERRALS, 0),  # another server would be sent the password
             (ldap.OPT_NETWORK_TIMEOUT, config.timeout_s),
             (ldap.OPT_TIMEOUT, config.timeout_s),
-            (ldap.OPT_X_TLS_REQUIRE_CERT, ldap.OPT_X_TLS_DEMAND),
         ):
             connection.set_option(option, value)
-        for option, chosen in ((ldap.OPT_X_TLS_CACERTFILE, config.ca_file), (ldap.OPT_X_TLS_CACERTDIR, "")):
-            if place := chosen or (None if config.ca_file else ldap.get_option(option)):
-                connection.set_option(option, place)  # a connection has none of its own, not even those of ldap.conf
-        connection.set_option(ldap.OPT_X_TLS_NEWCTX, 0)  # last: it takes the options above
+        is_plain = config.server.startswith("ldap:") and config.tls == "none" and is_loopback(self._host)
+        if not is_plain:
+            self._trust(ldap, connection)
         try:
-            if config.server.startswith("ldap:") and not (config.tls == "none" and is_loopback(self._host)):
+            if config.server.startswith("ldap:") and not is_plain:
                 connection.start_tls_s()
             yield connection
         finally:
             with contextlib.suppress(ldap.LDAPError):
                 connection.unbind_s()
+
+    def _trust(self, ldap: Any, connection: Any) -> None:
+        """Which certificates the server's may descend from: a connection knows none by itself.
+
+        Raises:
+            DirectoryError: they cannot be read.
+        """
+        place = self._config.ca_file or system_certificates()
+        if not place:
+            raise DirectoryError(f"no certificates are trusted: {SYSTEM} has no TLS_CACERT; set ca_file of [rights.ldap]")
+        try:
+            connection.set_option(ldap.OPT_X_TLS_REQUIRE_CERT, ldap.OPT_X_TLS_DEMAND)
+            connection.set_option(ldap.OPT_X_TLS_CACERTFILE, place)
+            connection.set_option(ldap.OPT_X_TLS_NEWCTX, 0)  # last: it takes the options above
+        except ValueError as error:
+            raise DirectoryError(
+                f"{self._config.server}: the certificates in {place} cannot be read; install them (Debian's ca-certificates), "
+                "or set ca_file of [rights.ldap]"
+            ) from error
 
     def _bind(self, ldap: Any, connection: Any, account: str, secret: str) -> None:
         if not account:
@@ -124,12 +146,23 @@ class LdapServer:
 
 def _library() -> Any:
     """The module ``ldap``. Raises DirectoryError: it is not installed."""
+    os.environ["LDAPNOINIT"] = "1"  # else whoever owns the working directory or $HOME says which servers are trusted
     try:
         import ldap
         import ldap.filter
     except ImportError as error:
         raise DirectoryError(f"python-ldap is missing ({error}); install failover[ldap], or Debian's python3-ldap") from error
     return ldap
+
+
+def system_certificates() -> str:
+    """The file that the system names; "": none."""
+    try:
+        lines = SYSTEM.read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    named = [words[1].strip() for line in lines if len(words := line.split(None, 1)) == 2 and words[0].upper() == "TLS_CACERT"]
+    return named[-1] if named else ""
 
 
 def _sentence(error: Any) -> str:

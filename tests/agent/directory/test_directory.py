@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
 import shutil
 import signal
 import stat
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,6 +114,58 @@ def test_a_server_with_a_wrong_certificate_is_not_believed(slapd: Slapd, scheme:
     with pytest.raises(DirectoryError, match=re.escape(address)) as refused:
         server_of(slapd, server=address, ca_file=str(tmp_path / "certificate")).groups("driver", PASSWORD.format("driver"))
     assert not isinstance(refused.value, WrongPasswordError)
+
+
+ASKED = """
+import json
+import sys
+from pathlib import Path
+from agent.directory import server
+from agent.errors import DirectoryError
+from failover.config.rights import LdapConfig
+server.SYSTEM = Path(sys.argv[1])
+try:
+    print(sorted(server.LdapServer(LdapConfig(**json.loads(sys.argv[2])), sys.argv[3]).groups("driver", None)))
+except DirectoryError as error:
+    print(type(error).__name__, error)
+"""
+
+
+def asked_with(system: Path, address: str, tls: str = "require", **environment: str) -> str:
+    """What a process is answered in whose system this file names the certificates; it was started in that file's folder."""
+    config = {"server": address, "base": "dc=lab", "account": SERVICE, "tls": tls, "timeout_s": 60}
+    words = [sys.executable, "-c", ASKED, str(system), json.dumps(config), SECRET]
+    known = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "HOME": str(system.parent), **environment}
+    return subprocess.run(words, cwd=system.parent, env=known, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize("where", ["ldaprc", ".ldaprc", "LDAPTLS_CACERT", "LDAPCONF"])
+def test_who_owns_the_folder_or_the_environment_does_not_say_which_server_is_trusted(
+    slapd: Slapd, tmp_path: Path, where: str
+) -> None:
+    make_certificate(tmp_path)
+    system, foreign = tmp_path / "ldap.conf", tmp_path / (where if "rc" in where else "own.conf")
+    system.write_text(f"# of the system\nTLS_CACERT\t{tmp_path / 'certificate'}\n")
+    foreign.write_text(f"TLS_CACERT {slapd.certificate}\n")
+    environment = {"LDAPTLS_CACERT": str(slapd.certificate), "LDAPCONF": str(foreign)}
+    chosen = {where: environment[where]} if where in environment else {}
+    address = f"ldaps://127.0.0.1:{slapd.port_tls}"
+    assert asked_with(system, address, **chosen).startswith("DirectoryError")
+    system.write_text(f"TLS_CACERT {slapd.certificate}\n")
+    assert "DirectoryError" not in asked_with(system, address, **chosen), "the system's is believed"
+
+
+def test_without_certificates_a_plain_server_is_asked_and_an_encrypted_one_is_told(slapd: Slapd, tmp_path: Path) -> None:
+    system, plain = tmp_path / "ldap.conf", f"ldap://127.0.0.1:{slapd.port}"
+    for text, why in (
+        (f"TLS_CACERT {tmp_path}/none\n", f"the certificates in {tmp_path}/none cannot be read"),
+        ("", "has no TLS_CACERT"),
+    ):
+        system.write_text(text)
+        assert "DirectoryError" not in asked_with(system, plain, "none")
+        for address in (plain, f"ldaps://127.0.0.1:{slapd.port_tls}"):
+            said = asked_with(system, address)
+            assert said.startswith("DirectoryError") and why in said
 
 
 def test_plain_is_for_this_machine_alone(slapd: Slapd) -> None:
