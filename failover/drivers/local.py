@@ -13,6 +13,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -189,6 +190,23 @@ class Connection:
     def close(self) -> None:
         """Let it go."""
         self._end.close()
+
+
+def close_all(connections: Sequence[Connection], linger_ms: int) -> None:
+    """Close them, after so many ms in which what waits to be sent may leave."""
+    until_ns = time.monotonic_ns() + linger_ms * MS
+    poller = select.poll()
+    unsent = {one.descriptor: one for one in connections if one.has_unsent}
+    for descriptor in unsent:
+        poller.register(descriptor, select.POLLOUT)
+    while unsent and (left_ns := until_ns - time.monotonic_ns()) > 0:
+        for descriptor, events in poller.poll(left_ns / MS):
+            unsent[descriptor].flush()
+            if events & (select.POLLERR | select.POLLHUP) or not unsent[descriptor].has_unsent:
+                poller.unregister(descriptor)
+                del unsent[descriptor]
+    for one in connections:
+        one.close()
 
 
 # --- The caller's side ------------------------------------------------------------------------------------------------

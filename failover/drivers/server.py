@@ -51,7 +51,7 @@ UNSENT_MAX: Final = 4 << 20
 """Bytes of answers that wait for one who does not read; then the connection is closed."""
 
 LINGER_MS: Final = 1_000
-"""How long the last answers to other robots may take to leave: who misses one sends the message again."""
+"""How long the last answers may take to leave: who misses one sends the message again."""
 
 BY_HAND_NUMBERS: Final = 1_000_000_000
 """Of messages of other robots that name no sender."""
@@ -253,8 +253,7 @@ class Serving:
     def __exit__(self, *_: object) -> None:
         for typing in self._hands.values():
             typing.connection.close()
-        for connection in self._near.values():
-            connection.close()
+        local.close_all(list(self._near.values()), LINGER_MS)
         self._stack.close()
 
     def stop(self) -> None:
