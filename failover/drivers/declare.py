@@ -27,7 +27,7 @@ from typing import Any, Final, Literal, TypeVar, overload
 import msgspec
 from msgspec import Struct
 
-from failover.core.messaging.envelope import SPEAKS
+from failover.core.messaging.envelope import SPEAKS, VERSION_SIZE_MAX, is_version
 from failover.core.messaging.pacing import Coalesce
 from failover.core.naming import names, worlds
 from failover.errors import DriverError, NameFormatError
@@ -42,7 +42,6 @@ DRIVER: Final = "__failover_driver__"
 RATE_HZ_MAX: Final = 10_000.0
 """Above it the loop of a driver is the limit."""
 
-VERSION_SIZE_MAX: Final = 16
 VERB_SIZE_MAX: Final = 64
 VERBS_MAX: Final = 64
 
@@ -195,6 +194,12 @@ def driver(
             verbs |= _spoken(_verbs(chosen), _checked_versions(chosen, speaks, earlier or {}), is_earlier=False)
         for spoken, cls in (earlier or {}).items():
             verbs |= _spoken(_verbs(cls), spoken, is_earlier=True)
+        shown = sum(1 for one in verbs.values() if one.earlier or SPEAKS not in one.name)
+        if shown > VERBS_MAX:
+            raise DriverError(
+                f"{chosen.__name__} has {shown} verbs with those of its earlier versions, {VERBS_MAX} are the most; "
+                "leave a version out"
+            )
         told = dict(labels or {}), version, migrations, dict(earlier or {})
         setattr(chosen, DRIVER, Declaration(normal, aliases, rate_hz, verbs, *told))
         setattr(chosen, RUNNER, "failover.drivers.server:run")
@@ -243,12 +248,18 @@ def _checked_versions(cls: type, speaks: str, earlier: Mapping[str, type]) -> st
     Raises:
         DriverError: it says none, or the versions cannot be told apart in messages.
     """
+    is_text = isinstance(speaks, str) and isinstance(earlier, Mapping) and all(isinstance(one, str) for one in earlier)
+    if not is_text or not all(isinstance(old, type) for old in earlier.values()):
+        raise DriverError(
+            f"{cls.__name__}: speaks={speaks!r}, earlier={earlier!r} do not name versions as text, and a class for each earlier "
+            'one: write speaks="2", earlier={"1": Version1}'
+        )
     if not speaks:
         raise DriverError(f'{cls.__name__} has earlier verbs and says no version of its own: write speaks="2", for example')
     if speaks in earlier:
         raise DriverError(f"{cls.__name__} speaks {speaks!r}, and earlier={{{speaks!r}: …}} names that, too")
     for one in (speaks, *earlier):
-        if not one.replace(".", "").isalnum() or not one.isascii() or len(one) > VERSION_SIZE_MAX:
+        if not is_version(one):
             raise DriverError(
                 f"{cls.__name__}: {one!r} is no version; write letters, digits and points, {VERSION_SIZE_MAX} at most"
             )

@@ -26,7 +26,7 @@ from msgspec import UNSET, Struct
 
 from failover.config import accounts
 from failover.core.messaging import envelope as envelopes
-from failover.core.messaging.envelope import SPEAKS, TEXT_MAX, Encoding, Envelope, Hop
+from failover.core.messaging.envelope import SPEAKS, TEXT_MAX, VERSION_SIZE_MAX, Encoding, Envelope, Hop, is_version
 from failover.core.messaging.mailbox import WINDOW
 from failover.core.naming.tree import Place
 from failover.drivers.here import Here, here, is_served
@@ -109,6 +109,10 @@ class Proxy:
         if not 1 <= queue <= WINDOW:
             raise DriverError(f"queue={queue} is no number of messages that can wait: write one from 1 to {WINDOW}")
         _check_encoding(encoding)
+        if version and not is_version(version):
+            raise DriverError(
+                f'version={version!r} is none: write text, such as version="1"; {VERSION_SIZE_MAX} characters at most'
+            )
         if not sender.isprintable() or "/" in sender or len(sender) + len(here.robot) >= TEXT_MAX // 2:
             raise DriverError(f"sender={sender[:64]!r} cannot name a program: write visible characters without /, 200 at most")
         if durable and not sender:

@@ -32,6 +32,7 @@ STAMP_MAX: Final = (1 << 63) - 1
 TEXT_MAX: Final = 512
 """Characters of ``to``, ``verb``, ``id``, ``from``, ``by``, ``re`` and of a name in ``hops``: tables keep thousands of them."""
 
+VERSION_SIZE_MAX: Final = 16
 SPEAKS: Final = "@"
 """Between a verb and the version of the receiver's verbs that the caller speaks: in no verb of a driver."""
 
@@ -421,6 +422,11 @@ def check_hops(hops: tuple[Hop, ...]) -> None:
                 stamp.isascii() and stamp.isdigit() and len(stamp) < 20 and int(stamp) <= STAMP_MAX
             ):
                 raise EnvelopeError(f"the message has the stamp {stamp[:40]!r}: write nanoseconds, from 2^53 on as text")
+
+
+def is_version(said: object) -> bool:
+    """Whether it names a version of verbs, as it stands behind `SPEAKS`."""
+    return isinstance(said, str) and len(said) <= VERSION_SIZE_MAX and said.isascii() and said.replace(".", "").isalnum()
 
 
 # --- Answers and hops -------------------------------------------------------------------------------------------------

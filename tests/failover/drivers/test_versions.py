@@ -126,6 +126,14 @@ class Kept:
         ({"speaks": "2", "earlier": {"x" * 17: PerCent}}, "letters, digits and points, 16 at most"),
         ({"speaks": "2", "earlier": {"1": Kept}}, "Kept keeps attributes: only Newest may"),
         ({"speaks": "2", "earlier": {"1": object}}, "object has no verb"),
+        ({"speaks": 2}, 'write speaks="2", earlier={"1": Version1}'),
+        ({"speaks": "2", "earlier": {1: PerCent}}, "do not name versions as text"),
+        ({"speaks": "2", "earlier": [PerCent]}, "do not name versions as text"),
+        ({"speaks": "2", "earlier": {"1": Kept()}}, "a class for each earlier one"),
+        (
+            {"speaks": "99", "earlier": {str(one): PerCent for one in range(30)}},
+            "has 91 verbs with those of its earlier versions",
+        ),
     ],
 )
 def test_versions_that_cannot_be_told_apart_are_refused_at_once(said: dict[str, Any], why: str) -> None:
@@ -138,3 +146,9 @@ def test_versions_that_cannot_be_told_apart_are_refused_at_once(said: dict[str, 
     with pytest.raises(DriverError) as refused:
         declare(Newest)
     assert why in str(refused.value)
+
+
+@pytest.mark.parametrize("version", [1, "1@2", "x" * 17])
+def test_a_caller_of_no_version_is_told_at_once(here: Here, version: Any) -> None:
+    with serving(Motor, here), pytest.raises(DriverError, match=r'is none: write text, such as version="1"'):
+        speaking(here, version)
