@@ -70,6 +70,11 @@ class Described(Declaration, frozen=True):
 
     told: Mapping[str, Any] = {}
 
+    @property
+    def shown(self) -> list[Verb]:
+        """Also those of earlier versions, which that process tells apart."""
+        return [one for one in self.verbs.values() if one.name in self.told]
+
     def schemas(self) -> dict[str, Any]:
         """As that process made them."""
         return dict(self.told)

@@ -9,6 +9,8 @@ import json
 from failover.cli import main
 from failover.drivers.lookup import lookup
 from failover.drivers.proxy import Proxy
+from failover.programs.channel import Hello, Verb
+from failover.programs.host import declared
 from failover.programs.hosting import Hosting
 from failover.programs.sources import Place
 from tests.failover.drivers.serving import LIMIT_S, serving, taking_messages
@@ -52,3 +54,9 @@ def test_what_a_program_calls_is_on_the_way_of_its_message(lab: Lab) -> None:
             assert main.main(["path", proxy.last.re, "--json"]) == 0
     (further,) = json.loads(said.getvalue())["further"]
     assert [part["who"] for part in further[::2]] == [proxy.sender, "robot1/Lab.robot1.Engine", "robot1/Lab.Lamp"]
+
+
+def test_a_host_names_the_verbs_of_earlier_versions_too() -> None:
+    verbs = {name: Verb("command", "queue", 0) for name in ("set", "set@2", "set@1")}
+    told = declared(Hello("Lab/Lamp", (), None, verbs, {"set": {}, "set@1": {}}, {}, (), (), ()), "")
+    assert [one.name for one in told.shown] == ["set", "set@1"]
