@@ -113,7 +113,7 @@ def run(cls: type[T]) -> T:
         NameFormatError: its path belongs to another robot.
     """
     serving = Serving(cls)
-    with serving, _signals(serving):
+    with _signals(serving), serving:
         for line in serving.addresses_told():
             print(line, file=sys.stderr, flush=True)
         serving.serve()
