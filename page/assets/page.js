@@ -199,7 +199,7 @@ const componentView = (name) => {
   const buttons = el("div", { class: "buttons", role: "group", "aria-label": "Orders" }), made = {};
   for (const verb of Object.keys(LABELS)) buttons.append(made[verb] = el("button", { type: "button", onclick: () => made[verb].getAttribute("aria-disabled") === "true" ? say(made[verb].title, true) : confirmOrder(name, verb) }, LABELS[verb]));
   const told = el("ol", { class: "story" }), silent = el("p", { class: "quiet" });
-  const out = el("pre", { tabindex: "0", "aria-label": "Standard output" }), err = el("pre", { tabindex: "0", "aria-label": "Standard error" }), outSays = el("p", { class: "quiet" });
+  const out = el("pre", { tabindex: "0", role: "group", "aria-label": "Standard output" }), err = el("pre", { tabindex: "0", role: "group", "aria-label": "Standard error" }), outSays = el("p", { class: "quiet" });
   const tasks = tableOf(["Task", "State", "Period", "Misses", "Late, half / 99 of 100 below", "Took, half / 99 of 100 below"]);
   const taskPart = section("Tasks", tasks.node);
   let shown = "";
