@@ -26,7 +26,7 @@ LOOKED_AT = 0x300
 """Bytes of a function in which it would show what it is made of."""
 WIDE = re.compile(r"%[yz]mm")
 LEVEL, BEYOND = {
-    "x86_64": ("x86-64-v2", ("avx512f", "amx_tile", "sha512")),
+    "x86_64": ("x86-64-v2", ("avx512f", "amx_tile", "xop")),
     "aarch64": ("armv8-a", ("asimddp", "bf16", "sha512")),
 }[cpu.NAME]
 """A level, and instruction sets of processors that have more."""
