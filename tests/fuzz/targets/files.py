@@ -243,19 +243,19 @@ def _posts(framed: Callable[[bytes], bytes], seeds: Callable[[list[bytes]], list
 
 @target("who writes to the folder of a program that posts: its messages that wait")
 def posts_file() -> Decoder:
-    from failover.drivers.posts_file import _framed
+    from failover.drivers.posts_file import framed
 
-    return _posts(lambda content: content, lambda made: [b"".join(_framed(one, safe) for one in made) for safe in (0, 100)])
+    return _posts(lambda content: content, lambda made: [b"".join(framed(one, safe) for one in made) for safe in (0, 100)])
 
 
 @target("who writes to the folder of a program that posts: one record, with a right digest", "msgpack")
 def posts_record() -> Decoder:
     import msgspec
 
-    from failover.drivers.posts_file import Begun, _framed
+    from failover.drivers.posts_file import Begun, framed
 
-    begun = _framed(msgspec.msgpack.encode(Begun("robot1/mission", "Lab/Engine", 7, 0)), 0)
-    return _posts(lambda content: begun + _framed(content, 0), lambda made: made[1:])
+    begun = framed(msgspec.msgpack.encode(Begun("robot1/mission", "Lab/Engine", 7, 0)), 0)
+    return _posts(lambda content: begun + framed(content, 0), lambda made: made[1:])
 
 
 # --- Configuration ----------------------------------------------------------------------------------------------------
