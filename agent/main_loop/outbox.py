@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Struct, field
 
 from failover.core.acts import Act, Ready, SetLease
-from failover.core.beat_pace import EARLY_PART
+from failover.core.beat_pace import least_ns
 from failover.core.types import VoteRecord
 from failover.core.wire.messages import Beat
 
@@ -111,7 +111,7 @@ class Outbox(Struct):
             return beats
         if not beats:
             return ()
-        if now_ns - self._beaten_ns < self.beat_ns - self.beat_ns // EARLY_PART:
+        if now_ns - self._beaten_ns < least_ns(self.beat_ns):
             self._withheld = beats[-1]
             return ()
         self._withheld, self._beaten_ns = None, now_ns

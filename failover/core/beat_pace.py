@@ -25,6 +25,11 @@ LATE_PART: Final = 25
 """…and by this part of it late, where it followed the one before; by two of them where it left just before that."""
 
 
+def least_ns(period_ns: int) -> int:
+    """Between two beats at least, unless the second one carries a change."""
+    return period_ns - period_ns // EARLY_PART
+
+
 class BeatPace(Struct):
     """Of one life of a robot.
 
@@ -57,12 +62,12 @@ class BeatPace(Struct):
 
     def follow(self, now_ns: int, period_ns: int) -> None:
         """The first member has just beaten: so does this one, or it comes nearer to that instant by its next beat."""
-        patience_ns, least_ns = period_ns // LATE_PART, self.last_ns + period_ns - period_ns // EARLY_PART
-        if now_ns - self.born_ns < FREE_NS or self.next_ns < least_ns:  # the latter: a change waits
+        patience_ns, earliest_ns = period_ns // LATE_PART, self.last_ns + least_ns(period_ns)
+        if now_ns - self.born_ns < FREE_NS or self.next_ns < earliest_ns:  # the latter: a change waits
             return
         if now_ns - self.last_ns <= patience_ns:
             self.next_ns = now_ns + period_ns + patience_ns
-        elif now_ns < least_ns:
-            self.next_ns = least_ns
+        elif now_ns < earliest_ns:
+            self.next_ns = earliest_ns
         else:
             self.follows, self._patience_ns = True, patience_ns
