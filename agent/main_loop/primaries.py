@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from failover.boards.agents_file import PRIMARIES
 from failover.boards.component_item import Primary, decode, encode
 from failover.boards.directory import AGENT_NAME
 from failover.boards.received import ReceivedItems
@@ -72,7 +73,7 @@ class Primaries:
 
 def _remembered(items: ReceivedItems) -> dict[str, Primary]:
     """The table that the agent before has left."""
-    record = items.file.record("primaries")
+    record = items.file.record(PRIMARIES)
     try:
         return dict(decode(get_carefully(items.file.place(record)).value)) if record is not None else {}
     except BoardError:  # never written, or damaged

@@ -23,7 +23,7 @@ from agent.config import Settings
 from agent.errors import AgentError
 from agent.system.permissions import NOBODY, uid_named
 from agent.worker import kept_items
-from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, boottime, directory
+from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, agents_file, boottime, directory
 from failover.boards.agents_file import AgentsFile
 from failover.boards.mapping import USER_PREFIX, uid_of
 from failover.boards.received import ReceivedItems
@@ -41,12 +41,12 @@ DIRECTORY_MODE: Final = 0o755
 PROGRAMS_MODE: Final = 0o660
 PEERS_MODE: Final = 0o640
 
-PRIMARIES: Final = Item("primaries", "msgpack", size=ITEM_SIZE_MAX, shared=False)
+PRIMARIES: Final = Item(agents_file.PRIMARIES, "msgpack", size=ITEM_SIZE_MAX, shared=False)
 """In the agent's own file: which robot runs which component (`failover.boards.component_item`)."""
 NO_LIST: Final = (errno.EOPNOTSUPP, errno.EINVAL)
 """The kernel has no access control lists on tmpfs; this agent's user namespace has no such uid."""
 OWNERS_NUMBER: Final = 1
-OWNERS: Final = Item("owners", size=ITEM_SIZE_MAX, shared=False)
+OWNERS: Final = Item(agents_file.OWNERS, size=ITEM_SIZE_MAX, shared=False)
 """There too, if there are such items: whose the items are that one user alone may put (`failover.core.board.owners`)."""
 
 log = logging.getLogger("failover.lanes")
