@@ -78,17 +78,17 @@ class Archivist:
     def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:
         """A file of the state that a chain leads to, as one base; of its deltas no more are in memory than when a store folds."""
         require_room(self._aside, 2 * sum(os.fstat(one).st_size for one in chain))  # folded, and sealed or folded again
-        deltas = list(chain[1:])
+        deltas, sizes = list(chain[1:]), [_pages_size(one) for one in chain[1:]]
         with contextlib.ExitStack() as files:
             base: BinaryIO = files.enter_context(open(chain[0], "rb", buffering=0, closefd=False))
             while deltas:
-                count = count_at_once([_pages_size(one) for one in (base.fileno(), *deltas)]) - 1
+                count = count_at_once([_pages_size(base.fileno()), *sizes]) - 1
                 folded = files.enter_context(tempfile.TemporaryFile(dir=self._aside))
                 fold_to(folded, base.fileno(), *deltas[:count])
                 folded.flush()
                 base.close()
                 base = folded
-                del deltas[:count]
+                del deltas[:count], sizes[:count]
             yield base
 
     def _spec(self, component: str) -> bytes:

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
@@ -27,10 +27,11 @@ from agent.config import Settings
 from agent.errors import TROUBLE, AgentError
 from agent.worker.components.connection import Dialogue
 from agent.worker.components.snapshots import newest_of
+from agent.worker.replication.send_files import Reader
 from checkpoint.keeper.messages import close_all, pair
 from checkpoint.model import Position
 from checkpoint.snapshot import format
-from checkpoint.snapshot.required_files import Need, needs
+from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
 from failover.archive.sealed import key_path
 from failover.core.events import Event, Noticed
@@ -53,9 +54,6 @@ END_S: Final = 10.0
 """How long it may take to end once it is killed."""
 
 log = logging.getLogger("failover.archive")
-
-Opening = Callable[[str, Need], Awaitable[int]]
-"""Opens a file that a component needs; raises CheckpointError or AgentError."""
 
 
 class NotArchivedError(AgentError):
@@ -86,7 +84,7 @@ class Archiving:
         settings: Settings,
         store: SnapshotStore,
         running: Callable[[], Collection[str]],
-        open_need: Opening,
+        open_need: Reader,
         tell: Callable[[Event], None],
     ) -> None:
         """
@@ -145,7 +143,10 @@ class Archiving:
 
     def _wanted(self) -> list[str]:
         held = self._store.components()
-        return [name for name in held if self._settings.me.role == "server" or name in self._running()]
+        if self._settings.me.role == "server":
+            return list(held)
+        running = self._running()
+        return [name for name in held if name in running]
 
     def _is_current(self, name: str, shelf: _Shelf) -> bool:
         return shelf.position is not None and shelf.position == self._store.newest(name)

@@ -22,7 +22,8 @@ from agent import config as configuration
 from agent.archive.messages import KeepCheckpoint
 from agent.archive.process import Archivist
 from agent.errors import LaneError
-from agent.worker.archiving import Archiving, Opening
+from agent.worker.archiving import Archiving
+from agent.worker.replication.send_files import Reader
 from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
@@ -75,7 +76,7 @@ async def nothing(component: str, need: Need) -> int:
 
 @contextlib.contextmanager
 def member(
-    directory: Path, *lines: str, role: Role = "robot", bring: bool = False, opening: Opening = nothing
+    directory: Path, *lines: str, role: Role = "robot", bring: bool = False, opening: Reader = nothing
 ) -> Iterator[Member]:
     robots = {f"robot{place}": Robot((f"127.0.0.1:74{place}0",), f"127.0.0.1:74{place}1") for place in (1, 2, 3)}
     robots["robot1"] = replace(robots["robot1"], role=role)
