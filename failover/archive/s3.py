@@ -145,14 +145,11 @@ class S3Objects:
         try:
             yield
         except (self._errors.BaseError, ValueError, OSError) as error:
-            is_found = isinstance(error, self._errors.AlreadyExistsError | self._errors.PreconditionError)
-            kind = (
-                _FoundError
-                if is_found
-                else _MissingError
-                if isinstance(error, self._errors.NotFoundError | FileNotFoundError)
-                else ArchiveError
-            )
+            kind = ArchiveError
+            if isinstance(error, self._errors.AlreadyExistsError | self._errors.PreconditionError):
+                kind = _FoundError
+            elif isinstance(error, self._errors.NotFoundError | FileNotFoundError):
+                kind = _MissingError
             raise kind(f"the archive {self._place} did not {tried}: {_in_words(str(error))}") from error
 
 
