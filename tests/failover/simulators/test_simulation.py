@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import psutil
 import pytest
 
 import failover
@@ -94,6 +95,32 @@ def paths() -> list[str]:
         return [one.record.path for one in whole_tree(here()).under()]
     except NameUnknownError:
         return []
+
+
+def policies(process: subprocess.Popen[str]) -> list[set[int]]:
+    """Of the threads of each process that simulates robots."""
+    found = []
+    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+        found.append({os.sched_getscheduler(int(thread)) & ~os.SCHED_RESET_ON_FORK for thread in os.listdir(f"/proc/{child}/task")})
+    return found
+
+
+def may_go_ahead() -> bool:
+    """Whether this user may run anything ahead of ordinary processes."""
+    done = subprocess.run([sys.executable, "-c", "import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))"], check=False)
+    return done.returncode == 0
+
+
+@pytest.mark.skipif(not may_go_ahead(), reason="this user may run nothing ahead of ordinary processes")
+def test_simulated_robots_run_ahead_of_ordinary_processes_until_they_do_not_fit_on_the_machine(place: Path) -> None:
+    with simulated("--robots", "2", "--labs", "1") as process:
+        until(lambda: policies(process) == [{os.SCHED_RR}], "the priority of all threads")
+        (child,) = psutil.Process(process.pid).children()
+        child.suspend()
+        time.sleep(2.0)  # 40 ticks
+        child.resume()
+        until(lambda: policies(process) == [{os.SCHED_OTHER}], "the priority to be given back")
+        ended(process)
 
 
 # --- By a seed ------------------------------------------------------------------------------------------------------------
