@@ -5,6 +5,7 @@ python -m benchmarks --quick             fewer cases and repetitions, some minut
 python -m benchmarks --quick restore     one of them
 python -m benchmarks load --load 8       beside eight busy loops, and without; no part of the whole run
 python -m benchmarks soak --for 2h       what grows over hours; no part of the whole run
+python -m benchmarks fleet               how a fleet grows to 1,000 robots, on paper; no part of the whole run
 
 As root more is measured (CRIU, beats on the wire). Nothing else should run meanwhile; a busy machine is warned of.
 """
@@ -37,6 +38,7 @@ from benchmarks import (
     engine,
     families,
     files,
+    fleet,
     increments,
     interference,
     lateness,
@@ -129,8 +131,8 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "messages": driver_call.messages,
 }
 
-BY_ITSELF: Final = ("load", "soak")
-"""No parts of the whole run: one takes twenty minutes, the other hours."""
+BY_ITSELF: Final = ("load", "soak", "fleet")
+"""No parts of the whole run: they take twenty minutes, hours, and ten minutes."""
 
 
 def main() -> int:
@@ -146,7 +148,11 @@ def main() -> int:
     began, before = time.monotonic(), machine.ticks()
     loads = (0, arguments.load) if arguments.load else load.LOADS
     span_s = arguments.span_ms / 1_000 if arguments.span_ms else None
-    benchmarks = BENCHMARKS | {"load": partial(load.load, loads=loads), "soak": partial(soak.soak, span_s=span_s)}
+    benchmarks = BENCHMARKS | {
+        "load": partial(load.load, loads=loads),
+        "soak": partial(soak.soak, span_s=span_s),
+        "fleet": fleet.fleet,
+    }
     findings = [_measure(name, benchmarks[name], arguments.quick) for name in arguments.names or BENCHMARKS]
     facts["it took"] = f"{time.monotonic() - began:.0f} s"
     facts["given to others by the host meanwhile"] = f"{(machine.ticks() - before).stolen_share:.1%} of its cores' time"

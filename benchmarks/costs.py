@@ -107,7 +107,7 @@ def _protected(robot: RobotMachine, program: Running) -> tuple[float, float, dic
     with robot.control() as link:
         link.ask("protect", pid=program.pid, name=NAME)
     interference.until_protected(robot)
-    parts = _parts(robot)
+    parts = parts_of(robot)
     began, snapshots, before = time.monotonic(), _snapshots(robot), _processor_s(parts)
     work = interference.rate(program)
     after, more, span = _processor_s(parts), _snapshots(robot) - snapshots, time.monotonic() - began
@@ -145,7 +145,7 @@ def _of_small_deltas(turns: int, span_s: float, directory: Path) -> list[Figure]
 
 def _by_delta(stage: Stage, name: str, span_s: float) -> dict[str, float]:
     """Of each process, and of each robot as a whole."""
-    parts = [(who, _parts(robot)) for who, robot in zip(("primary", "standby"), stage.robots, strict=True)]
+    parts = [(who, parts_of(robot)) for who, robot in zip(("primary", "standby"), stage.robots, strict=True)]
     count, before = _snapshots(stage.robots[0], name), [_processor_s(of_robot) for _, of_robot in parts]
     time.sleep(span_s)
     count, after = _snapshots(stage.robots[0], name) - count, [_processor_s(of_robot) for _, of_robot in parts]
@@ -190,7 +190,7 @@ def _idle(span_s: float, directory: Path) -> list[Figure]:
         stage.directory.mkdir()
         stage.start()
         time.sleep(span_s / 5)  # what it prepares is ready
-        parts = _parts(stage.robots[0])
+        parts = parts_of(stage.robots[0])
         before = _processor_s(parts)
         time.sleep(span_s)
         after = _processor_s(parts)
@@ -208,7 +208,7 @@ def _idle(span_s: float, directory: Path) -> list[Figure]:
     ]
 
 
-def _parts(robot: RobotMachine) -> dict[str, list[int]]:
+def parts_of(robot: RobotMachine) -> dict[str, list[int]]:
     """The processes of an agent, by what they are."""
     found: dict[str, list[int]] = {}
     for pid in robot.processes():
@@ -221,10 +221,11 @@ def _parts(robot: RobotMachine) -> dict[str, list[int]]:
 
 def _processor_s(parts: dict[str, list[int]]) -> dict[str, float]:
     """Seconds of processor time that each part has used."""
-    return {part: sum(map(_used_s, pids)) for part, pids in parts.items()}
+    return {part: sum(map(used_s, pids)) for part, pids in parts.items()}
 
 
-def _used_s(pid: int) -> float:
+def used_s(pid: int) -> float:
+    """Seconds of processor time that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS_A_SECOND
 

@@ -27,8 +27,7 @@ from failover.errors import LostAgentError, NoAgentError
 TEAM: Final = f"benchmark-{os.getpid()}"
 ROBOTS: Final = 8
 ITEMS: Final = 20
-BEAT_MS: Final = 50
-LEASE_MS: Final = 400
+PACE: Final = Pace(beat_ms=50, lease_ms=400)
 PUT_S: Final = 0.05
 """Between two puts of all items of a robot: each frame has new values."""
 
@@ -50,8 +49,8 @@ ITEM: Final = '[board.items.item{}]\ntype = {{ x = "f8", y = "f8" }}\n'
 class TeamStage(Stage):
     """Robots of a team with a board, on the loopback."""
 
-    def __init__(self, directory: Path, count: int, items: str) -> None:
-        super().__init__(directory, Means(own_pids=False, own_network=False), pace=Pace(BEAT_MS, LEASE_MS))
+    def __init__(self, directory: Path, count: int, items: str, settings: str = "", pace: Pace = PACE) -> None:
+        super().__init__(directory, Means(own_pids=False, own_network=False), settings, pace=pace)
         self.names = tuple(f"robot{number}" for number in range(1, count + 1))
         self._items = items
 
@@ -63,7 +62,7 @@ class TeamStage(Stage):
         for robot in self.robots:
             robot.switch_on()
         for robot in self.robots:
-            _until(lambda robot=robot: _hears_all(robot), f"{robot.name} to hear its team", START_PATIENCE_S)
+            until(lambda robot=robot: _hears_all(robot), f"{robot.name} to hear its team", START_PATIENCE_S)
 
     def __exit__(self, *raised: object) -> None:
         super().__exit__(*raised)
@@ -92,10 +91,10 @@ def main_loop(quick: bool, directory: Path) -> Findings:
     puts = _urgent(QUICK_URGENT_PUTS if quick else URGENT_PUTS, directory / "two")
     return Findings(
         "The main loop of a team with a board",
-        f"{ROBOTS} agents on this machine, {ITEMS} items of 16 bytes each, new values in each round of {BEAT_MS} ms: processor "
-        "time of one main loop, by the kernel's account (schedstat). Then two agents: from an urgent put at robot1 until a "
-        "program that waits at robot2 has it; beside it a datagram from program to program. Those who put and wait have "
-        f"real-time priority {urgent.PRIORITY}, the main loops theirs, where this user may.",
+        f"{ROBOTS} agents on this machine, {ITEMS} items of 16 bytes each, new values in each round of {PACE.beat_ms} ms: "
+        "processor time of one main loop, by the kernel's account (schedstat). Then two agents: from an urgent put at robot1 "
+        "until a program that waits at robot2 has it; beside it a datagram from program to program. Those who put and wait "
+        f"have real-time priority {urgent.PRIORITY}, the main loops theirs, where this user may.",
         (*shares, *puts),
     )
 
@@ -119,7 +118,7 @@ def _shares(span_s: float, directory: Path) -> list[Figure]:
         finally:
             for board in boards:
                 board.close()
-    case = f"{ROBOTS} robots, {ITEMS} items each, {BEAT_MS} ms"
+    case = f"{ROBOTS} robots, {ITEMS} items each, {PACE.beat_ms} ms"
     return [Figure("processor time of a main loop", case, "% of a core", tuple(values))]
 
 
@@ -163,7 +162,12 @@ def _hears_all(robot: RobotMachine) -> bool:
     return all(peer["state"] == "live" and peer["hears_us"] for peer in peers)
 
 
-def _until(holds: Any, what: str, patience_s: float = PATIENCE_S) -> None:
+def until(holds: Any, what: str, patience_s: float = PATIENCE_S) -> None:
+    """Wait for a condition.
+
+    Raises:
+        BenchmarkError: it did not come to hold.
+    """
     deadline = time.monotonic() + patience_s
     while not holds():
         if time.monotonic() > deadline:

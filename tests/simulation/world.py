@@ -327,7 +327,7 @@ class World:
                 for other in others if part is None else [part]:
                     if other.name in sealed.to:
                         for datagram in sealed.datagrams:
-                            self._transmit(robot.name, other, datagram)
+                            self.transmit(robot.name, other, datagram)
 
     # The network
 
@@ -335,7 +335,8 @@ class World:
         """Whether a message gets through at this instant."""
         return (sender, receiver) not in self.network.cuts and self.random.random() >= self.network.loss
 
-    def _transmit(self, sender: str, to: Robot, frame: bytes) -> None:
+    def transmit(self, sender: str, to: Robot, frame: bytes) -> None:
+        """Put a frame on the network: it may be lost, doubled or late."""
         copies = 1 + (self.random.random() < self.network.duplicate)
         for _ in range(copies):
             if self.passes(sender, to.name):
