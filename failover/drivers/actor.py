@@ -188,8 +188,6 @@ class Actor:
         waits = [max(sample_ns - now_ns, 0) for sample_ns in self._samples_ns.values()]
         if self._keeping is not None and (again_ns := self._keeping.wait_ns()) is not None:
             waits.append(again_ns)
-        if self._file is not None and (note_ns := self._file.wait_ns()) is not None:
-            waits.append(note_ns)
         if (first := self.following(now_ns)) is not None and not self._mailbox.is_ahead:
             waits.append(self._pace.wait_ns(now_ns) if self._is_paced(first) else 0)
         return min(waits, default=None)
@@ -250,13 +248,14 @@ class Actor:
         self._mailbox.done(message, msgspec.structs.replace(said, hops=hops))
 
     def count(self) -> None:
-        """Count and note what came and was handled lately. Called once the answers have left: no sender waits for it."""
+        """Count and note what came and was handled lately. Called once the answers have left: no sender waits for it.
+
+        A driver that is killed before counts a command of which the answer has left as one in hand.
+        """
         if self._unnoted:
             answers, self._unnoted = self._unnoted, []
             if self._file is not None:
                 self._file.over(answers, self._mailbox.kept)
-        if self._file is not None and self._file.wait_ns() == 0:
-            self._file.note()
         uncounted, self._uncounted = self._uncounted, []
         for message, at_ns, size, said in uncounted:
             if said is None:
@@ -264,12 +263,6 @@ class Actor:
             else:
                 took_ns = at_ns - message.hops[-1].came_ns
                 self._traffic.done(message.sender, message.verb, took_ns, at_ns, is_error=said.error is not UNSET)
-
-    def close(self) -> None:
-        """Note what has still to be noted: the driver ends in order."""
-        self.count()
-        if self._file is not None:
-            self._file.note()
 
     def carried_out(self, run: Sequence[Envelope]) -> Envelope:
         """The answer to messages that become one; the mailbox is not touched."""

@@ -3,9 +3,6 @@
 So a message that was answered gets the same answer again, and a command that was in hand is not begun a second time: its sender
 is told that it may have been carried out. A robot that boots has forgotten all of it, and its devices begin anew, too.
 
-An answer is noted together with the next command, or once the driver has had nothing to do for `NOTE_NS`: a note costs as much as
-the call itself. A driver that is killed before counts the last command as one in hand, though its answer has left.
-
 Each record is framed as those of `failover.drivers.posts_file`, with its content in msgpack. The file is written anew when a
 process begins with it, when most of it is over, and when records are missing in it, as the memory was full. It is open only while
 something is written: a capture seldom finds it open.
@@ -42,12 +39,6 @@ ANSWERS_SIZE_MAX: Final = 1 << 20
 SMALL: Final = 512
 ASKED_MAX: Final = 4_096
 """Queries with large answers that are known as such."""
-
-NOTE_NS: Final = 20_000_000
-"""Without a message for so long, what was answered is noted."""
-
-UNNOTED_MAX: Final = 64
-"""Answers that wait for being noted: queries alone begin no command."""
 
 RETRY_S: Final = 1.0
 """From a time when the file could not be written anew to the next."""
@@ -106,12 +97,9 @@ class CarriedOut:
         """For the mailbox of this process."""
         self.asked: OrderedDict[Key, None] = OrderedDict()
         """Queries that this mailbox takes again."""
-        self._unnoted: list[bytes] = []
-        """Records of answers that have left."""
-        self._due_ns = 0
         self._size = self._least = 0
         self._again_s = 0.0
-        self._is_torn = self._lacks_some = self._is_told = False
+        self._is_torn = self._is_behind = self._is_told = False
         try:
             self._load(path.read_bytes())
         except FileNotFoundError:
@@ -171,14 +159,6 @@ class CarriedOut:
         self._in_hand.update((one.sender, one.boot, one.seq) for one in named)
         self._append([_written(Began(one.sender, one.boot, one.seq, one.id, one.verb[:64])) for one in named])
 
-    def wait_ns(self) -> int | None:
-        """How long until `note` is to be called; None: there is nothing to note."""
-        return max(self._due_ns - time.monotonic_ns(), 0) if self._unnoted else None
-
-    def note(self) -> None:
-        """Note all answers that have left."""
-        self._append([])
-
     def over(self, answers: Iterable[Envelope], streams: Callable[[], Mapping[str, Stream]]) -> None:
         """These answers have left. ``streams``: tells what the mailbox keeps, for a file that is to be written anew."""
         named = [one for one in answers if one.seq and one.to]
@@ -189,12 +169,9 @@ class CarriedOut:
                 self._may_be_asked(key)
             elif self.asked:
                 self.asked.pop(key, None)
-        self._unnoted += [self._kept(one) for one in named]
-        self._due_ns = time.monotonic_ns() + NOTE_NS
-        if len(self._unnoted) > UNNOTED_MAX:
-            self.note()
+        self._append([self._kept(one) for one in named])
         has_grown = self._size > TIDY_SIZE and self._size > 2 * self._least
-        if (has_grown or self._lacks_some) and time.monotonic() >= self._again_s:
+        if (has_grown or self._is_behind) and time.monotonic() >= self._again_s:
             self._write_anew(streams())
 
     def _may_be_asked(self, key: Key) -> None:
@@ -213,8 +190,6 @@ class CarriedOut:
         return _over(msgspec.structs.replace(answer, ok=UNSET, error=Fault(ANSWER_LOST, sentence)))
 
     def _append(self, records: list[bytes]) -> None:
-        """Behind the answers that have left."""
-        records, self._unnoted = [*self._unnoted, *records], []
         if not records:
             return
         content = b"".join(framed(one, 0) for one in records)
@@ -237,7 +212,7 @@ class CarriedOut:
 
     def _lacks(self, why: str | None) -> None:
         """The file misses something; a driver that acts on is worth more than one that does not."""
-        self._lacks_some = True
+        self._is_behind = True
         if not self._is_told:
             self._is_told = True
             log.warning("%s cannot be written: %s; until it can, a command may come twice after a kill", self._path, why)
@@ -263,9 +238,8 @@ class CarriedOut:
             self._again_s = time.monotonic() + RETRY_S
             self._lacks(error.strerror)
             return
-        self._unnoted.clear()
         self._size = self._least = len(content)
-        self._is_torn = self._lacks_some = False
+        self._is_torn = self._is_behind = False
 
     def _unanswered(self, streams: Mapping[str, Stream]) -> list[bytes]:
         """Queries that an earlier process has answered, and that have not been asked again."""

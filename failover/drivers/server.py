@@ -251,7 +251,6 @@ class Serving:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._actor.close()
         for typing in self._hands.values():
             typing.connection.close()
         local.close_all(list(self._near.values()), LINGER_MS)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
-import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 from failover.core.messaging.envelope import Envelope, answer
 from failover.core.messaging.mailbox import NO_ANSWER, Mailbox
 from failover.drivers import carried_out
-from failover.drivers.carried_out import ANSWER_LOST, ANSWER_SIZE_MAX, NOTE_NS, UNNOTED_MAX, CarriedOut
+from failover.drivers.carried_out import ANSWER_LOST, ANSWER_SIZE_MAX, CarriedOut
 
 PATH = "Lab/Lamp"
 
@@ -43,11 +42,6 @@ class Life:
         return one
 
     def end(self, one: Envelope, result: Any) -> None:
-        self.answered(one, result)
-        self.file.note()
-
-    def answered(self, one: Envelope, result: Any) -> None:
-        """Its answer has left, and the driver goes on at once."""
         self.mailbox.done(one, answer(one, result))
         self.file.over(self.mailbox.committed(), self.mailbox.kept)
 
@@ -61,11 +55,6 @@ class Life:
     def carry_out(self, one: Envelope, result: Any = None) -> None:
         assert self.asked(one) == []
         self.end(self.begin(), result)
-
-
-def copy(place: Path) -> Path:
-    """The file as a later process would find it now."""
-    return Path(shutil.copy(place, place.with_suffix(".copy")))
 
 
 @pytest.fixture
@@ -94,38 +83,6 @@ def test_a_command_that_was_in_hand_is_not_begun_again_and_its_sender_is_told(pl
         assert told.error.kind == NO_ANSWER  # type: ignore[union-attr]
         assert "Lab/Lamp ended while it carried out set; it may have been carried out" in told.error.sentence  # type: ignore[union-attr]
         assert later.asked(message(2)) == [], "which was not begun"
-
-
-def test_an_answer_is_noted_together_with_the_next_command(place: Path) -> None:
-    first = Life(place)
-    assert first.file.wait_ns() is None
-    for seq in (1, 2):
-        assert first.asked(message(seq)) == []
-    first.answered(first.begin(), "one")
-    assert 0 < (first.file.wait_ns() or 0) <= NOTE_NS
-    size = place.stat().st_size
-    assert Life(copy(place)).asked(message(1))[0].error.kind == NO_ANSWER, "killed now"  # type: ignore[union-attr]
-    second = first.begin()
-    assert place.stat().st_size > size and first.file.wait_ns() is None
-    first.answered(second, "two")
-    later = Life(copy(place))
-    assert later.asked(message(1))[0].ok == "one"
-    assert later.asked(message(2))[0].error.kind == NO_ANSWER  # type: ignore[union-attr]
-    first.file.note()
-    assert Life(place).asked(message(2))[0].ok == "two"
-
-
-def test_answers_to_queries_alone_are_noted_some_at_a_time(place: Path) -> None:
-    life = Life(place)
-    sizes = set()
-    for seq in range(1, 3 * UNNOTED_MAX + 1):
-        assert life.asked(message(seq)) == []
-        taken = life.mailbox.take(1)
-        assert taken is not None
-        life.answered(taken, seq)
-        sizes.add(place.stat().st_size)
-    assert len(sizes) == 3
-    assert Life(place).file.streams["robot1/a"].last > 2 * UNNOTED_MAX
 
 
 def test_at_whatever_byte_the_process_was_killed_what_was_whole_counts(place: Path) -> None:
@@ -232,7 +189,6 @@ def test_a_command_of_which_only_the_beginning_was_noted_moves_nothing_back(plac
     for seq in range(2, 5):
         first.file.began([message(seq)])
         first.file.over([answer(message(seq), seq)], dict)
-    first.file.note()
     for _ in range(2):
         later = Life(place)
         stream = later.file.streams["robot1/a"]
@@ -247,7 +203,6 @@ def test_what_is_left_of_an_earlier_life_of_a_sender_changes_nothing(place: Path
     first = Life(place)
     first.file.began([message(9)])
     first.file.over([answer(message(1, boot=8), "new")], dict)
-    first.file.note()
     stream = Life(place).file.streams["robot1/a"]
     assert (stream.boot, stream.last, list(stream.answers)) == (8, 1, [1])
 
