@@ -15,8 +15,7 @@ from typing import Final
 
 from agent.config import Settings
 from agent.errors import LaneError
-from agent.worker.network.links import Links
-from agent.worker.network.replication_link import Callbacks, Keys, LinkState, ReplicationLink, Unread
+from agent.worker.network.replication_link import Callbacks, Devices, KeyOwners, Keys, LinkState, ReplicationLink, Unread
 from failover.config.team import Robot, split_address
 from failover.core.wire.messages import Bulk
 
@@ -43,7 +42,7 @@ class AllConnections:
     """
 
     def __init__(
-        self, settings: Settings, keys: Keys, heard: Heard, changed: Changed, links: Links, unread: Unread = lambda *_: None
+        self, settings: Settings, keys: Keys, heard: Heard, changed: Changed, links: Devices, unread: Unread = lambda *_: None
     ) -> None:
         self.troubles: list[str] = []
         self._connected: set[tuple[int, str]] = set()
@@ -52,7 +51,9 @@ class AllConnections:
         self._all: list[ReplicationLink] = []
         self._name, self._tell = settings.config.robot, (heard, changed, unread)
         self._further: dict[str, ReplicationLink] = {}
-        self.bulk = ReplicationLink(self._name, settings.me.bulk, _bulks(settings), keys, self._callbacks(BULK), links)
+        self._owners = KeyOwners(keys)
+        callbacks = self._callbacks(BULK)
+        self.bulk = ReplicationLink(self._name, settings.me.bulk, _bulks(settings), keys, callbacks, links, self._owners)
         self._all.append(self.bulk)
         for bind, peers in further_links(settings):
             self._add(bind, peers, keys)
@@ -62,7 +63,8 @@ class AllConnections:
         return Callbacks(functools.partial(heard, way), functools.partial(changed, way), unread)
 
     def _add(self, bind: str, peers: dict[str, str], keys: Keys) -> ReplicationLink:
-        link = self._further[bind] = ReplicationLink(self._name, bind, peers, keys, self._callbacks(len(self._all)))
+        callbacks = self._callbacks(len(self._all))
+        link = self._further[bind] = ReplicationLink(self._name, bind, peers, keys, callbacks, owners=self._owners)
         self._all.append(link)
         return link
 
@@ -84,11 +86,12 @@ class AllConnections:
             log.warning("%s", self.troubles[-1])
 
     async def change(self, settings: Settings, keys: Keys) -> None:
-        """Go on with these members.
+        """Go on with these members. A key that counts no more is refused on every link before the first one is made anew.
 
         Raises:
             LaneError: the replication link's address cannot be had any more.
         """
+        self._owners.know(keys)
         former = set(self._beat_keys) - set(settings.peers)
         self._beat_keys = {peer: key for peer, key in self._beat_keys.items() if peer not in former}
         self._their_keys = {ways: key for ways, key in self._their_keys.items() if ways[1] not in former}

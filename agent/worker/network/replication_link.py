@@ -107,6 +107,31 @@ class Keys(Struct, frozen=True):
         return bool(self.secret)
 
 
+class KeyOwners:
+    """Whose each public key is now. All links of one robot share it: a key that is refused on one is refused on each."""
+
+    def __init__(self, keys: Keys) -> None:
+        self._replaced: set[str] = set()
+        self.know(keys)
+
+    def know(self, keys: Keys) -> None:
+        """From now on these count, but for those that their owner has replaced already."""
+        self._keys = keys
+        owners = {key: name for name in keys.peers for key in keys.of(name)}
+        self._replaced &= owners.keys()
+        self._owners = {key: name for key, name in owners.items() if key not in self._replaced}
+
+    def owner(self, key: str) -> str | None:
+        """The member that this key proves; None: none."""
+        return self._owners.get(key)
+
+    def used(self, key: str, peer: str) -> None:
+        """A peer has used this key. If it is its new one, it goes back to no old one."""
+        if key == self._keys.following.get(peer):
+            self._replaced.add(self._keys.peers[peer])
+            self._owners.pop(self._keys.peers[peer], None)
+
+
 class Devices(Protocol):
     """Which interfaces connections are held to; see `agent.worker.network.links.Links`."""
 
@@ -349,12 +374,14 @@ class ReplicationLink:
         keys: Keys,
         callbacks: Callbacks,
         devices: Devices = ANY_DEVICE,
+        owners: KeyOwners | None = None,
     ) -> None:
         """
         Args:
             bind: "host:port" to listen at.
             peers: "host:port" by name.
             devices: which interfaces connections are held to.
+            owners: of the keys, as all links of this robot know them; None: this is the only link.
         """
         self._devices = devices
         self._router: zmq.asyncio.Socket | None = None
@@ -372,7 +399,7 @@ class ReplicationLink:
         self._mismatch: dict[str, str] = {}
         self._misunderstood: Counter[str] = Counter()
         self._arrivals = Arrivals(split_address(bind, "bulk address")[1], self._hosts())
-        self._owners = _owners(keys)
+        self._owners = owners or KeyOwners(keys)
 
     async def change(self, peers: Mapping[str, str], keys: Keys) -> None:
         """Go on with these peers: who has left is refused from now on, who has come is connected to.
@@ -385,7 +412,7 @@ class ReplicationLink:
         """
         before, self._peers = self._peers, peers
         former, self._keys = self._keys, keys
-        self._owners = _owners(keys)
+        self._owners.know(keys)
         self._arrivals.expect(self._hosts())
         for peer, link in list(self.links.items()):
             is_proved = not keys.present or link.their_key in keys.of(peer)
@@ -567,10 +594,9 @@ class ReplicationLink:
         if not self._keys.present:
             return claimed
         key = frames[1].get("User-Id")
-        if self._owners.get(key) != claimed:
+        if self._owners.owner(key) != claimed:
             return ""
-        if key == self._keys.following.get(claimed):  # it uses the new one, and goes back to no old one
-            self._owners.pop(self._keys.peers[claimed], None)
+        self._owners.used(key, claimed)
         return claimed
 
     async def _admit(self, gate: zmq.asyncio.Socket) -> None:
@@ -579,7 +605,7 @@ class ReplicationLink:
             while True:
                 version, request, _domain, address, _identity, mechanism, *credentials = await gate.recv_multipart()
                 key = _presented(credentials) if mechanism == b"CURVE" else ""
-                owner = self._owners.get(key)
+                owner = self._owners.owner(key)
                 if owner is None:
                     self._refuse(address.decode(errors="replace"), credentials)
                 else:
@@ -609,11 +635,6 @@ class ReplicationLink:
         if stranger != self._stranger:
             log.warning("refused a key that is not in team.toml on the replication link: %s", stranger)
         self._stranger = stranger
-
-
-def _owners(keys: Keys) -> dict[str, str]:
-    """Public key → whose it is."""
-    return {key: name for name in keys.peers for key in keys.of(name)}
 
 
 def _presented(credentials: list[bytes]) -> str:
