@@ -92,4 +92,4 @@ def start(directory: Path) -> str:
         if ran.returncode and words != ["reset-failed"]:
             said = (ran.stderr.strip() or ran.stdout.strip() or "nothing").splitlines()[-1]
             raise TeamFileError(f"systemctl {words[0]} {SERVICE} failed: {said}; failover-agent check names a mistake")
-    return "its service runs: failover status"
+    return "its service runs; failover status shows it"

@@ -180,6 +180,7 @@ ON_BEHALF: Final = frozenset(
 LENGTH: Final = struct.Struct(">I")
 SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
+SYSTEM_TEAM: Final = Path("/etc/failover/team/team.toml")
 SOCKET_VARIABLE: Final = "FAILOVER_SOCKET"
 CONNECT_TIMEOUT_S: Final = 5
 _CREDENTIALS: Final = struct.Struct("iII")
@@ -396,8 +397,19 @@ ODD_SHOWN: Final = 60
 """Characters of a text that cannot be sent, in the message about it."""
 
 
+def _is_absent(path: Path) -> bool:
+    """Whether a file is known not to be there: this user may be one who must not look."""
+    try:
+        path.stat()
+    except OSError as error:
+        return isinstance(error, FileNotFoundError)
+    return False
+
+
 def why_unreachable(path: Path, error: OSError) -> str:
     """One sentence, with the cure."""
+    if path == SYSTEM_SOCKET and isinstance(error, FileNotFoundError) and _is_absent(SYSTEM_TEAM):
+        return "this machine has no team yet: failover team create NAME begins one, failover team join enters another robot's"
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",
         ConnectionRefusedError: "the agent of this socket has ended; start failover-agent again",

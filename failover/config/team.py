@@ -124,7 +124,9 @@ def read(directory: Path) -> Team:
     except OSError as error:
         raise TeamFileError(f"{path}: cannot be read: {error.strerror}") from error
     if not is_there:
-        raise TeamFileError(f"{path}: there is no such file; failover team create makes one, or copy it here from another robot")
+        raise TeamFileError(
+            f"{path}: there is no such file: failover team create begins a team, failover team join enters another robot's"
+        )
     team = strict_toml.read(path, Team)
     check_team(str(path), team)
     if team.board.items:

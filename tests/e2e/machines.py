@@ -147,6 +147,14 @@ class Machine:
         """By the one namespace that neither a component nor a service has of its own."""
         return os.readlink(f"/proc/{pid}/ns/ipc") == os.readlink(f"/proc/{self.pid}/ns/ipc")
 
+    def stand_still(self) -> None:
+        """Freeze every process at once: nothing of what comes next is seen by any of them."""
+        (self.cgroup / "cgroup.freeze").write_text("1")
+        deadline = time.monotonic() + PATIENCE_S
+        while "frozen 1" not in (self.cgroup / "cgroup.events").read_text():
+            assert time.monotonic() < deadline, f"{self.name} does not stand still"
+            time.sleep(POLL_S)
+
     def end(self) -> None:
         """Cut its power."""
         with contextlib.suppress(ProcessLookupError):

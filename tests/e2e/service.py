@@ -92,11 +92,12 @@ def join(first: Machine, second: Machine) -> None:
 
 
 def lay_cable(first: Machine, second: Machine) -> None:
+    """Join two machines by a cable; each gets one of `ADDRESSES`, in their order."""
     ends = [["netns", str(machine.pid)] for machine in (first, second)]
     command = ["ip", "link", "add", "wire", *ends[0], "type", "veth", "peer", "name", "wire", *ends[1]]
     subprocess.run(command, check=True)
-    for machine in (first, second):
-        machine.run("ip", "address", "add", f"{ADDRESSES[machine.name]}/24", "dev", "wire")
+    for machine, address in zip((first, second), ADDRESSES.values(), strict=True):
+        machine.run("ip", "address", "add", f"{address}/24", "dev", "wire")
         machine.run("ip", "link", "set", "wire", "up")
 
 

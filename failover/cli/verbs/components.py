@@ -56,7 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.detach:
             answer = agent.ask("run", **wanted)
             if arguments.wait:
-                until_protected(agent, str(answer.get("started", answer)["name"]), is_quiet=arguments.json)
+                name = str(answer.get("started", answer)["name"])
+                standby = until_protected(agent, name, is_quiet=arguments.json)
+                if not arguments.json:
+                    print(visible(f"{standby} holds a checkpoint of it: it is protected"), file=sys.stderr)
             return _started(answer, arguments)
         with follower.passing_signals_on():
             return exit_like(follower.follow(agent, wanted))
@@ -142,8 +145,8 @@ class _Follower:
             print(visible(f"failover: {error}"), file=sys.stderr)
 
 
-def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> None:
-    """Return when another robot holds a checkpoint of a component; tell meanwhile how far that is.
+def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> str:
+    """Return when another robot holds a checkpoint of a component, and which; tell meanwhile how far that is.
 
     Raises:
         FailoverError: the component has ended, or cannot be protected.
@@ -157,7 +160,7 @@ def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> Non
             if one["state"] in ENDED:
                 raise FailoverError(f"{name} is {one['state']}: it will not be protected; see failover why {name}")
             if one["protection"] == "protected":
-                return
+                return str(one["standby"])
             if one["protection"] == "stopped":
                 why = "; ".join(one["reasons"]) or "on_unsupported = stop_protecting"
                 raise FailoverError(f"{name} runs and stays unprotected: {why}")

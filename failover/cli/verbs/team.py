@@ -46,7 +46,7 @@ def create(arguments: argparse.Namespace) -> int:
         raise
     service = agent_service.start(directory) if arguments.start else agent_service.NOT_STARTED
     answer = {"team": arguments.name, "file": str(path), "robot": robot, "beats": member.beats, "service": service}
-    sentence = f"team {arguments.name}: this machine is {robot} at {member.beats[0]}; {service}; failover team invite ROBOT"
+    sentence = f"team {arguments.name}: this machine is {robot} at {member.beats[0]}; {service}; then: failover team invite ROBOT"
     return _tell(arguments, answer, sentence)
 
 
@@ -155,7 +155,7 @@ def members_now(arguments: argparse.Namespace) -> int:
         robots = {name: {**msgspec.to_builtins(members.robots[name]), "state": seen[name]} for name in order}
         render.as_json({"team": members.team, "change": members.change, "robot": me, "robots": robots})
         return 0
-    print(f"team {members.team}: {len(order)} members")
+    print(_counted(members.team, len(order)))
     lines = [(name, members.robots[name].role, seen[name], " ".join(members.robots[name].beats)) for name in order]
     if lines:
         render.table(("robot", "role", "state", "addresses"), lines)
@@ -181,7 +181,7 @@ def show(arguments: argparse.Namespace) -> int:
         (name, robot.role, " ".join(robot.beats), robot.bulk, ", ".join(robot.keys) or "none")
         for name, robot in sorted(members.robots.items())
     ]
-    print(f"team {members.team}: {len(lines)} members")
+    print(_counted(members.team, len(lines)))
     if lines:
         render.table(("robot", "role", "beats", "bulk", "public key"), lines)
     if members.board.items:
@@ -189,6 +189,10 @@ def show(arguments: argparse.Namespace) -> int:
             f"board: {len(members.board.items)} items, digest {members.items().digest:016x}: it must be the same on every member"
         )
     return 0
+
+
+def _counted(name: str, count: int) -> str:
+    return f"team {name}: {count} member{'s' if count != 1 else ''}"
 
 
 def _write(directory: Path, members: Team) -> None:

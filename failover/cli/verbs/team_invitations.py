@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import secrets
 import socket
 import sys
@@ -99,7 +100,7 @@ def invite(arguments: argparse.Namespace) -> int:
         else:
             print(invitation.line)
             print(
-                f"on {robot}: failover team join, which asks for that line; it holds once, for {arguments.span} while this "
+                f"on {robot}: failover team join, which asks for that line; it works once, for {arguments.span}, while this "
                 "command runs; Ctrl-C ends it",
                 file=sys.stderr,
             )
@@ -114,11 +115,18 @@ def _listening(draft: Invitation) -> Iterator[tuple[Invitation, Listener]]:
     try:
         listener = OneTimeListener(draft.host, draft.port, draft.robot, draft.inviting_secret(), draft.joining_secret())
     except DriverError as error:
-        raise InvitationError(f"cannot invite: {error}; another invitation is open, or --port names another port") from error
+        raise InvitationError(f"cannot invite: {error}; {_cure(draft, error)}") from error
     try:
         yield replace(draft, port=listener.port), listener
     finally:
         listener.close()
+
+
+def _cure(draft: Invitation, error: DriverError) -> str:
+    number = getattr(error.__cause__, "errno", 0)
+    if number == errno.EADDRINUSE:
+        return f"another invitation is open, or another program uses port {draft.port}: --port names another one"
+    return f"no interface has {draft.host} now: see ip address; --address names another one of this robot"
 
 
 def _await_it(arguments: argparse.Namespace, listener: Listener, robot: str, span: int) -> int:

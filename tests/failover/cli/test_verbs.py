@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -15,7 +17,9 @@ from typing import Any
 import pytest
 
 from failover.cli import key_pairs, parser
-from failover.client.control import Output, Refused, Request, Result, Update
+from failover.client import control
+from failover.client.control import Control, Output, Refused, Request, Result, Update
+from failover.errors import NoAgentError
 from tests.failover.cli.stand_in import Answer, StandIn
 
 Start = Callable[[Callable[[Request], Answer]], StandIn]
@@ -193,7 +197,8 @@ def test_waiting_for_the_first_checkpoint_tells_how_much_of_what_has_arrived(age
     socket = agent(waiting(*WAITS, {"protection": "protected"})).path
     ran = failover(words[0], "--wait", *words[1:], socket=socket)
     assert ran.returncode == 0 and str(COMPONENT["name"]) in ran.stdout
-    (line,) = ran.stderr.splitlines()  # a plain one each five seconds
+    line, *told = ran.stderr.splitlines()  # a plain one each five seconds
+    assert told == ([f"{COMPONENT['standby']} holds a checkpoint of it: it is protected"] if words[0] == "run" else [])
     assert line.startswith("/lab/robot1/mapper: ") and (
         "(75 %)" in line or "program files to robot2: 1.0 MB of 4.0 MB (25 %)" in line
     )
@@ -615,10 +620,32 @@ def test_nothing_advises_to_delete_a_key_that_is_there(tmp_path: Path) -> None:
     assert ran.returncode == 1 and "r1.secret exists" in ran.stderr and "emove it" not in ran.stderr
 
 
+def test_an_invitation_at_an_address_that_this_robot_has_not_says_so(tmp_path: Path) -> None:
+    place = ["--directory", str(tmp_path / "team")]
+    begun = failover("team", "create", "lab", "--robot", "robot1", "--address", "127.0.0.1", "--no-start", *place)
+    assert begun.returncode == 0 and "then: failover team invite ROBOT" in begun.stdout
+    ran = failover("team", "invite", "robot2", "--address", "203.0.113.9", *place)
+    assert ran.returncode == 1 and "no interface has 203.0.113.9 now: see ip address; --address names another one" in ran.stderr
+    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = str(taken.getsockname()[1])
+        ran = failover("team", "invite", "robot2", "--port", port, *place)
+    assert ran.returncode == 1 and f"another invitation is open, or another program uses port {port}: --port" in ran.stderr
+
+
+def test_before_there_is_a_team_its_begin_is_told_in_place_of_a_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "SYSTEM_SOCKET", tmp_path / "control.sock")
+    monkeypatch.setattr(control, "SYSTEM_TEAM", tmp_path / "team.toml")
+    with pytest.raises(NoAgentError, match="this machine has no team yet: failover team create NAME begins one"):
+        Control.open(tmp_path / "control.sock")
+    (tmp_path / "team.toml").touch()
+    with pytest.raises(NoAgentError, match="no agent has been started there; start failover-agent"):
+        Control.open(tmp_path / "control.sock")
+
+
 def test_without_a_team_file_the_way_to_one_is_named(tmp_path: Path) -> None:
     ran = failover("team", "show", "--directory", str(tmp_path))
     assert ran.returncode == 1
-    assert "failover team create makes one" in ran.stderr
+    assert "failover team create begins a team, failover team join enters another robot's" in ran.stderr
 
 
 @pytest.mark.parametrize(
