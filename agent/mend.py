@@ -17,11 +17,12 @@ from agent.config import Settings
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
 from agent.worker.components.run_records import Records
+from checkpoint.errors import StoreError
 from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.store import open_store
 from failover.client.control import Control
 from failover.core import vote_record as core_vote_record
-from failover.core.types import EPOCH_SAID_MAX, PEERS_MAX, Record, State
+from failover.core.types import EPOCH_SAID_MAX, PEERS_MAX, Record, State, VoteRecord
 from failover.errors import NoAgentError
 
 COSTS: Final = """\
@@ -39,7 +40,7 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
         The exit status: 1 where nothing was changed.
 
     Raises:
-        AgentError: the agent runs, or the program does; no such record; not ours to change.
+        AgentError: the agent runs, or the program does; no such record; not ours to change; the store cannot be used.
     """
     directory = Path(settings.config.state_directory)
     check_right(directory)
@@ -52,7 +53,17 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
         raise AgentError(f"{settings.config.robot} has no record of {name!r}; it has {known}")
     if not 0 < epoch < record.epoch or epoch > EPOCH_SAID_MAX:
         raise AgentError(f"--epoch {epoch}: {name} has epoch {record.epoch}, and mending gives it a lower one, at least 1")
-    store = None if settings.me.role == "witness" else open_store(directory / "store")
+    try:
+        return _mend(settings, record_file, before, record, epoch, agreed=agreed)
+    except StoreError as error:
+        raise AgentError(f"cannot mend {name}: {error}; its record has epoch {record.epoch} still") from error
+
+
+def _mend(
+    settings: Settings, record_file: VoteRecordFile, before: VoteRecord, record: Record, epoch: int, *, agreed: bool
+) -> int:
+    name = record.name
+    store = None if settings.me.role == "witness" else open_store(Path(settings.config.state_directory) / "store")
     try:
         later = _later(store, name, epoch)
         held = len(store.positions(name)) if store is not None else 0

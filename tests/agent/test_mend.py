@@ -61,6 +61,15 @@ def test_it_tells_the_cost_and_changes_nothing_until_it_is_agreed_to(config: Pat
     assert records(config) == (POISONED, OTHER)
 
 
+def test_a_store_that_cannot_be_used_is_named_and_nothing_changes(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = open_store(config.parent / "state" / "store")
+    assert main(["mend", NAME, "--epoch", "12", "--yes", "--config", str(config)]) == 1
+    store.close()
+    said = capsys.readouterr().err
+    assert f"failover-agent: cannot mend {NAME}: " in said and f"its record has epoch {EPOCH_MAX - 1} still" in said
+    assert records(config) == (POISONED, OTHER)
+
+
 def test_it_lowers_the_one_record_and_leaves_no_vote_in_it(config: Path) -> None:
     assert main(["mend", NAME, "--epoch", "12", "--yes", "--config", str(config)]) == 0
     mended, other = records(config)
