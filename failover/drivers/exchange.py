@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from failover.core.naming import scan
 from failover.core.naming.scan import MULTICAST, Message, Send
-from failover.drivers.here import Here, host_and_port
+from failover.drivers.here import Here, TeamNow, host_and_port
 from failover.errors import DriverError
 
 if TYPE_CHECKING:
@@ -76,6 +76,13 @@ class Exchange:
     def neighbours(self) -> list[Path]:
         """The name services of this robot, without this process."""
         return [path for path in sorted(self.here.directory.glob(f"*.{ENDING}")) if path != self._path]
+
+    def know(self, here: Here) -> None:
+        """Go on with these members and keys: a door is made anew with them."""
+        self.here = here
+        if self._door is not None:
+            self._door.close()
+            self._door = self._door_tried_ns = None
 
     def be_door(self, now_ns: int, retry_ns: int = DOOR_RETRY_NS) -> bool:
         """Try to become the door of this robot, once in ``retry_ns``; whether it has become it just now."""
@@ -155,9 +162,10 @@ class Door:
         self._here = here
         self._team = here.team
         self._context = sockets.context()
-        self._peers: dict[str, sockets.Socket] = {}
+        self._peers: dict[str, sockets.Connection] = {}
+        self._now = TeamNow(here)
         try:
-            self._gate = sockets.Gate(self._context, {name: one.public_key for name, one in here.team.robots.items()})
+            self._gate = sockets.Gate(self._context, here.keys)
             self._listening, _ = sockets.listen_team(self._context, here, host_and_port(here.team, here.robot)[1])
         except DriverError:
             sockets.close(self._context)
@@ -174,17 +182,25 @@ class Door:
         if robot not in self._peers:
             host, port = host_and_port(self._team, robot)
             address = f"tcp://{self._sockets.bracketed(host)}:{port}"
-            self._peers[robot] = self._sockets.connect(self._context, address, self._here, robot, queued=QUEUED)
-        self._sockets.send(self._peers[robot], content)
+            self._peers[robot] = self._sockets.Connection(self._context, address, self._here, robot, queued=QUEUED)
+        self._peers[robot].mend()
+        self._sockets.send(self._peers[robot].socket, content)
 
     def receive(self) -> list[bytes]:
         """What other robots have sent."""
+        if self._now.look():
+            self._gate.know(self._now.here.keys)  # who counts no more is refused now; the door is made anew at the next turn
         self._gate.serve()
         found: list[bytes] = []
-        while len(found) < TURN_MAX and (message := self._sockets.receive(self._listening)) is not None:
-            found.append(message[1])
+        for _ in range(TURN_MAX):
+            if (message := self._sockets.receive(self._listening)) is None:
+                break
+            if self._gate.owner(message[2]):
+                found.append(message[1])
         return found
 
     def close(self) -> None:
         """Let another process be the door."""
+        for connection in self._peers.values():
+            connection.close()
         self._sockets.close(self._context)

@@ -17,6 +17,7 @@ this user may read, no driver opens a port.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 from pathlib import Path
@@ -32,7 +33,7 @@ from failover.config import team as team_file
 from failover.config.team import Team, split_address
 from failover.core.naming import worlds
 from failover.core.naming.tree import Claims
-from failover.errors import DriverError, TeamFileError
+from failover.errors import DriverError, FailoverError, TeamFileError
 
 DIRECTORY: Final = "FAILOVER_DRIVERS"
 TEAM: Final = "FAILOVER_TEAM"
@@ -70,11 +71,6 @@ class Here(Struct, frozen=True):
     world: str = ""
 
     @property
-    def public(self) -> str:
-        """This robot's public key."""
-        return self.team.robots[self.robot].public_key if self.team is not None else ""
-
-    @property
     def host(self) -> str:
         """The address at which other robots reach this one."""
         return host_and_port(self.team, self.robot)[0] if self.team is not None else ""
@@ -89,6 +85,12 @@ class Here(Struct, frozen=True):
     def claims(self) -> Claims:
         """Which paths belong to which robot."""
         return Claims(frozenset(self.team.robots)) if self.team is not None else Claims()
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """Public key, Z85 → the member that it proves. A member that replaces its key has two for a while."""
+        members = self.team.robots.items() if self.team is not None else ()
+        return {key: name for name, robot in members for key in robot.keys}
 
     def file(self, path: str, ending: str) -> Path:
         """A driver's file."""
@@ -107,7 +109,7 @@ def here() -> Here:
     place = Path(os.environ.get(TEAM) or SYSTEM_TEAM)
     world = worlds.checked(os.environ.get(worlds.VARIABLE, ""))
     try:
-        return replace(_of_team(directory, place), world=world)
+        return replace(_of_team(directory, place, os.environ.get(ROBOT) or _robot_of(place)), world=world)
     except (TeamFileError, OSError) as error:
         if os.environ.get(TEAM):
             raise DriverError(f"cannot use the team that {TEAM} names: {error}") from error
@@ -115,14 +117,53 @@ def here() -> Here:
         return Here(os.environ.get(ROBOT) or this_robot(), directory, alone=alone, rules=place, world=world)
 
 
-def _of_team(directory: Path, place: Path) -> Here:
+def _of_team(directory: Path, place: Path, robot: str) -> Here:
     team = team_file.read(place)
-    robot = os.environ.get(ROBOT) or _robot_of(place)
     if robot not in team.robots:
         raise TeamFileError(f"{place} has no robot {robot!r}; {ROBOT} says which one this is")
     if not all(one.public_key for one in team.robots.values()):
         raise TeamFileError(f"the team in {place} is one without keys; enrol its robots with keys")
     return Here(robot, directory, team, team_file.read_secret_key(place, robot), rules=place)
+
+
+class TeamNow:
+    """This robot and its team as the files have them now; used by one thread.
+
+    Members come and go, and keys are replaced, while drivers run: the agents write the files, and no driver is told.
+
+    Attributes:
+        here: as it was at the last look. What cannot be read, or has no place for this robot, changes nothing.
+    """
+
+    def __init__(self, here: Here) -> None:
+        self.here = here
+        files = (here.rules / team_file.TEAM_FILE, team_file.secret_key_path(here.rules, here.robot))
+        self._files = tuple(map(os.fspath, files))
+        self._stamps: tuple[tuple[int, ...], ...] = ()
+
+    def look(self) -> bool:
+        """Whether members or keys are others than at the last look; a microsecond or two where no file has changed."""
+        before = self.here
+        if before.team is None:
+            return False
+        stamps = tuple(map(_stamp, self._files))
+        if stamps == self._stamps:
+            return False
+        self._stamps = stamps
+        with contextlib.suppress(FailoverError, OSError):
+            found = _of_team(before.directory, before.rules, before.robot)
+            if found.team is not None and found.team.team == before.team.team:
+                self.here = replace(before, team=found.team, secret=found.secret)
+        return (self.here.team, self.here.secret) != (before.team, before.secret)
+
+
+def _stamp(path: str) -> tuple[int, ...]:
+    """By which a file is told from the one that takes its place."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def _robot_of(place: Path) -> str:

@@ -16,7 +16,7 @@ from failover.core.naming.records import Record
 from failover.core.naming.scan import MULTICAST, Scan, Send, Terms
 from failover.core.naming.tree import Place, Reach, Tree, robot_of
 from failover.drivers.exchange import DOOR_RETRY_NS, ENDING, Exchange
-from failover.drivers.here import Here, stem
+from failover.drivers.here import Here, TeamNow, stem
 from failover.errors import NameFormatError
 
 BOOT_SHIFT: Final = 20
@@ -39,6 +39,14 @@ def new_boot() -> int:
         return _last_boot
 
 
+TEAM_LOOK_NS: Final = 1_000_000_000
+"""Between two looks at the team's files."""
+
+
+def _seeds(here: Here) -> list[str]:
+    return [f"{robot}/" for robot in here.others]
+
+
 class NameService:
     """Registers what a process speaks for as long as it is open. `resolve` and `tree` may be called from any thread."""
 
@@ -49,9 +57,11 @@ class NameService:
         terms: Terms = Terms(),  # noqa: B008  frozen
         epoch: Callable[[], int] = lambda: 0,
         others: Sequence[Record] = (),
+        changed: Callable[[], None] = lambda: None,
     ) -> None:
         """
         Args:
+            changed: called when members or keys of the team are others.
             epoch: of the primacy under which the driver runs now; 0 without an agent.
             others: what else this process speaks for.
 
@@ -61,6 +71,8 @@ class NameService:
         """
         name = stem(record.path, here.directory)
         self._exchange = Exchange(here, f"{name}.{ENDING}")
+        self._now = TeamNow(here)
+        self._changed = changed
         self._lock = threading.Lock()
         self._skew = boottime.skew_ns()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -74,7 +86,7 @@ class NameService:
             new_boot(),
             self._now_ns(),
             address=self._exchange.address,
-            seeds=[f"{robot}/" for robot in here.others],
+            seeds=_seeds(here),
             multicast=True,
             terms=terms,
             claims=here.claims,
@@ -134,8 +146,9 @@ class NameService:
     def _serve(self) -> None:
         while not self._is_over:
             now_ns = self._now_ns()
+            self._look()
             self._exchange.be_door(now_ns)
-            self._turn(now_ns, now_ns + DOOR_RETRY_NS)
+            self._turn(now_ns, now_ns + (DOOR_RETRY_NS if self._now.here.team is None else TEAM_LOOK_NS))
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
         with self._lock:
@@ -160,6 +173,15 @@ class NameService:
         self._find_rival()
         if messages and self._exchange.is_door:
             self._pass_on()
+
+    def _look(self) -> None:
+        """Go on with the team as its files have it now."""
+        if self._now.look():
+            with self._lock:
+                self._scan.know(_seeds(self._now.here), self._now.here.claims)
+                self._scan.soon(self._now_ns())
+            self._exchange.know(self._now.here)
+            self._changed()
 
     def _renew(self, now_ns: int) -> None:
         """Tell the epoch under which the driver runs on, if it is another one."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from failover.boards import boottime
 from failover.core.naming.tree import Place
-from failover.drivers.here import Here
+from failover.drivers.here import Here, TeamNow
 from failover.drivers.local import SCHEME, LocalWay
 from failover.drivers.lookup import lookup
 from failover.errors import DriverError, FailoverError
@@ -28,7 +28,7 @@ class Route:
         Raises:
             DriverError: the driver is on another robot that cannot be reached.
         """
-        self.here = here
+        self._now = TeamNow(here)
         self.path = place.record.path
         self.place = place
         self.address = address_of(here, place)
@@ -42,10 +42,12 @@ class Route:
     def look_again(self, limit_ns: int = LOOK_NS) -> bool:
         """The driver does not answer: it may have been started anew, at another address; whether it was. Then the way is new."""
         with contextlib.suppress(*_may_pass()):  # it is waited for where it was
-            place = lookup(self.here, self.path, min(limit_ns, LOOK_NS))
-            address = address_of(self.here, place)
+            self._now.look()
+            here = self._now.here
+            place = lookup(here, self.path, min(limit_ns, LOOK_NS))
+            address = address_of(here, place)
             if address != self.address:
-                way = way_to(self.here, address, place.robot)
+                way = way_to(here, address, place.robot)
                 self.way.close()
                 self.place, self.address, self.way = place, address, way
                 return True

@@ -17,7 +17,6 @@ import msgspec
 from msgspec import Struct
 
 from failover.boards import boottime
-from failover.config.team import Team
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.by_hand import Typed
 from failover.core.messaging.envelope import Encoding, Envelope, Fault
@@ -32,9 +31,9 @@ from failover.drivers.actor import Actor, Whose
 from failover.drivers.call_rights import CallRights
 from failover.drivers.carried_out import CarriedOut
 from failover.drivers.declare import Declaration, declaration_of
-from failover.drivers.here import Here, here, hold, stem
+from failover.drivers.here import Here, TeamNow, here, hold, stem
 from failover.drivers.name_service import NameService
-from failover.errors import EnvelopeError, NotCommittedError
+from failover.errors import DriverError, EnvelopeError, NotCommittedError
 from failover.fencing.epoch import epoch
 from failover.kept_state.component import kept_of
 
@@ -65,9 +64,10 @@ log = logging.getLogger("failover.drivers")
 
 
 class Peer(Struct, frozen=True):
-    """One of another robot, by ZeroMQ's name for its connection."""
+    """One of another robot, by ZeroMQ's name for its connection. ``key``: with which that was made, Z85."""
 
     identity: bytes
+    key: str
 
 
 class Near(Struct, frozen=True):
@@ -139,6 +139,7 @@ class Serving:
         """
         declaration = declaration_of(cls)
         self.here = place or here()
+        self._now = TeamNow(self.here)
         self._epoch, self._epoch_told = epoch, 0
         self._name = stem(declaration.path, self.here.directory)
         self._skew = boottime.skew_ns()
@@ -158,7 +159,7 @@ class Serving:
             self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             stack.callback(os.close, self._wake)
             self._open(declaration, stack)
-            self.service = NameService(self.here, self.record_of(declaration), terms, epoch, self._others())
+            self.service = NameService(self.here, self.record_of(declaration), terms, epoch, self._others(), self.wake)
             stack.callback(self.service.close)
             self.instance, self._actor = self._made(cls, declaration, f"{self.here.robot}/{self._name}")
             self._actor.fence = self._fence
@@ -199,7 +200,7 @@ class Serving:
         self._addresses = [f"{local.SCHEME}{calls}"]
         self._team: sockets.Socket | None = None
         if self.here.team is not None:
-            self._open_team(self.here.team, stack)
+            self._open_team(stack)
         for file, accept in ((calls, self._accept_near), (hand, self._accept_hand)):
             listener = local.listen(file)
             stack.callback(file.unlink, missing_ok=True)
@@ -207,17 +208,17 @@ class Serving:
             self._wait_for(listener.fileno(), functools.partial(accept, listener))
         self._addresses.append(f"unix://{hand}")
 
-    def _open_team(self, team: Team, stack: contextlib.ExitStack) -> None:
+    def _open_team(self, stack: contextlib.ExitStack) -> None:
         """ZeroMQ, with its thread, only where other robots may call."""
         from failover.drivers import sockets
 
         self._sockets = sockets
         context = sockets.context()
         stack.callback(sockets.close, context, LINGER_MS)
-        self._gate = sockets.Gate(context, {name: robot.public_key for name, robot in team.robots.items()})
+        self._gate = sockets.Gate(context, self.here.keys)
         self._team, address = sockets.listen_team(context, self.here)
         self._addresses.append(address)
-        self._wait_for(self._gate.socket.fileno(), self._gate.serve)
+        self._wait_for(self._gate.socket.fileno(), self._admit)
         self._wait_for(self._team.fileno(), self._take_team)
 
     def _wait_for(self, descriptor: int, read: Callable[[], None]) -> None:
@@ -325,6 +326,7 @@ class Serving:
     def _woken(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._wake)
+        self._look_at_team()
 
     def _hear_kept(self, keeping: Keeping) -> None:
         try:
@@ -333,12 +335,32 @@ class Serving:
             log.warning("%s", error)
             self._close(keeping.fileno())
 
+    def _admit(self) -> None:
+        """Who connects has perhaps come into the team, or has another key, just now."""
+        self._look_at_team()
+        self._gate.serve()
+
+    def _look_at_team(self) -> None:
+        """Go on with the members and keys that the team has now."""
+        before = self._now.here
+        if not self._now.look():
+            return
+        here = self.here = self._now.here
+        self._gate.know(here.keys)
+        if self._team is not None and here.secret != before.secret:
+            try:
+                self._sockets.prove_anew(self._team, here)
+            except DriverError as error:
+                log.error("%s; start this driver anew", error)
+
     def _take_team(self) -> None:
         """One message of another robot, if one has come; `_wait_ns` takes those behind it."""
         assert self._team is not None
         if (message := self._sockets.receive(self._team)) is not None:
-            identity, content, robot = message
-            self._came(content, Peer(identity), robot)
+            identity, content, key = message
+            self._look_at_team()
+            if robot := self._gate.owner(key):
+                self._came(content, Peer(identity, key), robot)
 
     def _accept_near(self, listener: socket.socket) -> None:
         with contextlib.suppress(OSError):
@@ -438,6 +460,8 @@ class Serving:
         if isinstance(whose, Hand):
             return self._write(whose, content + b"\n")
         assert isinstance(whose, Peer)
+        if not self._gate.owner(whose.key):
+            return False
         return self._team is not None and self._sockets.answer(self._team, whose.identity, content)
 
     # --- By hand ----------------------------------------------------------------------------------------------------------

@@ -1,13 +1,16 @@
 """ZeroMQ for programs: messages between robots, by CURVE alone. The only ``zmq`` import of ``failover``.
 
-A server with CURVE and without an answer to ZAP admits any key: `Gate` answers, and admits only the keys of the team file. No
-socket sends ZMTP heartbeats: one that comes while the receive queue is full ends the process (libzmq issue 4767).
+A server with CURVE and without an answer to ZAP admits any key: `Gate` answers, and admits only the keys of the team file. ZeroMQ
+asks once, when a connection is made, and notes the key with each message: whose that is now is looked up then. No socket sends
+ZMTP heartbeats: one that comes while the receive queue is full ends the process (libzmq issue 4767).
 
 Source: rfc.zeromq.org/spec/25 (CURVE), /27 (ZAP); zmq_setsockopt(3).
 """
 
 from __future__ import annotations
 
+import contextlib
+import time
 from collections.abc import Mapping
 from typing import Final
 
@@ -15,7 +18,7 @@ import zmq
 from zmq.utils import z85
 
 from failover.core.messaging.envelope import MESSAGE_SIZE_MAX
-from failover.drivers.here import Here
+from failover.drivers.here import Here, TeamNow
 from failover.errors import DriverError
 
 HIGH_WATER: Final = 1_000
@@ -28,6 +31,9 @@ RETRANSMIT_LIMIT_MS: Final = 3_000
 """A connection whose bytes stay unacknowledged so long is dead (TCP_USER_TIMEOUT)."""
 
 HANDSHAKE_LIMIT_MS: Final = 5_000
+
+LISTEN_TRIES: Final = 400
+LISTEN_PAUSE_S: Final = 0.005
 
 ONE_TIME_LIMIT_MS: Final = 30_000
 """The handshake of an invitation: it happens once, on machines that may be starting, and a failure costs a person's time."""
@@ -78,28 +84,86 @@ def listen_team(context: Context, here: Here, port: int = 0) -> tuple[Socket, st
     return socket, socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 
-def connect(context: Context, address: str, here: Here, robot: str, *, queued: int = 0) -> Socket:
-    """A way to one process.
+def prove_anew(socket: Socket, here: Here) -> None:
+    """Listen at the same address with this robot's key as it is now. Connections that stand are not touched.
 
-    Args:
-        address: ``tcp://HOST:PORT`` of that robot.
-        queued: so many messages wait while there is no connection; 0: what is sent then is refused.
+    Raises:
+        DriverError: the address was taken meanwhile.
     """
-    socket = _limited(context.socket(zmq.DEALER))
-    if queued:
-        socket.setsockopt(zmq.SNDHWM, queued)
-    else:
-        socket.setsockopt(zmq.IMMEDIATE, 1)
-    socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
-    socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
-    if here.team is None or robot not in here.team.robots:
-        socket.close(0)
-        raise DriverError(f"cannot reach {address}: {here.alone or f'{robot} is not in team.toml'}")
-    socket.curve_publickey = here.public.encode()
+    address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+    socket.unbind(address)
     socket.curve_secretkey = here.secret.encode()
-    socket.curve_serverkey = here.team.robots[robot].public_key.encode()
-    socket.connect(address)
-    return socket
+    for _ in range(LISTEN_TRIES):  # ZeroMQ lets an address go some time after it was told to
+        with contextlib.suppress(zmq.ZMQError):
+            socket.bind(address)
+            return
+        time.sleep(LISTEN_PAUSE_S)
+    raise DriverError(f"cannot listen at {address} with another key: another program has taken it meanwhile")
+
+
+class Connection:
+    """A way to one process of another robot. It is made anew where keys have changed, and where a handshake failed.
+
+    Attributes:
+        socket: the same for as long as this lives.
+    """
+
+    def __init__(self, context: Context, address: str, here: Here, robot: str, *, queued: int = 0) -> None:
+        """
+        Args:
+            address: ``tcp://HOST:PORT`` of that robot.
+            queued: so many messages wait while there is no connection; 0: what is sent then is refused.
+
+        Raises:
+            DriverError: the keys of this robot or of that one are not here.
+        """
+        self._address, self._robot = address, robot
+        self._secret, self._keys = here.secret, _keys_of(here, robot)
+        if not self._keys:
+            raise DriverError(f"cannot reach {address}: {here.alone or f'{robot} is not in team.toml'}")
+        self.socket = _limited(context.socket(zmq.DEALER))
+        if queued:
+            self.socket.setsockopt(zmq.SNDHWM, queued)
+        else:
+            self.socket.setsockopt(zmq.IMMEDIATE, 1)
+        self.socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
+        self.socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
+        self._monitor = self.socket.get_monitor_socket(HANDSHAKE_FAILED)
+        self._connect()
+
+    def know(self, here: Here) -> None:
+        """Go on with these keys; one who is no member any more is not connected to anew."""
+        secret, keys = here.secret, _keys_of(here, self._robot)
+        if (secret, set(keys)) != (self._secret, set(self._keys)):
+            self._secret, self._keys = secret, keys
+            self._connect()
+
+    def mend(self) -> None:
+        """A handshake has failed: ZeroMQ does not try again where our key was refused, and the peer may use its other one."""
+        if has_message(self._monitor):
+            self._keys = (*self._keys[1:], *self._keys[:1])
+            self._connect()
+
+    def _connect(self) -> None:
+        with contextlib.suppress(zmq.ZMQError):  # the first time there is nothing to end
+            self.socket.disconnect(self._address)
+        while has_message(self._monitor):
+            self._monitor.recv_multipart()
+        if self._keys:
+            self.socket.curve_publickey = zmq.curve_public(self._secret.encode())
+            self.socket.curve_secretkey = self._secret.encode()
+            self.socket.curve_serverkey = self._keys[0].encode()
+            self.socket.connect(self._address)
+
+    def close(self) -> None:
+        """Watch no more; the socket goes with its context."""
+        self.socket.disable_monitor()
+        self._monitor.close(0)
+
+
+def _keys_of(here: Here, robot: str) -> tuple[str, ...]:
+    member = here.team.robots.get(robot) if here.team is not None else None
+    return member.keys if member is not None else ()
 
 
 def has_message(socket: Socket) -> bool:
@@ -108,7 +172,7 @@ def has_message(socket: Socket) -> bool:
 
 
 def receive(socket: Socket) -> tuple[bytes, bytes, str] | None:
-    """The next message of a listening socket: (whose, content, robot that its key proves); None: there is none.
+    """The next message of a listening socket: (whose, content, key of its sender, Z85); None: there is none.
 
     A message of several parts is dropped: nothing of ours sends one.
     """
@@ -158,13 +222,20 @@ class TeamWay:
         Raises:
             DriverError: the team's keys are not here.
         """
+        self._now = TeamNow(here)
         self._context = context()
         self._limit_ms = -1
         try:
-            self._socket = connect(self._context, address, here, robot)
+            self._connection = Connection(self._context, address, here, robot)
         except DriverError:
             close(self._context)
             raise
+        self._socket = self._connection.socket
+
+    def _renew(self) -> None:
+        if self._now.look():
+            self._connection.know(self._now.here)
+        self._connection.mend()
 
     @property
     def closed(self) -> bool:
@@ -173,6 +244,7 @@ class TeamWay:
 
     def send(self, content: bytes) -> bool:
         """Send at once; False: there is no connection, or its queue is full."""
+        self._renew()
         return send(self._socket, content)
 
     def await_sent(self, content: bytes, timeout_ns: int) -> bool:
@@ -186,6 +258,7 @@ class TeamWay:
 
     def await_open(self, timeout_ns: int, wake: int) -> bool:
         """Whether there is a connection within the time; ``wake``: a descriptor that ends the wait, too."""
+        self._renew()
         return bool(self._ready(zmq.POLLOUT, timeout_ns, wake) & zmq.POLLOUT)
 
     def _ready(self, events: int, timeout_ns: int, wake: int) -> int:
@@ -210,6 +283,8 @@ class TeamWay:
 
     def close(self, linger_ms: int = 0) -> None:
         """Let it go, after so many ms in which what was sent may leave."""
+        if not self.closed:
+            self._connection.close()
         self._context.destroy(linger=linger_ms)
 
 
@@ -230,7 +305,7 @@ class OneTimeListener:
         self._socket.curve_server = True
         self._socket.curve_secretkey = z85.encode(secret)
         self._socket.zap_domain = ZAP_DOMAIN
-        self._gate = Gate(self._context, {robot: _public(admitted).decode()})
+        self._gate = Gate(self._context, {_public(admitted).decode(): robot})
         try:
             _bound(self._socket, f"tcp://{bracketed(host)}:{port or '*'}")
         except DriverError:
@@ -312,12 +387,20 @@ class Gate:
     def __init__(self, context: Context, keys: Mapping[str, str]) -> None:
         """
         Args:
-            keys: robot → public key, Z85.
+            keys: public key, Z85 → robot.
         """
-        self._robots = {z85.decode(key.encode()): robot for robot, key in keys.items()}
+        self._robots = keys
         self.socket = context.socket(zmq.REP)
         self.socket.bind(ZAP_ADDRESS)
         self.refused = 0
+
+    def know(self, keys: Mapping[str, str]) -> None:
+        """From now on these count, also on connections that stand."""
+        self._robots = keys
+
+    def owner(self, key: str) -> str:
+        """The robot that a key proves; "" for none."""
+        return self._robots.get(key, "")
 
     def serve(self) -> None:
         """Answer what was asked; to be called when `socket` can be read."""
@@ -326,9 +409,10 @@ class Gate:
                 version, request, _domain, _address, _identity, mechanism, *credentials = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            robot = self._robots.get(credentials[0], "") if mechanism == b"CURVE" and credentials else ""
+            key = z85.encode(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else b""
+            robot = self.owner(key.decode())
             self.refused += not robot
-            status = (b"200", b"OK", robot.encode()) if robot else (b"400", b"this key is not in team.toml", b"")
+            status = (b"200", b"OK", key) if robot else (b"400", b"this key is not in team.toml", b"")
             self.socket.send_multipart([version, request, *status, b""])
 
 

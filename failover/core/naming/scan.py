@@ -183,6 +183,13 @@ class Scan:
         self._tree: tuple[int, dict[str, Reach], Tree] | None = None
         self._changes = 0
 
+    def know(self, seeds: Iterable[str], claims: Claims) -> None:
+        """The team has other members now."""
+        self._seeds = frozenset(seeds)
+        if claims != self.claims:
+            self.claims = claims
+            self._changes += 1
+
     @property
     def own(self) -> Table:
         """What this process says itself."""

@@ -86,11 +86,15 @@ class Lab:
         """That robot, as its programs see it."""
         directory = self.folder / robot
         directory.mkdir(mode=0o700, exist_ok=True)
-        return Here(robot, directory, self.team, secret or self.secrets[robot])
+        return Here(robot, directory, self.team, secret or self.secrets[robot], rules=self.place(robot))
+
+    def place(self, robot: str) -> Path:
+        """Where the team's files lie on that robot, if they were written."""
+        return self.folder / f"{robot}-team"
 
     def write(self, robot: str) -> Path:
         """The team's files, as they lie on that robot."""
-        place = self.folder / f"{robot}-team"
+        place = self.place(robot)
         write(place, self.team)
         write_secret_key(place, robot, self.secrets[robot])
         return place

@@ -371,11 +371,11 @@ def test_an_order_counts_by_the_way_it_came_also_when_that_way_is_forgotten(lab:
         def sentence(whose: Peer | Near) -> str:
             found = host.actor.came(order, whose, host.now_ns())
             for number in range(SENDERS_MAX + 1):
-                host.actor.came(Envelope("nobody", sender=f"robot2/{number}"), Peer(b"x"), host.now_ns())
+                host.actor.came(Envelope("nobody", sender=f"robot2/{number}"), Peer(b"x", ""), host.now_ns())
             answers = [*found, *host.actor.handle(host.now_ns)]
             return next(one.error.sentence for one in answers if one.re == "order")  # type: ignore[union-attr]
 
-        assert sentence(Peer(b"x")) == "give this order on the robot itself: robot2/x is on another one"
+        assert sentence(Peer(b"x", "")) == "give this order on the robot itself: robot2/x is on another one"
         assert "uid 54321 is neither" in sentence(Near(9, 1, 54_321))
         assert "cannot be rolled back" in sentence(Near(9, 2, os.geteuid()))
 
