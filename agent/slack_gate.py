@@ -24,7 +24,7 @@ from checkpoint.keeper.messages import Slack
 from failover.boards import boottime, futex, locks
 from failover.boards.fence import FENCE
 from failover.boards.openings import Opening, openings_of
-from failover.boards.schedule_file import ScheduleFile
+from failover.boards.unmapped_schedule import UnmappedSchedule
 from failover.core.schedule import layout
 from failover.core.schedule.activation import State
 from failover.core.schedule.layout import CPU_LOCKS, SETTLED_FIELD
@@ -51,7 +51,7 @@ class SlackGate:
     def __init__(self) -> None:
         self._skew_ns = boottime.skew_ns("monotonic")
         self._freezes = Freezes()
-        self._file: ScheduleFile | None = None
+        self._file: UnmappedSchedule | None = None
         self._rows: tuple[int, ...] = ()
         self._cpus: tuple[int, ...] = ()
         self._looked_ns = 0
@@ -106,9 +106,10 @@ class SlackGate:
 
     # --- The wait ---
 
-    def _opens(self, file: ScheduleFile, wait: Wait, until_ns: int) -> bool:
+    def _opens(self, file: UnmappedSchedule, wait: Wait, until_ns: int) -> bool:
         base = file.address(0)
         while True:
+            file.refresh(self._rows)
             ends = {row: file.table.ints[(layout.row_at(row) + SETTLED_FIELD) // 4] for row in self._rows}
             if FENCE is not None:
                 FENCE()
@@ -128,20 +129,18 @@ class SlackGate:
             futex.wait_until(base + layout.row_at(row) + SETTLED_FIELD, ends[row], min(next_ns, until_ns) + self._skew_ns)
 
     @contextlib.contextmanager
-    def _listening(self, file: ScheduleFile) -> Iterator[None]:
+    def _listening(self, file: UnmappedSchedule) -> Iterator[None]:
         """The ends of activations wake us."""
         if not file.is_writable:
             yield  # others' file: they do not wake us, and we look each slice
             return
-        for row in self._rows:
-            layout.set_listening(file.table, row, True)
+        file.write(layout.listening_piece(row, True) for row in self._rows)
         try:
             yield
         finally:
-            for row in self._rows:
-                layout.set_listening(file.table, row, False)
+            file.write(layout.listening_piece(row, False) for row in self._rows)
 
-    def _lock(self, file: ScheduleFile) -> bool:
+    def _lock(self, file: UnmappedSchedule) -> bool:
         """Have the processors of the program, all or none."""
         if not file.is_writable:
             return True
@@ -151,7 +150,7 @@ class SlackGate:
                 return False
         return True
 
-    def _unlock(self, file: ScheduleFile, cpus: tuple[int, ...]) -> None:
+    def _unlock(self, file: UnmappedSchedule, cpus: tuple[int, ...]) -> None:
         if file.is_writable:
             for cpu in cpus:
                 locks.give(file.descriptor, CPU_LOCKS + cpu)
@@ -159,8 +158,9 @@ class SlackGate:
     def _now_ns(self) -> int:
         return boottime.now_monotonic_ns() - self._skew_ns
 
-    def _first_due(self, file: ScheduleFile) -> tuple[str, int]:
+    def _first_due(self, file: UnmappedSchedule) -> tuple[str, int]:
         """Name and period of the task that a longer freeze would delay first."""
+        file.refresh(self._rows)
         row = min(self._rows, key=lambda one: layout.read_live(file.table, one).due_ns or 1 << 63)
         period_ns = 0
         with contextlib.suppress(FailoverError):  # its own program reports a damaged row
@@ -183,9 +183,10 @@ class SlackGate:
             self._rows = tuple(sorted({row for opening in openings for row in opening.rows}))
             self._cpus = self._processors(self._file, {opening.pid for opening in openings})
 
-    def _processors(self, file: ScheduleFile, pids: set[int]) -> tuple[int, ...]:
+    def _processors(self, file: UnmappedSchedule, pids: set[int]) -> tuple[int, ...]:
         """Those on which its tasks run: as they are declared, else as the kernel has it."""
         declared = 0
+        file.refresh(self._rows)
         for row in self._rows:
             with contextlib.suppress(FailoverError):
                 declared |= layout.read_terms(file.table, row)[1].cpus
@@ -208,12 +209,14 @@ def gate() -> SlackGate:
     return SlackGate()
 
 
-def _seen(file: ScheduleFile, row: int) -> TaskSeen:
+def _seen(file: UnmappedSchedule, row: int) -> TaskSeen:
     """A task between two of its stores; one that cannot be read so is taken for one that runs."""
     for _ in range(READINGS):
+        file.refresh((row,))
         before = layout.read_pulse(file.table, row)
         if FENCE is not None:
             FENCE()
+        file.refresh((row,))
         if layout.read_pulse(file.table, row) == before:
             state, _, due_ns, ended_ns = before
             return TaskSeen(state == State.RUNNING, ended_ns, None if state in UNKNOWN else due_ns)
@@ -225,7 +228,7 @@ def _next_to_end(tasks: dict[int, TaskSeen]) -> int:
     return min(tasks, key=lambda row: (not tasks[row].is_running, tasks[row].due_ns or 1 << 63))
 
 
-def _opened(opening: Opening) -> ScheduleFile | None:
+def _opened(opening: Opening) -> UnmappedSchedule | None:
     """The very file that a process has open, whatever its name leads to by now; None: it cannot be used."""
     try:
         if not stat.S_ISREG(os.stat(opening.path).st_mode):
@@ -242,7 +245,7 @@ def _opened(opening: Opening) -> ScheduleFile | None:
             raise ValueError("it is too short")
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if is_writable else 0)
         area = mmap.mmap(descriptor, layout.FILE_SIZE, mmap.MAP_SHARED, protection)
-        return ScheduleFile(Path(opening.path), area, is_writable, descriptor, (found.st_dev, found.st_ino))
+        return UnmappedSchedule(Path(opening.path), area, is_writable, descriptor, (found.st_dev, found.st_ino))
     except (FailoverError, OSError, ValueError):
         os.close(descriptor)
         return None

@@ -27,8 +27,8 @@ from failover.boards import LINK_NAME, SCHEDULE_NAME, SCHEDULE_PLACE, agents_fil
 from failover.boards.agents_file import AgentsFile
 from failover.boards.mapping import USER_PREFIX, uid_of
 from failover.boards.received import ReceivedItems
-from failover.boards.schedule_file import ScheduleFile
 from failover.boards.unmapped_file import UnmappedFile
+from failover.boards.unmapped_schedule import UnmappedSchedule
 from failover.core.board import layout
 from failover.core.board.announcements import first_number
 from failover.core.board.item_types import ITEM_SIZE_MAX
@@ -245,7 +245,7 @@ class _Files:
         """Keep the table of this robot's tasks if it is of this boot: its tasks go on while no agent runs."""
         path = self._place / SCHEDULE_NAME
         with contextlib.suppress(ScheduleError, FileNotFoundError):
-            file = ScheduleFile.open(path, writable=True)
+            file = UnmappedSchedule.at(path)
             header = file.header
             file.close()
             if (header.boot_id, header.robot) == (boottime.boot_id(), robot):

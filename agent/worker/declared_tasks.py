@@ -9,7 +9,7 @@ from agent.config import Settings
 from agent.task_config import declaration
 from agent.worker.board_directory import PROGRAMS_MODE, place_of
 from failover.boards import SCHEDULE_NAME, SCHEDULE_PLACE, directory
-from failover.boards.schedule_file import ScheduleFile
+from failover.boards.unmapped_schedule import UnmappedSchedule
 from failover.core.schedule import orders
 
 
@@ -27,7 +27,7 @@ def declare(settings: Settings) -> tuple[str, ...]:
     place = place_of(settings) if settings.team.board.items else Path(config.runtime_directory) / SCHEDULE_PLACE
     with contextlib.suppress(FileExistsError):
         directory.make_schedule(place, config.robot, mode=PROGRAMS_MODE)
-    file = ScheduleFile.open(place / SCHEDULE_NAME)
+    file = UnmappedSchedule.at(place / SCHEDULE_NAME)
     try:
         return file.give(lambda rows, held: orders.added(rows, found, held)).notes
     finally:

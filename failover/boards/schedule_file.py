@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import ClassVar
 
 from failover.boards import futex, locks
 from failover.boards.shared_file import SharedFile
 from failover.core.schedule import layout
-from failover.core.schedule.layout import ROW_LOCKS, Header, View
+from failover.core.schedule.layout import ROW_LOCKS, Header, Piece, View
 from failover.core.schedule.orders import Outcome, Rows
 from failover.core.schedule.terms import TASKS_MAX
 from failover.errors import FailoverError, ScheduleError, ScheduleGoneError
@@ -77,10 +77,14 @@ class ScheduleFile(SharedFile):
             held = frozenset(index for index in rows if index == own or self.is_run(index))
             outcome = order(rows, held)
             for index, row in outcome.written.items():
-                layout.apply(self.table, layout.row_pieces(self.table, index, row, rows.get(index)))
-            layout.apply(self.table, layout.successors_pieces({**rows, **outcome.written}))
+                self.write(layout.row_pieces(self.table, index, row, rows.get(index)))
+            self.write(layout.successors_pieces({**rows, **outcome.written}))
         self._wake(outcome)
         return outcome
+
+    def write(self, pieces: Iterable[Piece]) -> None:
+        """Write pieces in their order."""
+        layout.apply(self.table, pieces)
 
     def _wake(self, outcome: Outcome) -> None:
         """Wake the tasks that sleep on their own row, or on a predecessor's."""

@@ -135,12 +135,15 @@ class SharedFile:
         with locks.table(self.descriptor, f"cannot change {self.path}", self.ERROR, patience_s):
             generation = self.read_header().generation
             generation += generation % 2  # an odd one: the process that changed the table has died
-            self.words[GENERATION] = generation + 1
+            self._set_generation(generation + 1)
             try:
                 yield
             finally:
                 if not self.is_gone:
-                    self.words[GENERATION] = generation + 2
+                    self._set_generation(generation + 2)
+
+    def _set_generation(self, generation: int) -> None:
+        self.words[GENERATION] = generation
 
     def mend(self) -> None:
         """Make the generation even if the process that was to do it has died."""

@@ -120,6 +120,43 @@ def test_the_wait_for_an_end_leaves_no_flag_behind(steady: subprocess.Popen[str]
     file.close()
 
 
+SHORTENED = """
+import os, sys
+from agent import slack_gate
+gate, pid = slack_gate.gate(), int(sys.argv[1])
+def captured():
+    gate.begin(5_000_000_000)
+    while not gate.opens((pid,)):
+        pass
+    gate.closes(stood_still=True)
+    return gate.outcome
+assert captured().task == "steady"
+os.truncate(sys.argv[2], int(sys.argv[3]))
+gate.begin(5_000_000_000)
+gate.opens((pid,))
+gate.closes(stood_still=True)
+captured()
+print("captured")
+"""
+
+
+@pytest.mark.parametrize("size", [0, layout.row_at(0), layout.FILE_SIZE // 2])
+def test_who_makes_the_schedule_shorter_ends_no_keeper(steady: subprocess.Popen[str], place: Path, size: int) -> None:
+    """The kernel would end it by SIGBUS, if it touched the mapping."""
+    command = [sys.executable, "-c", SHORTENED, str(steady.pid), str(place / SCHEDULE_NAME), str(size)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (0, "captured\n"), ran.stderr
+
+
+def test_it_waits_no_more_for_the_end_of_an_activation_once_the_schedule_is_shorter(place: Path) -> None:
+    with process(BUSY, place) as child:
+        gate = slack_gate.gate()
+        gate.begin(LAG_NS)
+        assert not gate.opens((child.pid,)), "it runs"
+        os.truncate(place / SCHEDULE_NAME, 0)
+        assert gate.opens((child.pid,))
+
+
 def test_a_program_without_tasks_is_captured_at_once(place: Path) -> None:
     with process(IDLE, place) as child:
         assert captured(slack_gate.gate(), child.pid) is None

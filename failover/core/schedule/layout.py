@@ -8,6 +8,7 @@ table.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from typing import Final
 
 from msgspec import Struct, field
@@ -208,9 +209,9 @@ def is_awaited(view: View, index: int) -> bool:
     return view.ints[(at + SUCCESSORS_FIELD) // 4] != 0 or view.ints[(at + LISTENERS_FIELD) // 4] != 0
 
 
-def set_listening(view: View, index: int, listens: bool) -> None:
+def listening_piece(index: int, listens: bool) -> Piece:
     """A capture waits for the end of a task's activation, or does not any more; written by the one process that captures it."""
-    view.ints[(row_at(index) + LISTENERS_FIELD) // 4] = listens
+    return row_at(index) + LISTENERS_FIELD, HALF.pack(listens)
 
 
 def read_terms(view: View, index: int) -> tuple[int, Terms]:
@@ -437,7 +438,7 @@ def count(view: View, index: int, field: int, duration_ns: int) -> None:
     view.ints[place] = view.ints[place] + 1 & LOW_HALF
 
 
-def apply(view: View, pieces: list[Piece]) -> None:
+def apply(view: View, pieces: Iterable[Piece]) -> None:
     """Write pieces in their order; four bytes are one store."""
     for offset, octets in pieces:
         if len(octets) == HALF.size:
