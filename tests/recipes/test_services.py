@@ -1,4 +1,4 @@
-"""The recipes of docs/recipes.md for mosquitto, gpsd and MAVProxy, with the real programs; serial lines are pseudo-terminals."""
+"""The recipes of docs/recipes.md for mosquitto, gpsd and MAVLink routers, with the real programs; lines are pseudo-terminals."""
 
 from __future__ import annotations
 
@@ -245,14 +245,24 @@ def time_told(station: socket.socket) -> int:
             return int.from_bytes(datagram[14:18], "little")
 
 
-@needs("pip install MAVProxy, its bin directory in PATH", "mavproxy.py")
-def test_a_mavlink_router_goes_on_between_its_serial_line_and_a_station(tmp_path: Path) -> None:
+MAVPROXY = "mavproxy.py --master={line} --out=udp:127.0.0.1:{port} --non-interactive --no-state --default-modules="
+MAVLINK_ROUTER = "mavlink-routerd --tcp-port 0 --endpoint 127.0.0.1:{port} {line}:115200"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(MAVPROXY, marks=needs("pip install MAVProxy, its bin directory in PATH", "mavproxy.py")),
+        pytest.param(MAVLINK_ROUTER, marks=needs("mavlink-router, built from its sources, in PATH", "mavlink-routerd")),
+    ],
+    ids=["MAVProxy", "mavlink-router"],
+)
+def test_a_mavlink_router_goes_on_between_its_serial_line_and_a_station(tmp_path: Path, command: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station, SerialLine(frames) as line:
         station.bind(("127.0.0.1", 0))
         station.settimeout(60)
-        out = f"--out=udp:127.0.0.1:{station.getsockname()[1]}"
-        quiet = ("--non-interactive", "--no-state", "--default-modules=")
-        with ended(program(tmp_path, "router", "mavproxy.py", f"--master={line.name}", out, *quiet)) as router:
+        words = command.format(line=line.name, port=station.getsockname()[1]).split()
+        with ended(program(tmp_path, "router", *words)) as router:
             before = time_told(station)
             with ended(reopened(router, line)):
                 station.setblocking(False)
