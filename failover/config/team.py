@@ -296,6 +296,8 @@ def read_secret_key(directory: Path, robot: str) -> str:
     try:
         mode = path.stat().st_mode
         secret = path.read_text().strip()
+    except UnicodeDecodeError as error:
+        raise TeamFileError(f"{path} is no key: it is not text; copy it here again from where {robot} was enrolled") from error
     except OSError as error:
         raise TeamFileError(
             f"cannot read this robot's key {path}: {error.strerror}; copy it here from where {robot} was enrolled, or make a new "
@@ -305,6 +307,8 @@ def read_secret_key(directory: Path, robot: str) -> str:
         raise TeamFileError(f"{path} is open to others (mode {mode & 0o777:o}); run: chmod 600 {path}")
     if len(secret) != KEY_CHARACTERS:
         raise TeamFileError(f"{path} holds {len(secret)} characters; a key has {KEY_CHARACTERS}")
+    if not _is_z85(secret):
+        raise TeamFileError(f"{path} is no key: it is not Z85; copy it here again, every character of it")
     return secret
 
 

@@ -17,9 +17,10 @@ this user may read, no driver opens a port.
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import os
 import stat
+import time
 from pathlib import Path
 from typing import Final
 
@@ -45,6 +46,11 @@ ADDRESS_SIZE_MAX: Final = 107
 
 LOCK_AT: Final = 0
 """The byte of a lock file that its driver holds."""
+
+RETRY_NS: Final = 1_000_000_000
+"""Between two tries to read files of the team that could not be read."""
+
+log = logging.getLogger("failover.drivers")
 
 _LONGEST_ENDING: Final = len(".names")
 _HASH_SIZE: Final = 17
@@ -140,6 +146,9 @@ class TeamNow:
         files = (here.rules / team_file.TEAM_FILE, team_file.secret_key_path(here.rules, here.robot))
         self._files = tuple(map(os.fspath, files))
         self._stamps: tuple[tuple[int, ...], ...] = ()
+        self._failed_stamps = self._stamps
+        self._retry_ns = 0
+        self._trouble = ""
 
     def look(self) -> bool:
         """Whether members or keys are others than at the last look; a microsecond or two where no file has changed."""
@@ -147,14 +156,33 @@ class TeamNow:
         if before.team is None:
             return False
         stamps = tuple(map(_stamp, self._files))
-        if stamps == self._stamps:
+        if stamps == self._stamps or (stamps == self._failed_stamps and time.monotonic_ns() < self._retry_ns):
             return False
-        self._stamps = stamps
-        with contextlib.suppress(FailoverError, OSError):
-            found = _of_team(before.directory, before.rules, before.robot)
-            if found.team is not None and found.team.team == before.team.team:
-                self.here = replace(before, team=found.team, secret=found.secret)
+        try:
+            self._read(before)
+        except (FailoverError, OSError) as error:
+            self._failed_stamps, self._retry_ns = stamps, time.monotonic_ns() + RETRY_NS
+            self._say(f"cannot read the team's present members and keys: {error}; trying again once a second")
+        else:
+            self._stamps, self._failed_stamps = stamps, ()
+            self._say("")
         return (self.here.team, self.here.secret) != (before.team, before.secret)
+
+    def _read(self, before: Here) -> None:
+        """Take the public keys first: they count, whether or not this robot's own key can be read."""
+        team = team_file.read(before.rules)
+        if before.team is not None and team.team != before.team.team:
+            raise TeamFileError(f"{self._files[0]} is of team {team.team}, and this process began in {before.team.team}")
+        if before.robot not in team.robots:
+            raise TeamFileError(f"{self._files[0]} has no robot {before.robot!r} any more; end this process")
+        self.here = replace(before, team=team)
+        self.here = replace(self.here, secret=team_file.read_secret_key(before.rules, before.robot))
+
+    def _say(self, trouble: str) -> None:
+        """Log it once, not at each try."""
+        if trouble and trouble != self._trouble:
+            log.error("%s", trouble)
+        self._trouble = trouble
 
 
 def _stamp(path: str) -> tuple[int, ...]:

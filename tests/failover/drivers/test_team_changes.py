@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import resource
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +16,7 @@ from failover.config import members, team
 from failover.config.team import Robot, Team
 from failover.core.messaging.envelope import Envelope, decode, encode
 from failover.drivers import sockets
-from failover.drivers.here import Here
+from failover.drivers.here import Here, TeamNow
 from failover.drivers.proxy import Proxy
 from tests.failover.drivers.devices import Camera, Engine
 from tests.failover.drivers.serving import Lab, called, serving, until
@@ -168,3 +171,64 @@ def test_names_are_told_on_with_other_keys(town: Town) -> None:
         until(lambda: engine.service._exchange.here.team == camera.service._exchange.here.team == town.team)
     with serving(Engine, replace_team(town, "robot1")) as engine, serving(Camera, replace_team(town, "robot2")) as camera:
         until(lambda: resolved(camera, "engine") and resolved(engine, "Lab/robot2/Camera"))
+
+
+@contextlib.contextmanager
+def no_descriptor_left() -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    first_free = os.open("/dev/null", os.O_RDONLY)
+    os.close(first_free)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (first_free, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_keys_that_could_not_be_read_for_want_of_a_descriptor_are_read_later(
+    town: Town, caplog: pytest.LogCaptureFixture
+) -> None:
+    now = TeamNow(town.here("robot1"))
+    assert not now.look()
+    town.rotates("robot2")
+    with no_descriptor_left():
+        assert not now.look() and not now.look()
+        assert now.here.team != town.team
+    (said,) = caplog.messages
+    assert "Too many open files" in said and "team.toml" in said
+    until(now.look)
+    assert now.here.team == town.team
+
+
+def test_what_others_prove_is_taken_even_if_the_own_key_cannot_be_read(town: Town, caplog: pytest.LogCaptureFixture) -> None:
+    now = TeamNow(town.here("robot1"))
+    team.secret_key_path(town.place("robot1"), "robot1").chmod(0o644)
+    town.rotates("robot2")
+    assert now.look() and not now.look()
+    assert (now.here.team, now.here.secret) == (town.team, town.secrets["robot1"])
+    (said,) = caplog.messages
+    assert "chmod 600" in said
+
+
+def test_a_member_without_a_key_keeps_no_revoked_key_of_another_one(town: Town) -> None:
+    now = TeamNow(town.here("robot1"))
+    third = Robot(("127.9.9.9:7420",), "127.9.9.9:7421")
+    town.rotates("robot2")
+    town.takes(replace(town.team, robots=town.team.robots | {"robot3": third}), "robot1")
+    assert now.look()
+    assert set(now.here.keys) == {robot.public_key for robot in town.team.robots.values()}
+
+
+@pytest.mark.parametrize("damaged", [b"\xff" * 40, b"~" * 40, b"#" * 40], ids=["no text", "no Z85", "no number of 32 bits"])
+def test_a_damaged_key_ends_no_driver(town: Town, damaged: bytes) -> None:
+    path = team.secret_key_path(town.place("robot1"), "robot1")
+    whole = path.read_bytes()
+    with serving(Engine, town.here("robot1")) as engine, called(town.here("robot2"), "engine") as proxy:
+        path.write_bytes(damaged)
+        assert reads(proxy)
+        path.write_bytes(whole)
+        town.rotates("robot1")
+        town.rotates("robot2")
+        assert reads(proxy)
+        until(lambda: engine.service._exchange.here.team == town.team)
+        assert engine.service._thread.is_alive()
