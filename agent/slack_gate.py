@@ -72,7 +72,13 @@ class SlackGate:
 
     def opens(self, pids: tuple[int, ...]) -> bool:
         """See `checkpoint.engine.Gate.opens`."""
-        now_ns = self._now_ns()
+        try:
+            return self._opens_for(pids, self._now_ns())
+        except (FailoverError, OSError):  # there is no waiting on this machine: captures go on as of any other program
+            self._wait = None
+            return True
+
+    def _opens_for(self, pids: tuple[int, ...], now_ns: int) -> bool:
         if not self._looked_ns or now_ns - self._looked_ns >= LOOK_NS or (self._file is not None and self._file.is_gone):
             self._look(pids)
             self._looked_ns = now_ns
@@ -81,12 +87,8 @@ class SlackGate:
             return True
         if self._wait is None:
             self._wait = Wait(now_ns, self._lag_ns, self._freezes.expected_ns)
-        try:
-            with self._listening(file):
-                return self._opens(file, self._wait, now_ns + SLICE_NS)
-        except FailoverError:  # there is no waiting on this machine: captures go on as of any other program
-            self._wait = None
-            return True
+        with self._listening(file):
+            return self._opens(file, self._wait, now_ns + SLICE_NS)
 
     def closes(self, *, stood_still: bool) -> None:
         """See `checkpoint.engine.Gate.closes`."""
@@ -97,12 +99,13 @@ class SlackGate:
         self._unlock(file, self._cpus)
         self._freezes.note(ended_ns - self._opened_ns if stood_still else 0)
         slack_ns = wait.slack_ns if wait.slack_ns is not None else 0
-        task, period_ns = self._first_due(file)
-        self._outcome = Slack(
-            *(task, period_ns, self._opened_ns, ended_ns, self._opened_ns - wait.asked_ns),
-            *(slack_ns, wait.freeze_ns, self._is_squeezed and stood_still),
-        )
-        self._opened_ns = 0
+        opened_ns, self._opened_ns = self._opened_ns, 0
+        with contextlib.suppress(FailoverError):  # a file that cannot be read tells of no task
+            self._outcome = Slack(
+                *self._first_due(file),
+                *(opened_ns, ended_ns, opened_ns - wait.asked_ns),
+                *(slack_ns, wait.freeze_ns, self._is_squeezed and stood_still),
+            )
 
     # --- The wait ---
 
@@ -138,7 +141,8 @@ class SlackGate:
         try:
             yield
         finally:
-            file.write(layout.listening_piece(row, False) for row in self._rows)
+            with contextlib.suppress(FailoverError):  # a flag that stays costs a program one call at each end, and no more
+                file.write(layout.listening_piece(row, False) for row in self._rows)
 
     def _lock(self, file: UnmappedSchedule) -> bool:
         """Have the processors of the program, all or none."""

@@ -6,9 +6,10 @@ is mapped for that alone: where a page was lost, the kernel refuses the call, an
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, Self
 
@@ -53,14 +54,26 @@ class UnmappedSchedule(ScheduleFile):
         self.words, self.halves = self.view.cast("Q"), self.view.cast("H")
         self.table = View(self.view)
 
+    @contextlib.contextmanager
+    def _trouble(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:  # a full file system: a file that was made shorter, and longer again, has holes
+            raise ScheduleError(f"cannot {what} {self.path}: {error.strerror}") from error
+
     def refresh(self, rows: Iterable[int]) -> None:
-        """Read these rows anew."""
+        """Read these rows anew.
+
+        Raises:
+            ScheduleError: the file cannot be read.
+        """
         for row in rows:
             self._read(layout.row_at(row), ROW_SIZE)
 
     def _read(self, offset: int, size: int) -> None:
         place = self.view[offset : offset + size]
-        there = os.preadv(self.descriptor, [place], offset)
+        with self._trouble("read"):
+            there = os.preadv(self.descriptor, [place], offset)
         if there < size:
             place[there:] = bytes(size - there)
 
@@ -72,7 +85,8 @@ class UnmappedSchedule(ScheduleFile):
     @property
     def generation(self) -> int:
         """As it is now."""
-        word = os.pread(self.descriptor, WORD.size, GENERATION * WORD.size) if self.descriptor >= 0 else b""
+        with self._trouble("read"):
+            word = os.pread(self.descriptor, WORD.size, GENERATION * WORD.size) if self.descriptor >= 0 else b""
         return int(WORD.unpack(word)[0]) if len(word) == WORD.size else GONE
 
     def _set_generation(self, generation: int) -> None:
@@ -84,7 +98,14 @@ class UnmappedSchedule(ScheduleFile):
         return super().rows()
 
     def write(self, pieces: Iterable[Piece]) -> None:
-        """Write pieces in their order, into the file and into what was read."""
+        """Write pieces in their order, into the file and into what was read.
+
+        Raises:
+            ScheduleError: the file takes none, for example because its file system is full.
+        """
         for offset, octets in pieces:
-            os.pwrite(self.descriptor, octets, offset)
+            with self._trouble("write"):
+                there = os.pwrite(self.descriptor, octets, offset)
+            if there < len(octets):
+                raise ScheduleError(f"cannot write {self.path}: there is no room in its file system; free some")
             self.view[offset : offset + len(octets)] = octets

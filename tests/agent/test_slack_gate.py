@@ -148,6 +148,48 @@ def test_who_makes_the_schedule_shorter_ends_no_keeper(steady: subprocess.Popen[
     assert (ran.returncode, ran.stdout) == (0, "captured\n"), ran.stderr
 
 
+FULL = """
+import ctypes, os, sys
+from agent import slack_gate
+from failover.boards.unmapped_schedule import UnmappedSchedule
+gate, pid, schedule = slack_gate.gate(), int(sys.argv[1]), sys.argv[2]
+while not gate.opens((pid,)):
+    pass
+size = os.stat(schedule).st_size
+os.truncate(schedule, 64)
+os.truncate(schedule, size)  # the rows are a hole now
+with open(os.path.dirname(schedule) + "/more", "wb", buffering=0) as more:
+    try:
+        while True:
+            more.write(bytes(4096))
+    except OSError:
+        pass
+gate.begin(5_000_000_000)
+gate.opens((pid,))
+gate.closes(stood_still=True)
+gate.begin(5_000_000_000)
+gate.opens((pid,))
+gate.closes(stood_still=True)
+print("captured")
+"""
+
+
+@pytest.mark.root
+def test_a_full_file_system_ends_no_keeper(tmp_path: Path) -> None:
+    """A page that the file has lost cannot be written any more."""
+    place = tmp_path / "small"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(place)], check=True)
+    try:
+        directory.make_schedule(place, "robot1", mode=0o600)
+        with process(REST, place, "rests") as child:
+            command = [sys.executable, "-c", FULL, str(child.pid), str(place / SCHEDULE_NAME)]
+            ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (ran.returncode, ran.stdout) == (0, "captured\n"), ran.stderr
+    finally:
+        subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
 def test_it_waits_no_more_for_the_end_of_an_activation_once_the_schedule_is_shorter(place: Path) -> None:
     with process(BUSY, place) as child:
         gate = slack_gate.gate()

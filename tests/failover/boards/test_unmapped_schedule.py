@@ -69,3 +69,13 @@ def test_who_makes_it_shorter_ends_nobody(tmp_path: Path, size: int) -> None:
         assert file.is_gone is (size == 0)
     with pytest.raises(ScheduleError, match="this is no schedule"):
         UnmappedSchedule.at(path)
+
+
+def test_a_file_that_takes_nothing_is_told_in_a_sentence(tmp_path: Path) -> None:
+    path = schedule(tmp_path / "place")
+    with contextlib.closing(UnmappedSchedule.at(path)) as file:
+        read_only = os.open(path, os.O_RDONLY)
+        os.dup2(read_only, file.descriptor)  # the kernel refuses the write, as it does where the file system is full
+        os.close(read_only)
+        with pytest.raises(ScheduleError, match=r"cannot write .*: Bad file descriptor"):
+            file.write([(layout.row_at(0), b"x")])
