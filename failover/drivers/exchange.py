@@ -170,6 +170,9 @@ class Door:
         except DriverError:
             sockets.close(self._context)
             raise
+        except sockets.ZMQ_ERROR as error:
+            sockets.close(self._context)
+            raise DriverError(f"cannot listen for other robots: {error}") from error
 
     def descriptors(self) -> tuple[int, int]:
         """Readable after something has come; to be followed by `receive`."""

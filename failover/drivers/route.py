@@ -29,6 +29,8 @@ class Route:
             DriverError: the driver is on another robot that cannot be reached.
         """
         self._now = TeamNow(here)
+        self._now.look()  # the driver may have gone to a robot that came into the team since
+        here = self._now.here
         self.path = place.record.path
         self.place = place
         self.address = address_of(here, place)

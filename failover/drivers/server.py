@@ -33,7 +33,7 @@ from failover.drivers.carried_out import CarriedOut
 from failover.drivers.declare import Declaration, declaration_of
 from failover.drivers.here import Here, TeamNow, here, hold, stem
 from failover.drivers.name_service import NameService
-from failover.errors import DriverError, EnvelopeError, NotCommittedError
+from failover.errors import EnvelopeError, NotCommittedError
 from failover.fencing.epoch import epoch
 from failover.kept_state.component import kept_of
 
@@ -59,6 +59,10 @@ HANDS_MAX: Final = 64
 """Connections of people at once."""
 
 CHUNK: Final = 64 << 10
+
+LISTEN_FIRST_NS: Final = 5_000_000
+LISTEN_MOST_NS: Final = 1_000_000_000
+"""Between two tries to listen again with another key; the pause doubles from first to most."""
 
 log = logging.getLogger("failover.drivers")
 
@@ -199,6 +203,10 @@ class Serving:
         calls, hand = self.here.file(path, "calls"), self.here.file(path, "hand")
         self._addresses = [f"{local.SCHEME}{calls}"]
         self._team: sockets.Socket | None = None
+        self._withdrawn = ""
+        """The address at which it is to listen again; "": it does."""
+        self._listen_ns = self._listen_pause_ns = 0
+        self._is_deaf_told = False
         if self.here.team is not None:
             self._open_team(stack)
         for file, accept in ((calls, self._accept_near), (hand, self._accept_hand)):
@@ -321,7 +329,14 @@ class Serving:
                 if not self._sockets.has_message(self._team):
                     break
             return 0
-        return self._due_ns(self.now_ns())
+        now_ns = self.now_ns()
+        wait_ns = self._due_ns(now_ns)
+        if not self._withdrawn:
+            return wait_ns
+        if now_ns >= self._listen_ns:
+            self._listen_again()
+        left_ns = max(self._listen_ns - now_ns, 0)
+        return left_ns if wait_ns is None else min(wait_ns, left_ns)
 
     def _woken(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -348,10 +363,25 @@ class Serving:
         here = self.here = self._now.here
         self._gate.know(here.keys)
         if self._team is not None and here.secret != before.secret:
-            try:
-                self._sockets.prove_anew(self._team, here)
-            except DriverError as error:
-                log.error("%s; start this driver anew", error)
+            self._withdrawn = self._sockets.prove_anew(self._team, here)
+            self._listen_pause_ns = LISTEN_FIRST_NS
+            self._listen_again()
+
+    def _listen_again(self) -> None:
+        """Try to take messages of other robots again, with another key; the driver goes on meanwhile."""
+        assert self._team is not None
+        if self._sockets.listen_again(self._team, self._withdrawn):
+            self._withdrawn = ""
+            return
+        self._listen_ns = self.now_ns() + self._listen_pause_ns
+        if self._listen_pause_ns == LISTEN_MOST_NS and not self._is_deaf_told:
+            self._is_deaf_told = True
+            log.error(
+                "no other robot reaches this driver: another program has taken %s while this robot's key was replaced; end "
+                "that one, and the driver listens there again by itself",
+                self._withdrawn,
+            )
+        self._listen_pause_ns = min(2 * self._listen_pause_ns, LISTEN_MOST_NS)
 
     def _take_team(self) -> None:
         """One message of another robot, if one has come; `_wait_ns` takes those behind it."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 import zmq
 from zmq.utils import z85
@@ -32,9 +32,6 @@ RETRANSMIT_LIMIT_MS: Final = 3_000
 
 HANDSHAKE_LIMIT_MS: Final = 5_000
 
-LISTEN_TRIES: Final = 400
-LISTEN_PAUSE_S: Final = 0.005
-
 ONE_TIME_LIMIT_MS: Final = 30_000
 """The handshake of an invitation: it happens once, on machines that may be starting, and a failure costs a person's time."""
 
@@ -52,6 +49,8 @@ _READABLE: Final = int(zmq.POLLIN)
 
 Context = zmq.Context[zmq.Socket[bytes]]
 Socket = zmq.Socket[bytes]
+ZMQ_ERROR: Final = zmq.ZMQError
+"""What ZeroMQ raises where there is no descriptor or memory left."""
 
 
 def context() -> Context:
@@ -84,21 +83,26 @@ def listen_team(context: Context, here: Here, port: int = 0) -> tuple[Socket, st
     return socket, socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 
-def prove_anew(socket: Socket, here: Here) -> None:
-    """Listen at the same address with this robot's key as it is now. Connections that stand are not touched.
+def prove_anew(socket: Socket, here: Here) -> str:
+    """Prove this robot's key as it is now, once `listen_again` has the address. Connections that stand are not touched.
 
-    Raises:
-        DriverError: the address was taken meanwhile.
+    Returns:
+        The address, at which nobody listens until then.
     """
     address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
-    socket.unbind(address)
     socket.curve_secretkey = here.secret.encode()
-    for _ in range(LISTEN_TRIES):  # ZeroMQ lets an address go some time after it was told to
-        with contextlib.suppress(zmq.ZMQError):
-            socket.bind(address)
-            return
-        time.sleep(LISTEN_PAUSE_S)
-    raise DriverError(f"cannot listen at {address} with another key: another program has taken it meanwhile")
+    with contextlib.suppress(zmq.ZMQError):  # an earlier key has ended that
+        socket.unbind(address)
+    return address
+
+
+def listen_again(socket: Socket, address: str) -> bool:
+    """Try once; False: ZeroMQ, which lets an address go some time after it was told to, or another program has it still."""
+    try:
+        socket.bind(address)
+    except zmq.ZMQError:
+        return False
+    return True
 
 
 class Connection:
@@ -128,7 +132,7 @@ class Connection:
             self.socket.setsockopt(zmq.IMMEDIATE, 1)
         self.socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
         self.socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
-        self._monitor = self.socket.get_monitor_socket(HANDSHAKE_FAILED)
+        self.monitor = self.socket.get_monitor_socket(HANDSHAKE_FAILED)
         self._connect()
 
     def know(self, here: Here) -> None:
@@ -140,15 +144,20 @@ class Connection:
 
     def mend(self) -> None:
         """A handshake has failed: ZeroMQ does not try again where our key was refused, and the peer may use its other one."""
-        if has_message(self._monitor):
+        if has_message(self.monitor) and self.pause_ms() == 0:
             self._keys = (*self._keys[1:], *self._keys[:1])
             self._connect()
+
+    def pause_ms(self) -> int:
+        """How long `mend` waits after the last connection was begun: a peer that refuses us is not asked without a pause."""
+        return max(RECONNECT_FIRST_MS - (time.monotonic_ns() - self._begun_ns) // 1_000_000, 0)
 
     def _connect(self) -> None:
         with contextlib.suppress(zmq.ZMQError):  # the first time there is nothing to end
             self.socket.disconnect(self._address)
-        while has_message(self._monitor):
-            self._monitor.recv_multipart()
+        self._begun_ns = time.monotonic_ns()
+        while has_message(self.monitor):
+            self.monitor.recv_multipart()
         if self._keys:
             self.socket.curve_publickey = zmq.curve_public(self._secret.encode())
             self.socket.curve_secretkey = self._secret.encode()
@@ -158,7 +167,7 @@ class Connection:
     def close(self) -> None:
         """Watch no more; the socket goes with its context."""
         self.socket.disable_monitor()
-        self._monitor.close(0)
+        self.monitor.close(0)
 
 
 def _keys_of(here: Here, robot: str) -> tuple[str, ...]:
@@ -258,20 +267,29 @@ class TeamWay:
 
     def await_open(self, timeout_ns: int, wake: int) -> bool:
         """Whether there is a connection within the time; ``wake``: a descriptor that ends the wait, too."""
-        self._renew()
-        return bool(self._ready(zmq.POLLOUT, timeout_ns, wake) & zmq.POLLOUT)
+        until_ns = time.monotonic_ns() + timeout_ns
+        while True:
+            self._renew()
+            left_ns = max(until_ns - time.monotonic_ns(), 0)
+            pause_ns = self._connection.pause_ms() * 1_000_000
+            found = self._ready(zmq.POLLOUT, min(left_ns, pause_ns or left_ns), wake, mending=not pause_ns)
+            if self._socket in found or wake in found or not left_ns:
+                return self._socket in found
 
-    def _ready(self, events: int, timeout_ns: int, wake: int) -> int:
+    def _ready(self, events: int, timeout_ns: int, wake: int, *, mending: bool = False) -> set[Any]:
+        """Which of the socket, ``wake`` and, with ``mending``, the news of failed handshakes are ready within the time."""
         poller = zmq.Poller()
         poller.register(self._socket, events)
+        if mending:
+            poller.register(self._connection.monitor, zmq.POLLIN)
         if wake >= 0:
             poller.register(wake, zmq.POLLIN)
-        return int(dict(poller.poll(max(-(-timeout_ns // 1_000_000), 0))).get(self._socket, 0))
+        return {one for one, _ in poller.poll(max(-(-timeout_ns // 1_000_000), 0))}
 
     def await_message(self, timeout_ns: int, wake: int = -1) -> bytes | None:
         """What comes; None: nothing within the time, or `wake` can be read."""
         if wake >= 0:
-            return self._socket.recv(zmq.NOBLOCK) if self._ready(zmq.POLLIN, timeout_ns, wake) else None
+            return self._socket.recv(zmq.NOBLOCK) if self._socket in self._ready(zmq.POLLIN, timeout_ns, wake) else None
         limit_ms = max(-(-timeout_ns // 1_000_000), 0)
         if limit_ms != self._limit_ms:
             self._socket.setsockopt(zmq.RCVTIMEO, limit_ms)

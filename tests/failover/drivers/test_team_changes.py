@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
+import socket
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -232,3 +233,46 @@ def test_a_damaged_key_ends_no_driver(town: Town, damaged: bytes) -> None:
         assert reads(proxy)
         until(lambda: engine.service._exchange.here.team == town.team)
         assert engine.service._thread.is_alive()
+
+
+def test_a_driver_whose_address_is_taken_while_its_robot_replaces_its_key_goes_on_and_listens_there_again(
+    town: Town, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with serving(Engine, town.here("robot1")) as engine, called(town.here("robot2"), "engine") as proxy:
+        assert reads(proxy)
+        host, port = town.here("robot1").host, address_of(engine).rpartition(":")[2]
+        listen_again, others = sockets.listen_again, list[socket.socket]()
+
+        def late(listening: sockets.Socket, address: str) -> bool:
+            """Another program is quicker."""
+            with contextlib.suppress(OSError):
+                if not others:
+                    others.append(socket.create_server((host, int(port))))
+            return bool(others) and listen_again(listening, address)
+
+        monkeypatch.setattr(sockets, "listen_again", late)
+        town.rotates("robot1")
+        until(lambda: others)
+        with called(town.here("robot1"), "engine") as near:
+            assert reads(near)
+            until(lambda: f"another program has taken {address_of(engine)}" in caplog.text)
+            assert reads(near)
+        others[0].close()
+        with called(town.here("robot2"), "engine") as another:
+            assert reads(another) and reads(proxy)
+        assert not engine._withdrawn
+
+
+def test_a_stream_follows_to_a_robot_that_came_after_its_caller_began(folder: Path) -> None:
+    town = Town(folder, "robot1", "robot2", "robot3")
+    with_two = Town.__new__(Town)
+    with_two.folder, with_two.secrets = town.folder, town.secrets
+    with_two.team = Team("lab", {name: town.team.robots[name] for name in ("robot1", "robot3")})
+    with_two.takes(with_two.team, "robot1")
+    with serving(Engine, with_two.here("robot1")):
+        proxy = called(with_two.here("robot1"), "engine")
+        assert reads(proxy)
+    with proxy, serving(Camera, with_two.here("robot1")), serving(Engine, town.here("robot2")):
+        town.takes(town.team, "robot1")
+        assert reads(proxy) and proxy.place.robot == "robot2"
+        assert next(iter(proxy.stream("current"))) == 0.0
