@@ -115,11 +115,15 @@ class KeyOwners:
         self.know(keys)
 
     def know(self, keys: Keys) -> None:
-        """From now on these count, but for those that their owner has replaced already."""
+        """From now on these count, but for those that their owner is replacing, and has used the next one."""
         self._keys = keys
         owners = {key: name for name in keys.peers for key in keys.of(name)}
-        self._replaced &= owners.keys()
+        self._replaced &= {keys.peers[name] for name in keys.following if name in keys.peers}
         self._owners = {key: name for key, name in owners.items() if key not in self._replaced}
+
+    def is_replaced(self, key: str) -> bool:
+        """Whether its owner has used its next key since, while both are in the team file."""
+        return key in self._replaced
 
     def owner(self, key: str) -> str | None:
         """The member that this key proves; None: none."""
@@ -623,8 +627,15 @@ class ReplicationLink:
         peers = [peer for peer, there in self._peers.items() if plain(split_address(there, "bulk address")[0]) == host]
         key = shown(_presented(credentials))
         for peer in peers:
-            known = shown(self._keys.peers[peer])
-            self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
+            if self._owners.is_replaced(_presented(credentials)):
+                self._mismatch[peer] = (
+                    f"{peer} presents the key {key}, and has used its next key already: if its files were set back, take it out "
+                    f"of the team and invite it again; if not, somebody has a copy of its old key, and failover team rotate "
+                    f"{peer} ends the rotation"
+                )
+            else:
+                known = shown(self._keys.peers[peer])
+                self._mismatch[peer] = f"{peer} presents the key {key}, and team.toml here has {known} for it: {MEND}"
             self._callbacks.unread(peer, self._mismatch[peer])
         if not peers:
             self._callbacks.unread("", f"a sender at {address} presents the key {key}")

@@ -12,7 +12,7 @@ import pytest
 
 from agent.errors import LaneError
 from agent.system import connection_quota
-from agent.worker.network.replication_link import MEND, Callbacks, Keys, LinkState, ReplicationLink, new_keys, shown
+from agent.worker.network.replication_link import MEND, Callbacks, KeyOwners, Keys, LinkState, ReplicationLink, new_keys, shown
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk
 
 PATIENCE_S = 20.0
@@ -264,8 +264,28 @@ def test_once_a_peer_has_used_its_new_key_the_old_one_is_refused_though_both_cou
         await other.change(address, keys2)
         await until(lambda: one.strangers > before)
         await until(lambda: pair.state("robot2") is LinkState.REFUSED)
+        (trouble,) = (told for told in one.troubles() if told.startswith("robot2 presents"))
+        assert (
+            "has used its next key already: " in trouble
+            and "failover team rotate robot2 ends" in trouble
+            and "team.toml here has" not in trouble
+        )
 
     run(both, keys2, body)
+
+
+def test_a_team_file_without_the_next_key_brings_the_key_before_back() -> None:
+    """A replacement that was begun can be undone: by a team file from before, at each robot."""
+    public, following = new_keys()[0], new_keys()[0]
+    own = new_keys()
+    before = Keys(*own, {"robot2": public})
+    both = Keys(*own, {"robot2": public}, {"robot2": following})
+    owners = KeyOwners(both)
+    owners.used(following, "robot2")
+    owners.know(both)
+    assert (owners.owner(public), owners.owner(following)) == (None, "robot2") and owners.is_replaced(public)
+    owners.know(before)
+    assert (owners.owner(public), owners.owner(following)) == ("robot2", None) and not owners.is_replaced(public)
 
 
 @pytest.mark.parametrize("uses", ["the old one", "the new one"])
