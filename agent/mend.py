@@ -40,7 +40,8 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
         The exit status: 1 where nothing was changed.
 
     Raises:
-        AgentError: the agent runs, or the program does; no such record; not ours to change; the store cannot be used.
+        AgentError: the agent runs, or the program does; no such record; not ours to change; the store cannot be used, or not to
+            the end.
     """
     directory = Path(settings.config.state_directory)
     check_right(directory)
@@ -56,7 +57,10 @@ def mend(settings: Settings, name: str, epoch: int, *, agreed: bool) -> int:
     try:
         return _mend(settings, record_file, before, record, epoch, agreed=agreed)
     except StoreError as error:
-        raise AgentError(f"cannot mend {name}: {error}; its record has epoch {record.epoch} still") from error
+        raise AgentError(
+            f"cannot mend {name}: {error}; its record has epoch {record.epoch} still, and checkpoints of later epochs may be set "
+            "aside already; once the store can be used, give the command again"
+        ) from error
 
 
 def _mend(

@@ -180,6 +180,7 @@ ON_BEHALF: Final = frozenset(
 LENGTH: Final = struct.Struct(">I")
 SOCKET_NAME: Final = "control.sock"
 SYSTEM_SOCKET: Final = Path("/run/failover") / SOCKET_NAME
+SYSTEM_CONFIG: Final = Path("/etc/failover/agent.toml")
 SYSTEM_TEAM: Final = Path("/etc/failover/team/team.toml")
 SOCKET_VARIABLE: Final = "FAILOVER_SOCKET"
 CONNECT_TIMEOUT_S: Final = 5
@@ -406,9 +407,23 @@ def _is_absent(path: Path) -> bool:
     return False
 
 
+def _has_no_team() -> bool:
+    """Whether this machine is known to have none: its agent.toml may name another place of it."""
+    import tomllib  # here: only this message needs it
+
+    try:
+        config = tomllib.loads(SYSTEM_CONFIG.read_text())
+    except FileNotFoundError:
+        config = {}
+    except (OSError, ValueError):
+        return False
+    place = config.get("team_directory", str(SYSTEM_TEAM.parent))
+    return isinstance(place, str) and _is_absent(Path(place) / SYSTEM_TEAM.name)
+
+
 def why_unreachable(path: Path, error: OSError) -> str:
     """One sentence, with the cure."""
-    if path == SYSTEM_SOCKET and isinstance(error, FileNotFoundError) and _is_absent(SYSTEM_TEAM):
+    if path == SYSTEM_SOCKET and isinstance(error, FileNotFoundError) and _has_no_team():
         return "this machine has no team yet: failover team create NAME begins one, failover team join enters another robot's"
     cure = {
         FileNotFoundError: f"no agent has been started there; start failover-agent, or set {SOCKET_VARIABLE}",

@@ -67,6 +67,7 @@ def test_a_store_that_cannot_be_used_is_named_and_nothing_changes(config: Path, 
     store.close()
     said = capsys.readouterr().err
     assert f"failover-agent: cannot mend {NAME}: " in said and f"its record has epoch {EPOCH_MAX - 1} still" in said
+    assert "checkpoints of later epochs may be set aside already" in said and "give the command again" in said
     assert records(config) == (POISONED, OTHER)
 
 

@@ -126,7 +126,11 @@ def _cure(draft: Invitation, error: DriverError) -> str:
     number = getattr(error.__cause__, "errno", 0)
     if number == errno.EADDRINUSE:
         return f"another invitation is open, or another program uses port {draft.port}: --port names another one"
-    return f"no interface has {draft.host} now: see ip address; --address names another one of this robot"
+    if number == errno.EADDRNOTAVAIL:
+        return f"no interface has {draft.host} now: see ip address; --address names another one of this robot"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"only root may listen at port {draft.port}: --port names one from 1024 on"
+    return "--address names another address of this robot, --port another port"
 
 
 def _await_it(arguments: argparse.Namespace, listener: Listener, robot: str, span: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import signal
@@ -17,9 +18,11 @@ from typing import Any
 import pytest
 
 from failover.cli import key_pairs, parser
+from failover.cli.verbs import team_invitations
 from failover.client import control
 from failover.client.control import Control, Output, Refused, Request, Result, Update
-from failover.errors import NoAgentError
+from failover.config.invitation import SECRET_SIZE, Invitation
+from failover.errors import DriverError, NoAgentError
 from tests.failover.cli.stand_in import Answer, StandIn
 
 Start = Callable[[Callable[[Request], Answer]], StandIn]
@@ -632,11 +635,36 @@ def test_an_invitation_at_an_address_that_this_robot_has_not_says_so(tmp_path: P
     assert ran.returncode == 1 and f"another invitation is open, or another program uses port {port}: --port" in ran.stderr
 
 
+@pytest.mark.parametrize(
+    ("number", "cure"),
+    [
+        (errno.EADDRINUSE, "another invitation is open, or another program uses port 80"),
+        (errno.EADDRNOTAVAIL, "no interface has 127.0.0.1 now"),
+        (errno.EACCES, "only root may listen at port 80: --port names one from 1024 on"),
+        (errno.EMFILE, "--address names another address of this robot, --port another port"),
+    ],
+)
+def test_an_invitation_that_cannot_be_open_says_what_helps(number: int, cure: str) -> None:
+    error = DriverError("cannot listen")
+    error.__cause__ = OSError(number, os.strerror(number))
+    assert cure in team_invitations._cure(Invitation("robot2", "127.0.0.1", 80, bytes(SECRET_SIZE), "robot"), error)
+
+
 def test_before_there_is_a_team_its_begin_is_told_in_place_of_a_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "SYSTEM_SOCKET", tmp_path / "control.sock")
     monkeypatch.setattr(control, "SYSTEM_TEAM", tmp_path / "team.toml")
+    monkeypatch.setattr(control, "SYSTEM_CONFIG", tmp_path / "agent.toml")
     with pytest.raises(NoAgentError, match="this machine has no team yet: failover team create NAME begins one"):
         Control.open(tmp_path / "control.sock")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "agent.toml").write_text(f'team_directory = "{elsewhere}"\n')
+    with pytest.raises(NoAgentError, match="this machine has no team yet"):
+        Control.open(tmp_path / "control.sock")
+    (elsewhere / "team.toml").touch()
+    with pytest.raises(NoAgentError, match="no agent has been started there; start failover-agent"):
+        Control.open(tmp_path / "control.sock")
+    (tmp_path / "agent.toml").unlink()
     (tmp_path / "team.toml").touch()
     with pytest.raises(NoAgentError, match="no agent has been started there; start failover-agent"):
         Control.open(tmp_path / "control.sock")
