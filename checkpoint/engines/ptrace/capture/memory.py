@@ -207,6 +207,7 @@ class MemoryCapture:
         self.budget = FreezeBudget(0)
         self._is_armed = False
         self._start = 0
+        self._begun: RunningCopy | None = None
         self._unacknowledged: list[Unacknowledged] = []
         self._left_out: Words = NONE
         self.acknowledged: Position | None = None
@@ -250,7 +251,11 @@ class MemoryCapture:
     # While the program runs
 
     def has_rested(self, last: LastLook) -> bool:
-        """Whether its pages are as they were at the last look, whose snapshot is acknowledged."""
+        """Whether its pages are as they were at the last look, whose snapshot is acknowledged.
+
+        If they are not, the next `copy_running` begins with those that were read to find that out.
+        """
+        self._begun = None
         if self.acknowledged is None or not self._is_armed or not self._tracker.scans_running or self._shared_lines:
             return False
         if any(held.position is not None for held in self._unacknowledged):
@@ -266,7 +271,11 @@ class MemoryCapture:
             return False
         content = memoryview(bytearray(page_set.total_size(tail.written)))
         self._memory.read_pages_into(tail.written, content)
-        return last.are_equal(tail.written, content)
+        if last.are_equal(tail.written, content):
+            return True
+        self._begun = RunningCopy(self._start)
+        self._begun.add(Copy(tail.written, content))
+        return False
 
     def copy_running(self, *, base: bool, enough: int = 0, copied: RunningCopy | None = None) -> RunningCopy:
         """Copy beforehand what is worth it, so that little is left for the freeze.
@@ -277,9 +286,10 @@ class MemoryCapture:
                 program; 0: until another pass is not worth it.
         """
         self.refresh()
+        begun, self._begun = self._begun, None
         is_again = copied is not None and copied.start == self._start
         if copied is None or not is_again:
-            copied = RunningCopy(self._start)
+            copied = begun if begun and not base and begun.start == self._start else RunningCopy(self._start)
             if base:
                 self._copy_everything(copied)
         for scan in copied.late:

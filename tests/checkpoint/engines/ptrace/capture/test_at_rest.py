@@ -13,13 +13,15 @@ from pathlib import Path
 import pytest
 
 from checkpoint.engine import CaptureOrder, Session
-from checkpoint.engines.ptrace.capture import at_rest, memory_result
+from checkpoint.engines.ptrace.capture import at_rest, memory, memory_result
 from checkpoint.engines.ptrace.capture.session import PtraceSession
 from checkpoint.engines.ptrace.capture.snapshot_builder import SnapshotBuilder
 from checkpoint.errors import UnsupportedError
 from checkpoint.linux import abi
+from checkpoint.linux.memory.remote_memory import Memory
 from checkpoint.linux.procfs import procfs
-from checkpoint.model import Position
+from checkpoint.model import Position, Snapshot
+from checkpoint.pages import page_set
 from tests.checkpoint.round_trip import Program, captured_at_last, ended, protected, start, start_tracee
 
 pytestmark = [pytest.mark.root, pytest.mark.write_protection]
@@ -34,6 +36,9 @@ for word in words:
     word = word.strip()
     if word == "write":
         memory[-1] += 1
+    elif word == "many":
+        for place in range(0, 20 * 4096, 4096):
+            memory[place] += 1
     elif word == "thread":
         threading.Thread(target=never.wait, daemon=True).start()
     elif word == "fork" and not os.fork():
@@ -42,6 +47,8 @@ for word in words:
         never.wait()
     print(word, flush=True)
 """
+MANY = 20
+"""Pages that "many" writes."""
 PATIENCE_S = 60.0
 
 
@@ -58,11 +65,14 @@ class Waiting:
         os.write(self._words, f"{word}\n".encode())
         self.program.wait_for_line("born" if word == "fork" else word)
 
-    def capture(self, *, base: bool = False) -> Position:
+    def captured(self, *, base: bool = False) -> Snapshot:
         self._sequence += 1
         snapshot = captured_at_last(self.session, CaptureOrder(base=base, sequence=self._sequence))
         self.session.acknowledge(snapshot.position)
-        return snapshot.position
+        return snapshot
+
+    def capture(self, *, base: bool = False) -> Position:
+        return self.captured(base=base).position
 
     def until_at_rest(self) -> None:
         """Capture until it says that it is unchanged; a thread that has just printed takes its time to wait again."""
@@ -103,6 +113,49 @@ def test_a_program_that_waits_is_unchanged_until_it_writes(tmp_path: Path, monke
         one.say("write")
         assert one.session.unchanged(0) is None
         one.until_at_rest()
+
+
+def test_pages_that_were_read_to_compare_them_are_not_read_again_unless_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    for module in (at_rest, memory):
+        monkeypatch.setattr(module, "REST_PAGES", 4096)  # an interpreter writes a hundred pages to print a word
+    read: list[int] = []
+    read_into = memory.MemoryCapture._read_into
+    monkeypatch.setattr(memory.MemoryCapture, "_read_into", lambda *wanted: read.append(len(wanted[2])) or read_into(*wanted))
+    with waiting(tmp_path) as one:
+        for is_written_again in (False, True):
+            one.until_at_rest()
+            one.say("many")
+            _until_compared(one)
+            if is_written_again:
+                one.say("many")
+            read.clear()
+            snapshot = one.captured()
+            assert page_set.total_size(page_set.extents(snapshot.runs)) >= MANY * abi.PAGE_SIZE
+            assert _differing_pages(one.program.pid, snapshot) <= 1, "but for where restartable sequences are noted"
+            if not is_written_again:
+                assert not read
+
+
+def _until_compared(one: Waiting) -> None:
+    """Ask until its pages, not its threads alone, were found to differ: a thread that has just printed takes its time to wait."""
+    deadline = time.monotonic() + PATIENCE_S
+    of_program = one.session._first.memory  # type: ignore[attr-defined]
+    while of_program._begun is None:
+        assert one.session.unchanged(0) is None
+        assert time.monotonic() < deadline, "it never waits"
+
+
+def _differing_pages(pid: int, snapshot: Snapshot) -> int:
+    """How many of the pages that a snapshot tells are not those of a process that waits since."""
+    runs = page_set.extents(snapshot.runs)
+    now = memoryview(bytearray(page_set.total_size(runs)))
+    Memory(pid).read_pages_into(runs, now)
+    told = memoryview(snapshot.contents)
+    places = range(0, len(now), abi.PAGE_SIZE)
+    return sum(now[place : place + abi.PAGE_SIZE] != told[place : place + abi.PAGE_SIZE] for place in places)
 
 
 def _until_stopped(one: Waiting) -> None:
