@@ -7,9 +7,10 @@ unknown fields, doubled keys and other encodings of the same value do not pass.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import msgspec
 from blake3 import blake3
@@ -29,6 +30,7 @@ from checkpoint.model import (
     Vma,
     Zombie,
 )
+from checkpoint.pages.page_set import Mappings
 from checkpoint.snapshot.process_tree import every_mapping
 
 _Value = TypeVar("_Value")
@@ -43,6 +45,10 @@ PLAIN = frozenset((type(None), bool, int, float, str, bytes))
 """Types of facts that hold no others."""
 
 OUT_OF_ORDER = "not in canonical form (keys out of order)"
+
+PARTS_KEPT: Final = 32
+PART_SIZE: Final = 64 << 10
+"""Parts of states that stay decoded, and the most bytes of one: a few components' deltas, which tell the same of most things."""
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -115,8 +121,29 @@ class _TreeState(_State, frozen=True, forbid_unknown_fields=True):
     zombies: tuple[Zombie, ...]
 
 
+class _PackedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A ``_State`` of which those parts are not decoded that are often the same as of the snapshot before."""
+
+    component: str
+    engine: str
+    epoch: int
+    machine: msgspec.Raw
+    clocks: Clocks
+    process: msgspec.Raw
+    threads: tuple[ThreadState, ...]
+    vmas: msgspec.Raw
+    resources: msgspec.Raw
+
+
+class _PackedTree(_PackedState, frozen=True, forbid_unknown_fields=True):
+    """The same of a ``_TreeState``."""
+
+    members: tuple[_MemberRecord, ...]
+    zombies: tuple[Zombie, ...]
+
+
 class State(msgspec.Struct, frozen=True):
-    """The decoded state section: the fields of ``Snapshot`` with the same names."""
+    """The decoded state section: the fields of ``Snapshot`` with the same names. Parts decoded before are the same objects."""
 
     component: str
     engine: str
@@ -125,7 +152,7 @@ class State(msgspec.Struct, frozen=True):
     clocks: Clocks
     process: ProcessState
     threads: tuple[ThreadState, ...]
-    vmas: tuple[Vma, ...]
+    vmas: Mappings
     resources: tuple[Resource, ...]
     members: tuple[Member, ...] = ()
     zombies: tuple[Zombie, ...] = ()
@@ -221,36 +248,77 @@ def decode_state(packed: bytes | memoryview, *, is_tree: bool = False) -> State:
     Raises:
         FormatError: not a state, or not in canonical form; names the field.
     """
-    state: _State = _decoded(packed, _TreeState if is_tree else _State, "state")
-    members = state.members if isinstance(state, _TreeState) else ()
-    _check_canonical(state)
+    state: _PackedState = _decoded(packed, _PackedTree if is_tree else _PackedState, "state")
+    members = state.members if isinstance(state, _PackedTree) else ()
+    _check_registers(state.threads)
     for record in members:
-        _check_canonical(record)
+        _check_registers(record.threads)
+        _check_process(record.process)
+        _check_facts(record.resources)
     return State(
         component=state.component,
         engine=state.engine,
         epoch=state.epoch,
-        machine=state.machine,
+        machine=_part(_machine, state.machine),
         clocks=state.clocks,
-        process=state.process,
+        process=_part(_process, state.process),
         threads=state.threads,
-        vmas=state.vmas,
-        resources=_resources(state.resources),
+        vmas=_part(_mappings, state.vmas),
+        resources=_part(_facts, state.resources),
         members=tuple(map(_member, members)),
-        zombies=state.zombies if isinstance(state, _TreeState) else (),
+        zombies=state.zombies if isinstance(state, _PackedTree) else (),
     )
 
 
-def _check_canonical(state: _State | _MemberRecord) -> None:
+def _part(read: Callable[[bytes], _Value], packed: msgspec.Raw) -> _Value:
+    """A part of a state: the same object as before, where it is the same bytes."""
+    content = bytes(packed)
+    found: _Value = _kept(read, content) if len(content) <= PART_SIZE else read(content)
+    return found
+
+
+@lru_cache(PARTS_KEPT)
+def _kept(read: Callable[[bytes], Any], packed: bytes) -> Any:
+    return read(packed)
+
+
+def _machine(packed: bytes) -> Machine:
+    return _decoded(packed, Machine, "state: machine")
+
+
+def _process(packed: bytes) -> ProcessState:
+    process = _decoded(packed, ProcessState, "state: process")
+    _check_process(process)
+    return process
+
+
+def _mappings(packed: bytes) -> Mappings:
+    return Mappings(_decoded(packed, tuple[Vma, ...], "state: vmas"))
+
+
+def _facts(packed: bytes) -> tuple[Resource, ...]:
+    records = _decoded(packed, tuple[_ResourceRecord, ...], "state: resources")
+    _check_facts(records)
+    return _resources(records)
+
+
+def _check_process(process: ProcessState) -> None:
+    if not _is_sorted(process.limits):
+        raise FormatError(f"state: {OUT_OF_ORDER}")
+
+
+def _check_registers(threads: tuple[ThreadState, ...]) -> None:
+    if not all(_is_sorted(thread.registers) for thread in threads):
+        raise FormatError(f"state: {OUT_OF_ORDER}")
+
+
+def _check_facts(records: tuple[_ResourceRecord, ...]) -> None:
     """Refuse facts that cannot be, and keys that are out of order."""
-    for record in state.resources:
+    for record in records:
         try:
             _check_fact(record.facts, MAX_FACT_DEPTH)
         except FormatError as error:
             raise FormatError(f"state: facts of {record.kind} {record.name!r}: {error}") from None
-    mappings: tuple[Mapping[Any, object], ...] = (state.process.limits, *(thread.registers for thread in state.threads))
-    if not all(map(_is_sorted, mappings)):
-        raise FormatError(f"state: {OUT_OF_ORDER}")
 
 
 def _resources(records: tuple[_ResourceRecord, ...]) -> tuple[Resource, ...]:

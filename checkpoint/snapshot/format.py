@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from threading import local
-from typing import Final
+from typing import Final, TypeAlias
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from checkpoint.errors import FormatError
 from checkpoint.model import PageCopy, PageRun, Snapshot
 from checkpoint.pages import page_set
-from checkpoint.pages.page_set import Flags, Mappings, Words
+from checkpoint.pages.page_set import Flags, Words
 from checkpoint.pages.xor_delta import Rows
 from checkpoint.runtime import parallel
 from checkpoint.runtime.identity_memo import Memo
@@ -160,18 +160,26 @@ def _pairs(runs: Iterable[PageRun]) -> bytes:
 # Reading
 
 
-def decode(source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *, threads: int = 1) -> Snapshot:
+Outlined: TypeAlias = tuple[Preamble, Snapshot]
+"""What is known of a file that was verified, but for its pages. The preamble has the digest of every section."""
+
+
+def decode(
+    source: Source, max_contents_size: int = layout.MAX_CONTENTS_SIZE, *, threads: int = 1, known: Outlined | None = None
+) -> Snapshot:
     """Read and verify a whole snapshot file.
 
     Args:
         max_contents_size: refuse a file that claims more bytes of pages than this.
         threads: that read and verify; more than one takes processors from what else runs here.
+        known: of this file: its sections are not read again, as long as it begins with that preamble.
 
     Raises:
         FormatError: not a whole, unaltered snapshot of a version that we read; says what and where.
     """
     with opened(source) as reader:
-        preamble, outline = outlined(reader)
+        preamble = _read_preamble(reader)
+        outline = known[1] if known is not None and known[0] == preamble else _read_outline(reader, preamble)[0]
         check_contents_size(preamble.contents_size, max_contents_size)
         contents = np.empty(preamble.contents_size, dtype=np.uint8).data
 
@@ -190,12 +198,13 @@ class Streamed(Struct, frozen=True):
     """A whole file that is read piece by piece, so that gigabytes of pages need no memory.
 
     Attributes:
-        outline: all but the pages.
+        preamble, outline: all but the pages.
         digest: the digest that the position must have (`canonical_state.state_digest`), of the bytes as read.
         pieces: the bytes of the pages, in order, `layout.FRAME_SIZE` at a time: verified, and the caller's to change until the
             next piece is asked for. After the last one every byte of the file has been verified.
     """
 
+    preamble: Preamble
     outline: Snapshot
     digest: bytes
     pieces: Iterator[memoryview]
@@ -213,7 +222,7 @@ def streamed(source: Source) -> Iterator[Streamed]:
         outline, state = _read_outline(reader, preamble)
         check_contents_size(preamble.contents_size)
         digest = canonical_state.digest_of_state(outline.page_sum, state)
-        yield Streamed(outline, digest, _pieces(reader, preamble))
+        yield Streamed(preamble, outline, digest, _pieces(reader, preamble))
 
 
 def _pieces(reader: Reader, preamble: Preamble) -> Iterator[memoryview]:
@@ -308,10 +317,10 @@ def verify(source: Source) -> Header:
     Raises:
         FormatError: as ``decode``.
     """
-    return canonical_state.header_of(verified_outline(source))
+    return canonical_state.header_of(verified(source)[1])
 
 
-def verified_outline(source: Source) -> Snapshot:
+def verified(source: Source) -> Outlined:
     """The outline of a file of which every byte is as it was written; no page is decompressed.
 
     Raises:
@@ -322,10 +331,10 @@ def verified_outline(source: Source) -> Snapshot:
         body = np.empty(min(preamble.contents_size, layout.FRAME_SIZE), dtype=np.uint8).data  # used again: new memory costs time
         for frame in frames_of(reader, preamble):
             check_frame(reader, frame, body[: frame.head.stored_size])
-    return outline
+    return preamble, outline
 
 
-def outlined(reader: Reader) -> tuple[Preamble, Snapshot]:
+def outlined(reader: Reader) -> Outlined:
     """The preamble of a file, and what `read_outline` answers."""
     preamble = _read_preamble(reader)
     return preamble, _read_outline(reader, preamble)[0]
@@ -358,7 +367,7 @@ def _read_outline(reader: Reader, preamble: Preamble) -> tuple[Snapshot, bytes |
         clocks=decoded.clocks,
         process=decoded.process,
         threads=decoded.threads,
-        vmas=Mappings(decoded.vmas),
+        vmas=decoded.vmas,
         resources=decoded.resources,
         cleared=table.cleared,
         runs=table.runs,

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from msgspec.structs import replace
 
@@ -18,7 +18,9 @@ from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
 from checkpoint.snapshot.byte_sources import Source
 from checkpoint.snapshot.canonical_state import header_of
+from checkpoint.snapshot.format import Outlined
 from checkpoint.snapshot.frames import Sink
+from checkpoint.snapshot.layout import Preamble
 from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
 from checkpoint.store.base_on_disk import stored_base, stored_chain
@@ -28,6 +30,15 @@ from checkpoint.store.folding import Folding
 from checkpoint.store.index import Entry, file_name, folder_name
 
 A = TypeVar("A")
+
+NOTHING: Final[Mapping[Path, Outlined | None]] = {}
+
+KNOWN_COUNT: Final = 256
+"""Deltas of which the outline stays in memory until they are folded; of more components than four others are read again."""
+
+KNOWN_RUNS: Final = 128
+KNOWN_OUTPUT: Final = 4 << 10
+"""Runs, and bytes of output, of one of these at most: it takes a few KB, because its mappings are those of the others."""
 
 
 class ChainFiles:
@@ -41,6 +52,20 @@ class ChainFiles:
         self._root = root
         self._files = files
         self._set_out_of_use = set_out_of_use
+        self._known: dict[Path, Outlined] = {}
+
+    def know(self, path: Path, preamble: Preamble, outline: Snapshot) -> None:
+        """Keep what a fold asks of a file that has just been verified, where that is little."""
+        output_size = sum(len(piece.content) for piece in outline.output)
+        if outline.parent is None or outline.is_tree or len(outline.runs) > KNOWN_RUNS or output_size > KNOWN_OUTPUT:
+            return
+        self._known[path] = preamble, replace(outline, threads=(), resources=())
+        for oldest in list(self._known)[:-KNOWN_COUNT]:
+            self.forget(oldest)
+
+    def forget(self, path: Path) -> None:
+        """A file goes."""
+        self._known.pop(path, None)
 
     def load(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
         """The state that a chain leads to, or None when a file of it had to be set out of use."""
@@ -59,7 +84,7 @@ class ChainFiles:
         Raises:
             FormatError: what it amounts to cannot be written; its files are not to blame, and stay.
         """
-        deltas = self._all_decoded(component, entries[1:])
+        deltas = self._all_decoded(component, entries[1:], {entry.path: self._known.get(entry.path) for entry in entries[1:-1]})
         is_tree = self._read(component, entries, lambda: format.is_of_several_processes(entries[0].path))
         if deltas is None or is_tree is None:
             return None
@@ -71,12 +96,14 @@ class ChainFiles:
         folded = replace(whole, output=newest_output(whole.output))
         return self._write(folded, lambda file: format.encode(folded, file))
 
-    def _all_decoded(self, component: str, entries: tuple[Entry, ...]) -> list[Snapshot] | None:
+    def _all_decoded(
+        self, component: str, entries: tuple[Entry, ...], known: Mapping[Path, Outlined | None] = NOTHING
+    ) -> list[Snapshot] | None:
         """All of these files, or None when one of them had to be set out of use."""
         snapshots = []
         for entry in entries:
             try:
-                snapshots.append(format.decode(entry.path))
+                snapshots.append(format.decode(entry.path, known=known.get(entry.path)))
             except FormatError as error:
                 self._set_out_of_use(component, entry, str(error))
                 return None

@@ -132,7 +132,12 @@ class Folding:
         chosen = np.flatnonzero(is_base)
         for index in page_set.distinct(places // np.uint64(self._count)).tolist():
             here = places // np.uint64(self._count) == index
-            rows[chosen[here]] = self._rows_of_base(index)[(places[here] % np.uint64(self._count)).astype(np.intp)]
+            told, within = self._rows_of_base(index), (places[here] % np.uint64(self._count)).astype(np.intp)
+            first, shift = within[0], chosen[here][0] - within[0]
+            if (chosen[here] == within + shift).all():  # as if no page came or went; those in between are overwritten below
+                rows[first + shift : within[-1] + shift + 1] = told[first : within[-1] + 1]
+            else:
+                rows[chosen[here]] = told[within]
         if not is_base.all():
             later = PageMap(state.addresses[~is_base], state.words[~is_base])
             rows[~is_base] = rows_of(self._origins.whole(self._stored.chain, later).data, self._page_size)

@@ -25,7 +25,7 @@ from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
 from checkpoint.snapshot.canonical_state import header_of
-from checkpoint.snapshot.format import Streamed
+from checkpoint.snapshot.format import Outlined, Streamed
 from checkpoint.snapshot.required_files import needs
 from checkpoint.snapshot.validity import place
 from checkpoint.store import inventory
@@ -206,16 +206,17 @@ class Store:
             StoreError: the disk does not take it; nothing of it is left.
         """
         if not prove:
-            return self._put(source, format.verified_outline(source))
+            return self._put(source, format.verified(source))
         with format.streamed(source) as told:
-            return self._put(source, told.outline, told)
+            return self._put(source, (told.preamble, told.outline), told)
 
-    def _put(self, source: int, snapshot: Snapshot, told: Streamed | None = None) -> Snapshot:
+    def _put(self, source: int, outlined: Outlined, told: Streamed | None = None) -> Snapshot:
         """Keep the file of a snapshot, which is given without its pages.
 
         Args:
             told: the same with its pages, to be proved; None: it was made here.
         """
+        preamble, snapshot = outlined
         with self._change_of(snapshot.component):
             shelf = self._shelf(snapshot.component)
             self._check_parent(shelf, snapshot)
@@ -228,6 +229,7 @@ class Store:
                 self._proofs.keep(snapshot.component, proved)
             else:  # a snapshot made here is not proved: pages remembered while it came from elsewhere are of no use
                 self._proofs.forget(snapshot.component)
+            self._chains.know(final, preamble, snapshot)
             outline = replace(snapshot, runs=(), cleared=(), copies=(), differences=(), contents=b"")
             with self._lock:
                 self._made_last.pop(snapshot.component, None)
@@ -421,6 +423,7 @@ class Store:
                     self._shelves[component] = self._shelf(component).without((entry,))
                 if entry.parent is None and taken(entry.path):
                     continue
+                self._chains.forget(entry.path)
                 self._files.remove(entry.path)  # a reader of a chain has opened it, or does not know this file any more
 
     def _remove_damaged(self, component: str, is_old: Callable[[Path], bool]) -> None:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from checkpoint.errors import FormatError
 from checkpoint.model import OutputPiece, PageRun, Resource, Snapshot, Vma
 from checkpoint.pages.page_set import Mappings
-from checkpoint.snapshot import format, layout, validity
+from checkpoint.snapshot import canonical_state, format, layout, validity
 from checkpoint.snapshot.frames import Packer
 from tests.checkpoint.snapshots import PAGE, START, family, history, page, snapshot, vma
 
@@ -69,8 +69,47 @@ def test_what_was_written_is_what_is_read(made: Snapshot) -> None:
     outline = format.read_outline(content)
     assert replace(outline, contents=made.contents) == made
     assert format.verify(content) == format.read_header(content)
-    assert format.verified_outline(content) == outline
+    assert format.verified(content)[1] == outline
     assert format.read_header(content).position == made.position
+
+
+def test_what_two_snapshots_tell_in_the_same_bytes_is_decoded_once() -> None:
+    first = snapshot({0: page("a")}, vmas=(vma(0, 7),))
+    other = snapshot({0: page("b")}, sequence=2, vmas=(vma(0, 7),), component="another")
+    read = [format.read_outline(format.encode_bytes(one)) for one in (first, other)]
+    for name in ("machine", "process", "vmas", "resources"):
+        assert getattr(read[0], name) is getattr(read[1], name)
+        assert getattr(read[1], name) == getattr(other, name)
+    wider = format.read_outline(format.encode_bytes(snapshot({0: page("a")}, vmas=(vma(0, 8),))))
+    assert wider.vmas == (vma(0, 8),)
+    assert wider.vmas != read[0].vmas
+
+
+def test_a_part_that_was_refused_is_refused_again() -> None:
+    """Keys out of order, which only a changed program writes."""
+    made = snapshot({0: page("a")})
+    packed = canonical_state.encode_state(replace(made, resources=(Resource("files", "fd 3", {"a": 1, "b": 2}),)))
+    wrong = packed.replace(b"\xa1a\x01\xa1b\x02", b"\xa1b\x02\xa1a\x01")
+    assert wrong != packed
+    for _ in range(2):
+        with pytest.raises(FormatError, match="facts of files 'fd 3': not in canonical form"):
+            canonical_state.decode_state(wrong)
+
+
+def test_sections_of_a_known_file_are_not_read_again_and_its_pages_are() -> None:
+    content = format.encode_bytes(snapshot({0: page("a"), 1: page("b")}))
+    known = format.verified(content)
+    altered = bytearray(content)
+    state = known[0].sections[layout.SectionKind.STATE - 1]
+    altered[state.offset + 3] ^= 1
+    assert format.decode(bytes(altered), known=known) == format.decode(content)
+    with pytest.raises(FormatError, match="section state"):
+        format.decode(bytes(altered))
+    altered[known[0].frames_offset + layout.FRAME_HEAD_SIZE] ^= 1
+    with pytest.raises(FormatError, match="its body does not match"):
+        format.decode(bytes(altered), known=known)
+    other = format.encode_bytes(snapshot({0: page("c")}))
+    assert format.decode(other, known=known) == format.decode(other)
 
 
 def test_a_file_of_several_frames_is_read_from_a_path_a_descriptor_and_memory(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from msgspec.structs import replace
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.keeper.messages import close_all, memfd_holding
 from checkpoint.model import Position, Snapshot
-from checkpoint.snapshot import format
+from checkpoint.snapshot import canonical_state, format
 from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
 from checkpoint.store.disk import Disk, DiskFile
@@ -302,6 +302,19 @@ def test_a_long_chain_is_folded_and_stays_the_same_state(tmp_path: Path) -> None
         assert store.newest(COMPONENT) == made[-1].position
         assert len(store.chain_of(COMPONENT)) <= 2
         assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(made))
+
+
+def test_a_fold_decodes_the_state_of_the_newest_delta_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, decoded = history(80), []
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+        read = canonical_state.decode_state
+        monkeypatch.setattr(canonical_state, "decode_state", lambda *state, **kind: decoded.append(1) or read(*state, **kind))
+        store.keep_newest(COMPONENT, 1)
+        assert len(decoded) == len(["base", "newest"])
+        assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(made))
+        assert not store._chains._known.keys() & {entry.path for entry in store.chain_of(COMPONENT)}
 
 
 class StuckDisk(Disk):

@@ -27,7 +27,7 @@ def _read_snapshot(content: bytes) -> object:
 
     made = format.decode(content)
     format.verify(content)
-    outline = format.verified_outline(content)
+    outline = format.verified(content)[1]
     format.read_state(content)
     format.encode_bytes(made)
     msgspec.json.encode(inspect_file.as_builtins(outline, len(content)))
