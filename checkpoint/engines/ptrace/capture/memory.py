@@ -308,6 +308,8 @@ class MemoryCapture:
             last, before = page_set.total_size(missing), last
             if (turn >= PASS_LIMIT or (before and self.budget.is_long)) and last >= CATCHING_UP * before:
                 break
+            if not enough and not is_again and last < LARGE_COUNT * abi.PAGE_SIZE:
+                break  # while so few were read, hardly as many were written
         copied.owed = page_set.difference(self._since_acknowledged(base=base)[0], copied.valid)
         return copied
 
@@ -352,7 +354,18 @@ class MemoryCapture:
 
     def _read_into(self, copied: RunningCopy, wanted: Words) -> None:
         """Read a set as far as it is there."""
-        buffer = np.empty(page_set.total_size(wanted) + ROOM_SIZE, dtype=np.uint8).data
+        wanted_size = page_set.total_size(wanted)
+        buffer = np.empty(wanted_size + ROOM_SIZE, dtype=np.uint8).data
+        if wanted_size <= READ_CHUNK:
+            found = self._memory.readable_pages_into(wanted, buffer[:wanted_size])
+            filled = page_set.total_size(found)
+        else:
+            found, filled = self._read_in_chunks(wanted, buffer)
+        if filled:
+            copied.add(Copy(found, buffer[: filled + ROOM_SIZE]))
+
+    def _read_in_chunks(self, wanted: Words, buffer: memoryview) -> tuple[Words, int]:
+        """The pages of a set that are there, and how many bytes of the buffer they fill."""
         found, filled = [], 0
         chunks = page_set.cut(wanted, READ_CHUNK)
         bounds = itertools.pairwise(itertools.accumulate(map(page_set.total_size, chunks), initial=0))
@@ -362,15 +375,14 @@ class MemoryCapture:
             chunk, begin, end = place
             return Memory(self._memory.pid).readable_pages_into(chunk, buffer[begin:end])
 
-        answers = parallel.in_order(read, places, self.readers if len(places) > 1 else 1)
+        answers = parallel.in_order(read, places, self.readers)
         for (_, begin, _), readable in zip(places, answers, strict=True):
             size = page_set.total_size(readable)
             if begin != filled:  # of one before it there was less than was wanted
                 buffer[filled : filled + size] = buffer[begin : begin + size]
             found.append(readable)
             filled += size
-        if found:
-            copied.add(Copy(pagemap.pages_joined(np.concatenate(found)), buffer[: filled + ROOM_SIZE]))
+        return pagemap.pages_joined(np.concatenate(found)), filled
 
     def rehearse(self) -> None:
         """See ``checkpoint.engines.ptrace.capture.process``."""

@@ -68,6 +68,10 @@ from checkpoint.store.base_in_process import UnreadBase
 MOVED_S: Final = 2.0
 """How long a freeze is made again because processes came and went in the middle of it, since the first one."""
 MOVED_PAUSE_S: Final = 0.005
+DIFFERENCES_SHOWN: Final = 3
+"""Times in a row that a program was found to have changed, after which it is asked less often whether it rests…"""
+UNASKED_MAX: Final = 7
+"""…up to so many captures apart: to compare takes a tenth of a small capture, and a program that works does not rest soon."""
 FREEZES_MAX: Final = 4
 """Freezes of one capture that may be given up because they would take too long."""
 
@@ -109,6 +113,7 @@ class PtraceSession:
         self._owner = order.terms.owner
         self._epoch = 0
         self._rests_until = 0.0
+        self._differences = self._unasked = 0
         self._closed = False
 
     @property
@@ -194,9 +199,14 @@ class PtraceSession:
             or self._standstill.is_held
         ):
             return None
+        if self._unasked:
+            self._unasked -= 1
+            return None
         try:
             processes = {process.pid: process for process in self._tree.processes()}
             has_rested = self._first.has_rested() and all(process.has_rested() for process in processes.values())
+            self._differences = 0 if has_rested else self._differences + 1
+            self._unasked = min((1 << max(self._differences - DIFFERENCES_SHOWN, 0)) - 1, UNASKED_MAX)
             return known if has_rested and processes.keys() == set(self._tree.others()) else None
         except CheckpointError:  # the capture that follows says why
             return None

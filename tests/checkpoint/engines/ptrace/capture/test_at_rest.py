@@ -14,6 +14,7 @@ import pytest
 
 from checkpoint.engine import CaptureOrder, Session
 from checkpoint.engines.ptrace.capture import at_rest, memory, memory_result
+from checkpoint.engines.ptrace.capture.process import CapturedProcess
 from checkpoint.engines.ptrace.capture.session import PtraceSession
 from checkpoint.engines.ptrace.capture.snapshot_builder import SnapshotBuilder
 from checkpoint.errors import UnsupportedError
@@ -137,6 +138,21 @@ def test_pages_that_were_read_to_compare_them_are_not_read_again_unless_written(
             assert _differing_pages(one.program.pid, snapshot) <= 1, "but for where restartable sequences are noted"
             if not is_written_again:
                 assert not read
+
+
+def test_a_program_that_works_is_compared_less_often_and_one_that_comes_to_rest_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("checkpoint.engines.ptrace.capture.session.REST_MAX_S", PATIENCE_S)
+    asked: list[int] = []
+    with waiting(tmp_path) as one:
+        with monkeypatch.context() as patched:
+            patched.setattr(CapturedProcess, "has_rested", lambda _: bool(asked.append(ask)))
+            for ask in range(1, 41):  # noqa: B007 - the lambda has it
+                assert one.session.unchanged(0) is None
+        assert asked == [1, 2, 3, 4, 6, 10, 18, 26, 34]
+        one.until_at_rest()
+        assert one.session.unchanged(0) is not None, "it is asked each time again"
 
 
 def _until_compared(one: Waiting) -> None:
