@@ -203,7 +203,9 @@ class ReadyCopy:
             raise launch.stale(self._name)
         if newest[-1].position == ready.outline.position:
             return
-        deltas, outline = await asyncio.to_thread(self._opened, newest[-1].position, ready.outline.position)
+        last, held = newest[-1].position, ready.outline.position
+        is_known = self._outline is not None and self._outline.position == last  # nothing is read then
+        deltas, outline = self._opened(last, held) if is_known else await asyncio.to_thread(self._opened, last, held)
         try:
             if outline is None:
                 return

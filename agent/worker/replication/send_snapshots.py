@@ -6,6 +6,7 @@ import asyncio
 import logging
 import os
 from collections.abc import Callable
+from typing import Final
 
 from agent.errors import AgentError, LaneError
 from agent.system.crash import end_worker_on_mistake
@@ -22,6 +23,9 @@ from failover.core.events import Event, ShipEnded, UnderWay
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Offer
 
 log = logging.getLogger("failover.dispatch")
+
+AT_ONCE_SIZE: Final = 64 << 10
+"""Bytes of a file that is examined at once: to hand it to a thread, and to wait for that, takes longer."""
 
 
 class Dispatch:
@@ -94,7 +98,9 @@ class Dispatch:
             entry = await asyncio.to_thread(self._folded, act)
         descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            needed, digest = await asyncio.to_thread(self._examined, act.component, entry, descriptor)
+            told = act.component, entry, descriptor
+            is_small = entry.size <= AT_ONCE_SIZE
+            needed, digest = self._examined(*told) if is_small else await asyncio.to_thread(self._examined, *told)
             if self._bringing is not None:
                 await self._bringing.bring(act.to, act.component, needed)
             digest = digest or await asyncio.to_thread(digest_of, descriptor, entry.size)

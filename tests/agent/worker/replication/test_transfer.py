@@ -14,13 +14,20 @@ from blake3 import blake3
 
 from agent.errors import LaneError
 from agent.system import crash
-from agent.worker.replication import transfer
+from agent.worker.replication import send_snapshots, transfer
+from agent.worker.replication.send_snapshots import Dispatch
 from agent.worker.replication.transfer import BATCH_CHUNKS, Receiver, Refusal, Shipper, digest_of
+from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Position
+from checkpoint.snapshot import format
 from checkpoint.store.disk import DiskFile
+from checkpoint.store.store import open_store
+from failover.core import acts
+from failover.core.events import Event, ShipEnded
 from failover.core.types import ComponentSpec
 from failover.core.wire.codec import encode_bulk
 from failover.core.wire.messages import CHUNK_SIZE_MAX, Bulk, Cancel, Chunk, Credit, Offer, Refuse, Taken
+from tests.checkpoint.snapshots import PAGE, snapshot
 
 SIZE = 5 * CHUNK_SIZE_MAX + 17
 SMALL = 3_000
@@ -166,6 +173,38 @@ def test_a_small_snapshot_travels_with_its_offer(tmp_path: Path, small: Path) ->
         assert [type(message) for message in (*two.out.said, *two.back.said)] == [Offer, Taken]
 
     run(body())
+
+
+@pytest.mark.parametrize(("pages", "threads"), [(1, 0), (64, 1)], ids=["small", "large"])
+def test_a_small_file_is_examined_without_a_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pages: int, threads: int
+) -> None:
+    made = snapshot({number: os.urandom(PAGE) for number in range(pages)})
+    store, to_thread = open_store(tmp_path / "store"), asyncio.to_thread
+    handed: list[str] = []
+    told: list[Event] = []
+
+    def handing(*call: Any) -> Coroutine[Any, Any, Any]:
+        handed.append(call[0].__name__)
+        return to_thread(*call)
+
+    async def body() -> None:
+        two, ended = Two(tmp_path, Desk()), asyncio.Event()
+        dispatch = Dispatch(store, two.shipper, lambda event: told.append(event) or ended.set())
+        monkeypatch.setattr(send_snapshots.asyncio, "to_thread", handing)
+        dispatch.ship(acts.Ship(made.component, 1, made.position, None, "robot2", ComponentSpec(made.component)))
+        await asyncio.wait_for(ended.wait(), BOUND_S)
+        assert two.desk.taken == [store.chain_of(made.component)[-1].path.read_bytes()]
+
+    try:
+        descriptor = memfd_holding(format.encode_bytes(made), "snapshot")
+        store.put(descriptor)
+        os.close(descriptor)
+        run(body())
+    finally:
+        store.close()
+    assert told == [ShipEnded(made.component, 1, made.position, "robot2", True, "")]
+    assert handed.count("_examined") == threads
 
 
 def test_a_receiver_of_an_older_release_gets_a_small_snapshot_as_a_chunk(tmp_path: Path, small: Path) -> None:
