@@ -20,7 +20,7 @@ from checkpoint.snapshot.byte_sources import Source
 from checkpoint.snapshot.canonical_state import header_of
 from checkpoint.snapshot.format import Outlined
 from checkpoint.snapshot.frames import Sink
-from checkpoint.snapshot.layout import Preamble
+from checkpoint.snapshot.layout import Preamble, SectionKind
 from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
 from checkpoint.store.base_on_disk import stored_base, stored_chain
@@ -38,7 +38,11 @@ KNOWN_COUNT: Final = 256
 
 KNOWN_RUNS: Final = 128
 KNOWN_OUTPUT: Final = 4 << 10
-"""Runs, and bytes of output, of one of these at most: it takes a few KB, because its mappings are those of the others."""
+KNOWN_STATE: Final = 64 << 10
+"""Runs of all kinds, bytes of output, and bytes of the state section, of one of these at most."""
+
+KNOWN_STATES: Final = 8 << 20
+"""Bytes of all state sections of these: in memory twice as much, where no two have the same mappings."""
 
 
 class ChainFiles:
@@ -53,19 +57,28 @@ class ChainFiles:
         self._files = files
         self._set_out_of_use = set_out_of_use
         self._known: dict[Path, Outlined] = {}
+        self._states_size = 0
 
     def know(self, path: Path, preamble: Preamble, outline: Snapshot) -> None:
         """Keep what a fold asks of a file that has just been verified, where that is little."""
+        self.forget(path)
         output_size = sum(len(piece.content) for piece in outline.output)
-        if outline.parent is None or outline.is_tree or len(outline.runs) > KNOWN_RUNS or output_size > KNOWN_OUTPUT:
+        runs = len(outline.runs) + len(outline.cleared) + len(outline.copies) + len(outline.differences) + len(outline.notes)
+        if outline.parent is None or outline.is_tree or runs > KNOWN_RUNS or output_size > KNOWN_OUTPUT:
+            return
+        if (size := _state_size(preamble)) > KNOWN_STATE:
             return
         self._known[path] = preamble, replace(outline, threads=(), resources=())
-        for oldest in list(self._known)[:-KNOWN_COUNT]:
+        self._states_size += size
+        for oldest in list(self._known):
+            if len(self._known) <= KNOWN_COUNT and self._states_size <= KNOWN_STATES:
+                break
             self.forget(oldest)
 
     def forget(self, path: Path) -> None:
         """A file goes."""
-        self._known.pop(path, None)
+        if (known := self._known.pop(path, None)) is not None:
+            self._states_size -= _state_size(known[0])
 
     def load(self, component: str, entries: tuple[Entry, ...]) -> Snapshot | None:
         """The state that a chain leads to, or None when a file of it had to be set out of use."""
@@ -155,3 +168,7 @@ def entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:
     """A file that has just been written."""
     pages_size = sum(run.size for run in snapshot.runs)
     return Entry(path, snapshot.position, snapshot.parent, snapshot.epoch, size, time.time(), pages_size)
+
+
+def _state_size(preamble: Preamble) -> int:
+    return next(section.raw_size for section in preamble.sections if section.kind is SectionKind.STATE)

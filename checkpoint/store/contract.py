@@ -96,6 +96,10 @@ class SnapshotStore(Protocol):
         """A snapshot without its pages, from the descriptor of its file."""
         ...
 
+    def is_made_last(self, component: str, entry: Entry) -> bool:
+        """Whether `outline` of this file reads nothing."""
+        ...
+
     def load(self, component: str, position: Position | None = None) -> Snapshot:
         """The state at a position as one base, verified and proved; the newest that is intact, if none is named."""
         ...

@@ -147,6 +147,12 @@ class Store:
             path, outline = self._made_last.get(component, (None, None))
         return outline if outline is not None and path == entry.path else format.read_outline(source)
 
+    def is_made_last(self, component: str, entry: Entry) -> bool:
+        """Whether `outline` of this file is known, and reads nothing."""
+        with self._lock:
+            path, _ = self._made_last.get(component, (None, None))
+        return path == entry.path
+
     def load(self, component: str, position: Position | None = None) -> Snapshot:
         """The state at a position as one base, verified and proved.
 

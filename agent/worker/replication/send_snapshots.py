@@ -25,7 +25,7 @@ from failover.core.wire.messages import CHUNK_SIZE_MAX, Offer
 log = logging.getLogger("failover.dispatch")
 
 AT_ONCE_SIZE: Final = 64 << 10
-"""Bytes of a file that is examined at once: to hand it to a thread, and to wait for that, takes longer."""
+"""Bytes of a file that was made here last and is examined at once: to hand it to a thread, and to wait for that, takes longer."""
 
 
 class Dispatch:
@@ -99,8 +99,8 @@ class Dispatch:
         descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
             told = act.component, entry, descriptor
-            is_small = entry.size <= AT_ONCE_SIZE
-            needed, digest = self._examined(*told) if is_small else await asyncio.to_thread(self._examined, *told)
+            is_little = entry.size <= AT_ONCE_SIZE and self._store.is_made_last(act.component, entry)
+            needed, digest = self._examined(*told) if is_little else await asyncio.to_thread(self._examined, *told)
             if self._bringing is not None:
                 await self._bringing.bring(act.to, act.component, needed)
             digest = digest or await asyncio.to_thread(digest_of, descriptor, entry.size)

@@ -22,9 +22,9 @@ from msgspec.structs import replace
 
 from checkpoint.errors import ChainError, FormatError, StoreError
 from checkpoint.keeper.messages import close_all, memfd_holding
-from checkpoint.model import Position, Snapshot
+from checkpoint.model import PageRun, Position, Snapshot
 from checkpoint.snapshot import canonical_state, format
-from checkpoint.store import chain
+from checkpoint.store import chain, chain_files
 from checkpoint.store.atomic_files import WholeFiles
 from checkpoint.store.disk import Disk, DiskFile
 from checkpoint.store.fold_rules import fold_is_due
@@ -315,6 +315,29 @@ def test_a_fold_decodes_the_state_of_the_newest_delta_alone(tmp_path: Path, monk
         assert len(decoded) == len(["base", "newest"])
         assert pages_of(store.load(COMPONENT)) == pages_of(chain.fold(made))
         assert not store._chains._known.keys() & {entry.path for entry in store.chain_of(COMPONENT)}
+
+
+def test_what_is_known_of_deltas_for_a_fold_stays_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = history(6)
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+        known = list(store._chains._known)
+        assert len(known) == 5 and store._chains._states_size > 0
+        monkeypatch.setattr(chain_files, "KNOWN_STATES", 0)
+        store._chains.know(known[0], *store._chains._known[known[0]])
+        assert not store._chains._known and store._chains._states_size == 0
+    with opened(tmp_path / "other") as store, monkeypatch.context() as patched:
+        patched.setattr(chain_files, "KNOWN_STATES", 8 << 20)
+        patched.setattr(chain_files, "KNOWN_STATE", 100)
+        for one in made:
+            put(store, one)
+        assert not store._chains._known, "each has a large state"
+    many = replace(made[1], cleared=tuple(PageRun(number << 13, (number << 13) + 4096) for number in range(1, 2_000)))
+    with opened(tmp_path / "third") as store:
+        put(store, made[0])
+        put(store, many, prove=False)
+        assert not store._chains._known, "many runs were cleared"
 
 
 class StuckDisk(Disk):

@@ -205,7 +205,7 @@ class PtraceSession:
         try:
             processes = {process.pid: process for process in self._tree.processes()}
             has_rested = self._first.has_rested() and all(process.has_rested() for process in processes.values())
-            self._differences = 0 if has_rested else self._differences + 1
+            self._differences = 0 if has_rested else min(self._differences + 1, DIFFERENCES_SHOWN + UNASKED_MAX.bit_length())
             self._unasked = min((1 << max(self._differences - DIFFERENCES_SHOWN, 0)) - 1, UNASKED_MAX)
             return known if has_rested and processes.keys() == set(self._tree.others()) else None
         except CheckpointError:  # the capture that follows says why
