@@ -101,9 +101,9 @@ class SlackGate:
         slack_ns = wait.slack_ns if wait.slack_ns is not None else 0
         opened_ns, self._opened_ns = self._opened_ns, 0
         with contextlib.suppress(FailoverError):  # a file that cannot be read tells of no task
+            task, period_ns = self._first_due(file)
             self._outcome = Slack(
-                *self._first_due(file),
-                *(opened_ns, ended_ns, opened_ns - wait.asked_ns),
+                *(task, period_ns, opened_ns, ended_ns, opened_ns - wait.asked_ns),
                 *(slack_ns, wait.freeze_ns, self._is_squeezed and stood_still),
             )
 

@@ -146,7 +146,7 @@ class TeamNow:
         files = (here.rules / team_file.TEAM_FILE, team_file.secret_key_path(here.rules, here.robot))
         self._files = tuple(map(os.fspath, files))
         self._stamps: tuple[tuple[int, ...], ...] = ()
-        self._failed_stamps = self._stamps
+        self._failed_stamps: tuple[tuple[int, ...], ...] = ()
         self._retry_ns = 0
         self._trouble = ""
 
