@@ -239,7 +239,7 @@ def test_a_process_that_hangs_is_told_and_replaced(tmp_path: Path, monkeypatch: 
         one.running.add(COMPONENT)
 
         async def work() -> None:
-            await until(lambda: one.archived() == [1])
+            await until(lambda: (shelf := one.archiving._shelves.get(COMPONENT)) is not None and shelf.position is not None)
             child = one.archiving._child
             assert child is not None
             os.kill(child.pid, signal.SIGSTOP)
