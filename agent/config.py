@@ -500,10 +500,21 @@ def _check_alerts(path: Path, config: Config, members: Team) -> None:
 
 
 def _check_archive(path: Path, config: Config, members: Team) -> None:
-    """A witness holds nothing to archive."""
-    if config.store.s3 and members.robots[config.robot].role == "witness":
-        where = f"{path}:{strict_toml.line_of(path.read_text(), ('store',))}: store"
-        raise ConfigError(f"{where}: {config.robot} is a witness, and keeps no checkpoints; set s3 on robots or servers")
+    """A witness holds nothing to archive, and it alone keeps the copies of others."""
+    store, role = config.store, members.robots[config.robot].role
+    where = f"{path}:{strict_toml.line_of(path.read_text(), ('store',))}: store"
+    if role == "witness" and store.place:
+        raise ConfigError(
+            f"{where}: {config.robot} is a witness, and has no checkpoints of its own; set s3 or witness on robots or servers"
+        )
+    if role != "witness" and store.sealed_size:
+        raise ConfigError(f"{where}: {config.robot} is a {role}: sealed_size is for a witness, which keeps copies for others")
+    if store.witness and (store.witness not in members.robots or members.robots[store.witness].role != "witness"):
+        able = ", ".join(sorted(name for name, member in members.robots.items() if member.role == "witness"))
+        raise ConfigError(
+            f"{where}: witness = {store.witness!r}, which is no witness of the team; "
+            + (f"choose among {able}" if able else "failover team invite NAME --role witness adds one")
+        )
 
 
 def _check_user(where: str, user: str) -> None:

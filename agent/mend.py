@@ -109,15 +109,19 @@ def check_right(directory: Path) -> None:
         raise AgentError(f"cannot mend a record in {directory}: it belongs to uid {owner}; ask root")
 
 
-def check_stopped(settings: Settings, name: str) -> None:
-    runtime = Path(settings.config.runtime_directory)
+def check_agent_stopped(settings: Settings) -> None:
+    """Raises AgentError: it runs."""
     try:
-        Control.open(runtime / "control.sock").close()
+        Control.open(Path(settings.config.runtime_directory) / "control.sock").close()
     except NoAgentError:
-        pass
-    else:
-        raise AgentError(f"the agent of {settings.config.robot} runs; stop it first")
-    if Records(runtime / "running").epoch(name):
+        return
+    raise AgentError(f"the agent of {settings.config.robot} runs; stop it first")
+
+
+def check_stopped(settings: Settings, name: str) -> None:
+    """Raises AgentError: the agent runs, or the component."""
+    check_agent_stopped(settings)
+    if Records(Path(settings.config.runtime_directory) / "running").epoch(name):
         raise AgentError(
             f"{name} runs at {settings.config.robot}, or did until it was killed; start the agent and failover release it "
             "(it runs on), or end it, first"

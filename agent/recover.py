@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,7 +18,7 @@ from agent.config import Settings
 from agent.core_config import retention
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
-from agent.mend import check_right, check_stopped
+from agent.mend import check_agent_stopped, check_right, check_stopped
 from agent.worker.replication.receive_files import is_in_place
 from checkpoint.errors import UNDECODABLE, CheckpointError
 from checkpoint.sentences import in_words
@@ -27,6 +28,8 @@ from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.store import open_store
 from failover.archive import sealed
 from failover.archive.archive import Archive, Copy, Label, object_store
+from failover.archive.objects import ObjectStore
+from failover.archive.witness import WitnessObjects
 from failover.core import vote_record as core_vote_record
 from failover.core.types import ComponentSpec, Record, State, VoteRecord
 
@@ -39,8 +42,8 @@ def recover(settings: Settings, name: str) -> int:
         FailoverError: the archive does not have it, or does not give it whole.
     """
     directory, config = Path(settings.config.state_directory), settings.config.store
-    if not config.s3:
-        raise AgentError(f'{settings.path} names no archive; write s3 = "s3://BUCKET/PREFIX" into [store]')
+    if not config.place:
+        raise AgentError(f'{settings.path} names no archive; write s3 = "s3://BUCKET/PREFIX", or witness = "NAME", into [store]')
     if settings.me.role == "witness":
         raise AgentError(f"{settings.config.robot} is a witness, and keeps no checkpoints; recover {name} at a robot")
     try:
@@ -49,10 +52,30 @@ def recover(settings: Settings, name: str) -> int:
         raise AgentError(f"cannot make the state directory {directory}: {error.strerror}") from error
     check_right(directory)
     key = sealed.read_key(Path(settings.config.team_directory))
-    archive = Archive(object_store(config.s3, config.s3_endpoint), key, settings.team.team, directory)
+    with _objects(settings, key) as objects:
+        return _recover(settings, name, Archive(objects, key, settings.team.team, directory), directory)
+
+
+@contextlib.contextmanager
+def _objects(settings: Settings, key: bytes) -> Iterator[ObjectStore]:
+    """Where the copies are."""
+    config = settings.config.store
+    if not config.witness:
+        yield object_store(config.s3, config.s3_endpoint)
+        return
+    from agent.visit import visiting  # here: only then a connection is needed
+
+    check_agent_stopped(settings)
+    with visiting(settings) as witness:
+        yield WitnessObjects(witness, key)
+
+
+def _recover(settings: Settings, name: str, archive: Archive, directory: Path) -> int:
     copies = archive.named(name)
     if not copies:
-        raise AgentError(f"the archive {config.s3} has no checkpoint of {name}; failover archive list shows those there are")
+        raise AgentError(
+            f"the archive {settings.config.store.place} has no checkpoint of {name}; failover archive list shows those there are"
+        )
     record_file = VoteRecordFile(directory, settings.config.robot)
     before = core_vote_record.decode(record_file.read().core)
     try:

@@ -39,3 +39,28 @@ class Done(Struct, frozen=True, tag=True):
 
 
 Request = Look | KeepContent | KeepCheckpoint
+
+
+class Carry(Struct, frozen=True, tag=True):
+    """Instead of an answer, before it: have the witness do this (`failover.archive.witness`). Answered by `Carried`.
+
+    Attributes:
+        arguments: of a request to it, in msgpack; b"": take these bytes, whose file comes with this message.
+        digest, size: of that file.
+    """
+
+    arguments: bytes = b""
+    digest: bytes = b""
+    size: int = 0
+
+
+class Carried(Struct, frozen=True, tag=True):
+    """What came of a `Carry`.
+
+    Attributes:
+        refusal: why it was not done; "" where it was.
+        answer: of the witness, in msgpack.
+    """
+
+    refusal: str = ""
+    answer: bytes = b""

@@ -13,12 +13,12 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import msgspec
 
 from agent import config as configuration
-from agent.archive.messages import Done, KeepCheckpoint, KeepContent, Look, Request
+from agent.archive.messages import Carried, Carry, Done, KeepCheckpoint, KeepContent, Look, Request
 from agent.config import Settings
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
@@ -30,8 +30,9 @@ from checkpoint.store.chain_files import fold_to
 from checkpoint.store.fold_rules import count_at_once
 from failover.archive import sealed
 from failover.archive.archive import Archive, object_store, require_room
+from failover.archive.witness import Witness, WitnessObjects
 from failover.core import vote_record
-from failover.errors import FailoverError
+from failover.errors import ArchiveError, FailoverError
 
 NICE: Final = 10
 """A tenth of what an ordinary process gets where both want the processor: it yields, and still comes on where all are busy."""
@@ -39,11 +40,36 @@ NICE: Final = 10
 OOM_SCORE: Final = "800"
 
 
+class ByWorker:
+    """The way to the witness, as `failover.archive.witness.Witness` says: the worker has the link, and the credit on it."""
+
+    def __init__(self, channel: Channel[Request | Carried]) -> None:
+        self._channel = channel
+
+    def ask(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """See `failover.archive.witness.Witness.ask`."""
+        answer: dict[str, Any] = msgspec.msgpack.decode(self._carried(Carry(msgspec.msgpack.encode(arguments))))
+        return answer
+
+    def ship(self, digest: bytes, size: int, descriptor: int) -> None:
+        """See `failover.archive.witness.Witness.ship`."""
+        self._carried(Carry(digest=digest, size=size), (descriptor,))
+
+    def _carried(self, carry: Carry, descriptors: tuple[int, ...] = ()) -> bytes:
+        self._channel.send(carry, descriptors)
+        answer, _ = self._channel.receive()
+        assert isinstance(answer, Carried), "the worker asks one thing after the other"
+        if answer.refusal:
+            raise ArchiveError(answer.refusal)
+        return answer.answer
+
+
 class Archivist:
     """Carries requests out. The place, the key and the bucket's keys are looked for at each: they may come later, and change."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, witness: Witness | None = None) -> None:
         self._settings = settings
+        self._witness = witness
         self._aside = Path(settings.config.state_directory)
 
     def answer(self, request: Request, descriptors: tuple[int, ...]) -> Done:
@@ -72,7 +98,8 @@ class Archivist:
     def _opened(self) -> Archive:
         store, team = self._settings.config.store, self._settings.team.team
         key = sealed.read_key(Path(self._settings.config.team_directory))
-        return Archive(object_store(store.s3, store.s3_endpoint), key, team, self._aside)
+        objects = WitnessObjects(self._witness, key) if self._witness is not None else object_store(store.s3, store.s3_endpoint)
+        return Archive(objects, key, team, self._aside)
 
     @contextlib.contextmanager
     def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:
@@ -106,18 +133,20 @@ def _pages_size(snapshot: int) -> int:
 def main() -> int:
     """Answer until the worker has gone."""
     path, descriptor = sys.argv[1:3]
-    channel: Channel[Request] = Channel(socket.socket(fileno=int(descriptor)), Request)
+    channel: Channel[Request | Carried] = Channel(socket.socket(fileno=int(descriptor)), Request | Carried)
     os.nice(NICE)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(OOM_SCORE)
     try:
-        archivist = Archivist(configuration.load(Path(path)))
+        settings = configuration.load(Path(path))
     except AgentError as error:
         print(f"failover archive: {error}", file=sys.stderr)
         return 1
+    archivist = Archivist(settings, ByWorker(channel) if settings.config.store.witness else None)
     while True:
         try:
             request, descriptors = channel.receive()
+            assert not isinstance(request, Carried), "nothing is being carried"
             try:
                 channel.send(archivist.answer(request, descriptors))
             finally:

@@ -20,14 +20,16 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
+import msgspec
 from msgspec import Struct, field
 
-from agent.archive.messages import Done, KeepCheckpoint, KeepContent, Look, Request
+from agent.archive.messages import Carried, Carry, Done, KeepCheckpoint, KeepContent, Look, Request
 from agent.config import Settings
 from agent.errors import TROUBLE, AgentError
 from agent.worker.components.connection import Dialogue
 from agent.worker.components.snapshots import newest_of
 from agent.worker.replication.send_files import Reader
+from agent.worker.replication.send_sealed import Courier
 from checkpoint.keeper.messages import close_all, pair
 from checkpoint.model import Position
 from checkpoint.snapshot import format
@@ -35,6 +37,7 @@ from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
 from failover.archive.sealed import key_path
 from failover.core.events import Event, Noticed
+from failover.core.wire.messages import Content
 
 BEHIND_ROUNDS: Final = 3
 """A copy that is older than so many rounds is told of, also while one is under way."""
@@ -86,11 +89,14 @@ class Archiving:
         running: Callable[[], Collection[str]],
         open_need: Reader,
         tell: Callable[[Event], None],
+        courier: Courier | None = None,
     ) -> None:
         """
         Args:
             running: the components that run here.
+            courier: brings what is for the witness that keeps the copies; None: they go elsewhere.
         """
+        self._courier = courier
         self._settings, self._config = settings, settings.config.store
         self._store, self._running, self._open_need, self._tell = store, running, open_need, tell
         self._shelves: dict[str, _Shelf] = {}
@@ -140,6 +146,13 @@ class Archiving:
             )
         more = len(behind) - SAID_MAX
         return behind[:SAID_MAX] + ([f"ARCHIVE BEHIND: {more} more components"] if more > 0 else [])
+
+    def sealed(self, component: str) -> dict[str, object] | None:
+        """For the status: the newest copy of a component at the witness; None: this worker has made none there."""
+        shelf = self._shelves.get(component)
+        if not self._config.witness or shelf is None or shelf.position is None:
+            return None
+        return {"at": self._config.witness, "age_s": time.monotonic() - shelf.since_s, "copies": None, "size": None}
 
     def _wanted(self) -> list[str]:
         held = self._store.components()
@@ -237,6 +250,8 @@ class Archiving:
         try:
             async with asyncio.timeout(limit_s):
                 answer, more = await dialogue.ask(request, descriptors)
+                while isinstance(answer, Carry):
+                    answer, more = await dialogue.ask(await self._carry(answer, more))
         except TimeoutError as error:
             self._hang_up()
             raise NotArchivedError(
@@ -246,6 +261,19 @@ class Archiving:
         if not isinstance(answer, Done) or answer.refusal:
             raise NotArchivedError(answer.refusal)
         return answer
+
+    async def _carry(self, carry: Carry, descriptors: tuple[int, ...]) -> Carried:
+        """Have the witness do something for the process."""
+        assert self._courier is not None, "the process knows the same settings"
+        try:
+            if carry.arguments:
+                return Carried(answer=msgspec.msgpack.encode(await self._courier.ask(msgspec.msgpack.decode(carry.arguments))))
+            await self._courier.ship(Content(0, carry.size, carry.digest), descriptors[0])
+        except TROUBLE as error:
+            return Carried(str(error))
+        finally:
+            close_all(descriptors)
+        return Carried()
 
     async def _opened(self) -> Dialogue:
         """The conversation with the process, which is started if there is none.
@@ -268,7 +296,7 @@ class Archiving:
         with theirs:
             command = [sys.executable, "-P", "-m", "agent.archive.process", str(self._settings.path), str(theirs.fileno())]
             self._child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, process_group=0)
-        self._dialogue = Dialogue(ours, Done, NotArchivedError, "the archive's process")
+        self._dialogue = Dialogue(ours, Done | Carry, NotArchivedError, "the archive's process")
         return self._dialogue
 
     def _hang_up(self) -> None:

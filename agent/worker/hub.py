@@ -15,8 +15,9 @@ import signal
 import socket
 import sys
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 from agent import config as configuration
@@ -46,11 +47,11 @@ from agent.system.systemd_units import is_restarted, starter
 from agent.worker.control.queries import QUESTIONS, Questions
 from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import ControlServer
-from agent.worker.network.connections import BULK, AllConnections
+from agent.worker.network.connections import BULK, AllConnections, keys_of
 from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Link, Links, Medium
-from agent.worker.network.remote_orders import Errands
-from agent.worker.network.replication_link import Keys, LinkState, public_key_of
+from agent.worker.network.remote_orders import Errands, OrderOfPeer
+from agent.worker.network.replication_link import LinkState
 from agent.worker.team_changes import TEAM_IS, TEAM_TOLD, TeamChanges, digest
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError
@@ -112,7 +113,7 @@ class Switchboard:
         self._own_troubles: list[str] = []
         self._board_troubles: list[str] = []
         self._signs: dict[tuple[str, str], float] = {}
-        keys = self._keys()
+        keys = keys_of(settings)
         if keys.present and keys.public not in settings.me.keys:
             self._own_troubles.append(UNFIT_KEY)
         facts = Facts(frozenset(config.wireless))
@@ -122,19 +123,11 @@ class Switchboard:
         self._replication_link = self._connections.bulk
         self.team_changes = TeamChanges(self)
 
-    def connect(self, verbs: Questions) -> None:
-        """Have the orders of people and robots carried out by these."""
+    def connect(self, verbs: Questions, of_peers: Mapping[str, OrderOfPeer] = MappingProxyType({})) -> None:
+        """Have the orders of people and robots carried out by these; ``of_peers``: further ones that robots give themselves."""
         self.verbs = verbs
-        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands(), self.team_changes.orders())
-
-    def _keys(self) -> Keys:
-        settings = self.settings
-        if settings.config.insecure:
-            return Keys("", "", {})
-        known = {**settings.former, **settings.team.robots}
-        publics = {name: robot.public_key for name, robot in known.items()}
-        following = {name: robot.next_key for name, robot in known.items() if robot.next_key}
-        return Keys(public_key_of(settings.secret_key), settings.secret_key, publics, following)
+        orders = {**self.team_changes.orders(), **of_peers}
+        self.errands = Errands(self._connections.say, self.hindrance, verbs.errands(), orders)
 
     async def take_team(self, team: Team) -> None:
         """Go on with these members: the main loop's frames and rules, and every connection."""
@@ -151,7 +144,7 @@ class Switchboard:
     async def _connect_anew(self) -> None:
         """Every connection, as far as members and keys are others now."""
         try:
-            await self._connections.change(self.settings, self._keys())
+            await self._connections.change(self.settings, keys_of(self.settings))
         except LaneError as error:
             log.critical("%s; the worker process starts anew", error)
             self._end.set()

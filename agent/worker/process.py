@@ -153,10 +153,13 @@ class Worker(Switchboard):
 
             self._alerts = Alerts(self.settings, self.verbs, self.tell, hooks)
             self._alerts.begin()
-        if self.settings.config.store.s3:
+        if self.settings.config.store.place:
             from agent.worker.archiving import Archiving  # here: a member without an archive does not load it
+            from agent.worker.replication.send_sealed import Courier
 
-            self._archiving = Archiving(self.settings, store, self._running_here, self._sources.open, self.tell)
+            witness = self.settings.config.store.witness
+            courier = Courier(self.errands, self._shipper, witness, self._links.hindrance) if witness else None
+            self._archiving = Archiving(self.settings, store, self._running_here, self._sources.open, self.tell, courier)
             self._task(self._archiving.run())
         found = await self._find_guards(records)
         await self._mend_logs(found)
@@ -489,7 +492,16 @@ class Worker(Switchboard):
         behind = self._archiving.complaints() if self._archiving is not None else ()
         notices = [*self.notices(), *complaints, *behind, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
-        ours = WorkerView(links, notices, interfaces, self.supervisors, self._around.store, self._memory(), self._arriving)
+        ours = WorkerView(
+            links,
+            notices,
+            interfaces,
+            self.supervisors,
+            self._around.store,
+            self._memory(),
+            self._arriving,
+            self._archiving.sealed if self._archiving is not None else lambda _: None,
+        )
         return team_view(self.settings, self._life, told, ours)
 
     def _arriving(self, component: str) -> list[dict[str, Any]]:

@@ -3,21 +3,38 @@
 Started as `python -m agent.system.child_main agent.worker.witness CONFIG DESCRIPTOR` in place of `agent.worker.process`.
 There is no store, no pool of processes and no output log. Nothing that could read a snapshot or start a program is even imported.
 It needs no right that an ordinary user does not have.
+
+With ``sealed_size`` in its ``[store]`` it keeps sealed copies of checkpoints, which it cannot open
+(`agent.worker.replication.sealed_copies`).
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from agent.config import Settings
+from agent.errors import AgentError, RefusedError
 from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.worker.control.queries import Questions
 from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.hub import Switchboard, live
 from checkpoint.keeper.messages import Channel
+from failover.archive.witness import VERB
+from failover.config.quantities import size_bytes
 from failover.core import acts
-from failover.core.wire.messages import Bulk, Offer, Refuse
+from failover.core.wire.messages import Bulk, Cancel, Chunk, Content, Offer, Refuse
+from failover.errors import ArchiveError
+
+if TYPE_CHECKING:
+    from agent.worker.replication.sealed_copies import SealedCopies
+    from agent.worker.replication.transfer import Receiver
+
+NO_COPIES: Final = (
+    "{0} is a witness that keeps no sealed copies: set sealed_size in [store] of its agent.toml, and restart its agent"
+)
 
 log = logging.getLogger("failover.lanes")
 
@@ -27,11 +44,41 @@ class Witness(Switchboard):
 
     def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         super().__init__(settings, main_loop)
-        self.connect(Questions(self, self.gate))
+        self.connect(Questions(self, self.gate), {VERB: self._asked_for_a_copy})
+        self._sealed: SealedCopies | None = None
+        self._receiver: Receiver | None = None
 
     async def prepare(self) -> Inventory:
-        """Nothing is kept here and nothing runs here."""
+        """Nothing runs here; the core hears of no copy that could not be opened here."""
+        config = self.settings.config
+        if config.store.sealed_size:
+            from agent.worker.replication import sealed_copies, transfer  # here: a witness that keeps none does not load them
+            from failover.archive.signature import read_public
+
+            directory = Path(config.state_directory) / sealed_copies.FOLDER
+            self._sealed = sealed_copies.SealedCopies(
+                directory,
+                size_bytes(config.store.sealed_size),
+                config.robot,
+                lambda: read_public(Path(config.team_directory)),
+            )
+            try:
+                await asyncio.to_thread(self._sealed.load)
+            except ArchiveError as error:
+                raise AgentError(str(error)) from error
+            self._receiver = transfer.Receiver(self._replication_link, directory, self._sealed)
         return Inventory((), ())
+
+    async def _asked_for_a_copy(self, peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        if self._sealed is None:
+            raise RefusedError(NO_COPIES.format(self.settings.config.robot))
+        return await self._sealed.answer(peer, arguments)
+
+    def link_is_new(self, peer: str) -> None:
+        """What was half here stays half."""
+        if self._sealed is not None and self._receiver is not None:
+            self._receiver.lost(peer)
+            self._sealed.lost(peer)
 
     def obeys(self, act: acts.Act) -> None:
         """Pass the core's answers on; it orders nothing else that would be carried out here."""
@@ -41,16 +88,37 @@ class Witness(Switchboard):
             log.debug("a witness does not do %s", type(act).__name__)
 
     def hear_of_a_snapshot(self, peer: str, message: Bulk) -> None:
-        """A witness is offered none."""
-        if isinstance(message, Offer):
-            self._replication_link.say(
-                peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots")
-            )
+        """A witness is offered no snapshot; a sealed copy comes as a content."""
+        match message:
+            case Offer():
+                self._replication_link.say(
+                    peer, Refuse(message.transfer, f"{self.settings.config.robot} is a witness and keeps no snapshots")
+                )
+            case _ if self._receiver is None or self.votes_only(peer):
+                return
+            case Content():
+                self._receiver.offered(peer, message)
+            case Chunk():
+                self._receiver.chunk(peer, message)
+            case Cancel():
+                self._receiver.cancelled(peer, message)
 
     def picture(self, told: Told) -> dict[str, Any]:
         """What ``status`` shows."""
-        ours = WorkerView(self._replication_link.links, self.notices(), self._links.shown())
+        ours = WorkerView(self._replication_link.links, self.notices(), self._links.shown(), sealed=self._copies_of)
         return team_view(self.settings, self._life, told, ours)
+
+    def _copies_of(self, component: str) -> dict[str, Any] | None:
+        """What the status shows of a component's sealed copies here."""
+        if self._sealed is None:
+            return None
+        from checkpoint.store.index import folder_name
+
+        found = self._sealed.of_component(folder_name(component))
+        if found is None:
+            return None
+        copies, size, age_s = found
+        return {"at": self.settings.config.robot, "age_s": age_s, "copies": copies, "size": size}
 
 
 def main() -> int:

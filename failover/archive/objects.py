@@ -1,4 +1,4 @@
-"""The contract of the place where an archive's objects lie; ``tests/contracts/test_object_stores.py`` holds both kinds to it.
+"""The contract of the place where an archive's objects lie; ``tests/contracts/test_object_stores.py`` holds each kind to it.
 
 An object has a name, words with ``/`` between them, and a content. It stands under its name whole or not at all, and is never
 changed: the first `ObjectStore.put` of a name wins. The owner of the place can read names and sizes, and can remove objects; the
@@ -134,7 +134,7 @@ class FolderObjects:
             self._path(name).unlink(missing_ok=True)
 
     def _path(self, name: str) -> Path:
-        if ".." in name.split("/"):
+        if ".." in name.split("/") or name.startswith("/"):
             raise ArchiveError(f"{name!r} names no object")
         return self._root / name
 

@@ -109,7 +109,7 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
     restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reserved, arriving,
-    reasons, output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
+    sealed, reasons, output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
     slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
         tasks of the schedule: its captures, and those of them that delayed an activation; of the newest: the longest time between
@@ -133,6 +133,8 @@ components: [{name, role, primary, home, prefer, state, protection, epoch, gener
     contested: at its primary: which of its files others hold open for writing, so that a restore is refused; by sentence
     arriving: [{to, what, arrived, size}]: at its primary, what is on its way to other robots, and how many bytes of it have
         arrived, by their own word; what: checkpoint | files (those of the program that the robot lacks)
+    sealed: {at, age_s, copies, size}: of its sealed copies at a witness (at), age of the newest; at a robot or server that puts
+        them, copies and size are None; at the witness: how many, and their bytes; None: there is none; none of them is a standby
     unstored: why the last snapshot that came to this robot was not stored there; "" otherwise
     role: primary | standby | none; protection: none | protected | degraded | stopped
     resumed: {at, robot, state_at, sequence}: of its last restore at this robot: when its program acted here first (seconds

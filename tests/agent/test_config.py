@@ -460,5 +460,24 @@ def test_a_witness_has_nothing_to_tell_of_and_nothing_to_archive(directory: Path
     team.write(directory / "team", Team("lab", members))
     with pytest.raises(ConfigError, match="is a witness, and holds nothing to tell of"):
         configuration.load(written(directory, "[alerts]", 'user = "nobody"', 'on_split = ["tell"]'))
-    with pytest.raises(ConfigError, match="is a witness, and keeps no checkpoints"):
-        configuration.load(written(directory, "[store]", 's3 = "s3://robots"'))
+    for place in ('s3 = "s3://robots"', 'witness = "robot1"'):
+        with pytest.raises(ConfigError, match="is a witness, and has no checkpoints of its own"):
+            configuration.load(written(directory, "[store]", place))
+    assert configuration.load(written(directory, "[store]", 'sealed_size = "20GB"')).config.store.place == ""
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (('witness = "robot3"',), "witness = 'robot3', which is no witness of the team; choose among robot2"),
+        (('witness = "gate"',), "witness = 'gate', which is no witness of the team"),
+        (('witness = "robot2"', 's3 = "/mnt"'), "copies go to one place; remove one of the two"),
+        (('sealed_size = "20GB"',), "robot1 is a robot: sealed_size is for a witness"),
+        (('sealed_size = "much"',), "sealed_size: 'much' is no size"),
+    ],
+)
+def test_who_keeps_sealed_copies_is_a_witness(lines: tuple[str, ...], said: str, directory: Path) -> None:
+    team.write(directory / "team", Team("lab", {"robot1": ROBOT, "robot2": replace(ROBOT, role="witness"), "robot3": ROBOT}))
+    with pytest.raises(ConfigError, match=said):
+        configuration.load(written(directory, "[store]", *lines))
+    assert configuration.load(written(directory, "[store]", 'witness = "robot2"')).config.store.place == "of witness robot2"

@@ -1,4 +1,4 @@
-"""The contract of the place of an archive, `failover.archive.objects`: one suite for a folder and for two servers of S3."""
+"""The contract of the place of an archive, `failover.archive.objects`: one suite for a folder, S3, and a witness."""
 
 from __future__ import annotations
 
@@ -18,15 +18,21 @@ import pytest
 
 from failover.archive.archive import object_store
 from failover.archive.objects import FolderObjects, ObjectStore, Readable
+from failover.archive.witness import WitnessObjects
 from failover.errors import ArchiveError
-from tests import s3_servers
+from tests import s3_servers, witnesses
 
+WITNESS = "witness"
+KEY = bytes(range(32))
 NAME = "lab/@%2Flab%2Fr1%2Fmapper/0001-0002-00ff.base.sealed"
 
 
-@pytest.fixture(scope="module", params=["folder", *s3_servers.KINDS])
+@pytest.fixture(scope="module", params=["folder", *s3_servers.KINDS, WITNESS])
 def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """Where the objects lie, and the server's URL."""
+    """Where the objects lie, and the server's URL; a witness is made for each test."""
+    if request.param == WITNESS:
+        yield WITNESS, ""
+        return
     directory = tmp_path_factory.mktemp("objects") / "place"
     directory.mkdir()
     if request.param == "folder":
@@ -37,14 +43,18 @@ def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture
-def objects(place: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ObjectStore:
-    """An empty one: each test has a prefix, or a folder, of its own."""
+def objects(place: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectStore]:
+    """An empty one: each test has a prefix, a folder, or a witness of its own."""
+    if place[0] == WITNESS:
+        with witnesses.keeping(tmp_path, KEY) as gate:
+            yield WitnessObjects(gate, KEY)
+        return
     for name, value in s3_servers.environment().items():
         monkeypatch.setenv(name, value)
     where = f"{place[0]}/{tmp_path.name}"
     if not place[1]:
         Path(where).mkdir()
-    return object_store(where, place[1])
+    yield object_store(where, place[1])
 
 
 @pytest.fixture
@@ -125,6 +135,8 @@ def test_what_was_removed_can_be_put_again(objects: ObjectStore, content: Binary
 def test_a_place_that_is_not_there_is_named_in_one_sentence(
     place: tuple[str, str], content: BinaryIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if place[0] == WITNESS:
+        pytest.skip("what an agent says without one: tests/e2e/test_sealed_copies.py")
     for name, value in s3_servers.environment().items():
         monkeypatch.setenv(name, value)
     where = "s3://no-such-bucket/x" if place[1] else str(tmp_path / "not-mounted")

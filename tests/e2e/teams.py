@@ -20,13 +20,16 @@ ORDINARY_USER = ("/usr/bin/env", "unshare", "--user", "--map-user=1000", "--map-
 
 TWO_AND_A_SERVER: Mapping[str, Role] = {"robot1": "robot", "robot2": "robot", "hall": "server"}
 
+NOTHING: Mapping[str, str] = {}
+
 
 class TeamStage(Stage):
     """The members and the place where they stand; each can be cut off from its power and switched on again."""
 
-    def __init__(self, directory: Path, roles: Mapping[str, Role], settings: str = "") -> None:
+    def __init__(self, directory: Path, roles: Mapping[str, Role], settings: str = "", own: Mapping[str, str] = NOTHING) -> None:
         super().__init__(directory, replace(robots.means(), own_network=False), settings)
         self._roles = roles
+        self._own = own
         self.members: dict[str, RobotMachine] = {}
 
     def start(self) -> None:
@@ -56,6 +59,10 @@ class TeamStage(Stage):
             self.members[name].freeze()
         for name in names:
             self.members[name].end()
+
+    def configuration(self, name: str, directory: Path) -> str:
+        """The text of a member's agent.toml, with what it has for itself."""
+        return super().configuration(name, directory) + self._own.get(name, "")
 
     def command(self, name: str, config: Path) -> list[str]:
         """The host of a member; of a witness as an ordinary user, without capabilities."""
@@ -92,9 +99,14 @@ def hears_all(member: RobotMachine) -> bool:
 
 
 @contextmanager
-def acting(directory: Path, roles: Mapping[str, Role] = TWO_AND_A_SERVER, settings: str = "") -> Iterator[TeamStage]:
-    """A team of these members, beating and connected."""
-    with TeamStage(directory / "stage", roles, settings) as stage:
+def acting(
+    directory: Path,
+    roles: Mapping[str, Role] = TWO_AND_A_SERVER,
+    settings: str = "",
+    own: Mapping[str, str] = NOTHING,
+) -> Iterator[TeamStage]:
+    """A team of these members, beating and connected; ``own``: lines of agent.toml that one member alone has."""
+    with TeamStage(directory / "stage", roles, settings, own) as stage:
         stage.directory.mkdir(exist_ok=True)  # a test may have put a disk of its own there
         try:
             stage.start()

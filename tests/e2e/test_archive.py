@@ -189,10 +189,15 @@ def is_gone(robot: RobotMachine) -> bool:
     return not is_running and not any(parts(robot, name) for name in ("main_loop", "worker", "guard", "keeper"))
 
 
-def recovered(robot: RobotMachine, name: str) -> str:
-    """What failover-agent recover says at a robot whose agent is stopped."""
+def recovering(robot: RobotMachine, name: str) -> subprocess.CompletedProcess[str]:
+    """What failover-agent recover does at a robot whose agent is stopped."""
     command = [sys.executable, "-m", "agent.main", "recover", name, "--config", str(robot.directory / "agent.toml")]
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+
+
+def recovered(robot: RobotMachine, name: str) -> str:
+    """The same where it succeeds: what it says."""
+    ran = recovering(robot, name)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
 

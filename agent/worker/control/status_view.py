@@ -74,6 +74,7 @@ class WorkerView(Struct, frozen=True):
         store: None at a witness.
         memory: None at a witness.
         arriving: what of a component is on its way to other robots, as the status shows it.
+        sealed: its sealed copies at a witness, as the status shows them; None: there are none.
     """
 
     links: Mapping[str, PeerConnection]
@@ -83,6 +84,7 @@ class WorkerView(Struct, frozen=True):
     store: SnapshotStore | None = None
     memory: Memory | None = None
     arriving: Callable[[str], list[dict[str, Any]]] = lambda _: []
+    sealed: Callable[[str], dict[str, Any] | None] = lambda _: None
 
 
 def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> dict[str, Any]:
@@ -112,7 +114,8 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "media": [_medium(one) for one in told.media],
         "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in _members(view, settings)],
         "components": [
-            _component(one, ours.supervisors.get(one.name), settings, ours.store) | {"arriving": ours.arriving(one.name)}
+            _component(one, ours.supervisors.get(one.name), settings, ours.store)
+            | {"arriving": ours.arriving(one.name), "sealed": ours.sealed(one.name)}
             for one in (view.components if view else ())
         ],
         "beats": {

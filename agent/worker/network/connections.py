@@ -15,7 +15,16 @@ from typing import Final
 
 from agent.config import Settings
 from agent.errors import LaneError
-from agent.worker.network.replication_link import Callbacks, Devices, KeyOwners, Keys, LinkState, ReplicationLink, Unread
+from agent.worker.network.replication_link import (
+    Callbacks,
+    Devices,
+    KeyOwners,
+    Keys,
+    LinkState,
+    ReplicationLink,
+    Unread,
+    public_key_of,
+)
 from failover.config.team import Robot, split_address
 from failover.core.wire.messages import Bulk
 
@@ -156,6 +165,20 @@ class AllConnections:
         known = self._their_keys.get((way, peer))
         self._their_keys[way, peer] = key
         return known != key
+
+
+def keys_of(settings: Settings) -> Keys:
+    """This robot's pair of keys, and those of all members.
+
+    Raises:
+        LaneError: its secret key is none.
+    """
+    if settings.config.insecure:
+        return Keys("", "", {})
+    known = {**settings.former, **settings.team.robots}
+    publics = {name: robot.public_key for name, robot in known.items()}
+    following = {name: robot.next_key for name, robot in known.items() if robot.next_key}
+    return Keys(public_key_of(settings.secret_key), settings.secret_key, publics, following)
 
 
 def _bulks(settings: Settings) -> dict[str, str]:

@@ -35,7 +35,8 @@ def _add_place(room: argparse.ArgumentParser) -> None:
 
 KEY_DESCRIPTION: Final = """
     Make the archive key of the team: keys/archive.key in the team directory. Carry it to the same place at every robot and server
-    that archives or fetches, and keep a copy where no robot is: without it nobody opens the archive.
+    that archives or fetches, and keep a copy where no robot is: without it nobody opens the archive. The file
+    keys/archive.public beside it opens nothing: it is for a witness that is to keep sealed copies.
 
       failover archive key
     """

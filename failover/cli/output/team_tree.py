@@ -244,10 +244,20 @@ def promises(status: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def kept(status: Mapping[str, Any]) -> tuple[str, ...]:
-    """The checkpoints that a server keeps: for which component, how much, how old."""
-    if status.get("role") != "server":
-        return ()
-    return tuple(_kept_line(component) for component in status["components"] if component.get("kept"))
+    """The checkpoints that a server keeps, and the sealed copies at a witness: of which component, how much, how old."""
+    components = status["components"]
+    held = [_kept_line(one) for one in components if one.get("kept")] if status.get("role") == "server" else []
+    return (*held, *(_sealed_line(one) for one in components if one.get("sealed")))
+
+
+def _sealed_line(component: Mapping[str, Any]) -> str:
+    found = component["sealed"]
+    age, at = milliseconds(found["age_s"] * 1_000), found["at"]
+    if found["copies"] is None:
+        return f"sealed copy at {at}, which is no standby: {component['name']}, {age} old"
+    return (
+        f"sealed copies, which {at} cannot open: {component['name']}, {found['copies']}, {size(found['size'])}, newest {age} old"
+    )
 
 
 def _kept_line(component: Mapping[str, Any]) -> str:

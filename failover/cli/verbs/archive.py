@@ -19,7 +19,7 @@ from checkpoint.sentences import visible
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import Need, needs
 from checkpoint.store.content_store import CONTENT_MODE, digest_of_file, path_in
-from failover.archive import sealed
+from failover.archive import sealed, signature
 from failover.archive.archive import Archive, Copy, object_store
 from failover.cli.output import render, team_tree
 from failover.config import team as team_directory
@@ -34,12 +34,18 @@ NAMED: Final = 3
 
 
 def key(arguments: argparse.Namespace) -> int:
-    """Make the team's archive key."""
-    path = sealed.new_key(Path(arguments.directory))
+    """Make the team's archive key, and write its public half, by which a witness proves what it keeps."""
+    team = Path(arguments.directory)
+    path = sealed.key_path(team)
+    if not path.exists() or signature.public_path(team).exists():
+        path = sealed.new_key(team)  # refuses where there is one
+    signature.write_public(team, sealed.read_key(team))
+    public = signature.public_path(team)
     if arguments.json:
-        render.as_json({"file": str(path)})
+        render.as_json({"file": str(path), "public": str(public)})
     else:
         print(f"{path} is the archive key: carry it to the same place at every robot and server, and keep a copy elsewhere")
+        print(f"{public} opens nothing: carry it to the same place at a witness that is to keep sealed copies")
     return 0
 
 
@@ -107,6 +113,11 @@ def _archive(arguments: argparse.Namespace) -> tuple[str, Archive]:
             raise ArchiveError(
                 f"{CONFIG} does not say where the archive is: {why}; name it by --place s3://BUCKET/PREFIX"
             ) from error
+        if config.witness:
+            raise ArchiveError(
+                f"the copies are at witness {config.witness}, which gives them to agents: failover-agent recover takes one; "
+                "or name the folder sealed of its state directory, or a copy of that, by --place"
+            )
         place, endpoint = config.s3, endpoint if endpoint is not None else config.s3_endpoint
     try:
         StoreConfig(s3=place, s3_endpoint=endpoint or "")

@@ -19,10 +19,11 @@ from msgspec.structs import replace
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
 from checkpoint.store.index import folder_name
-from failover.archive import sealed
+from failover.archive import sealed, signature
 from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
 from failover.cli import main
+from failover.errors import ArchiveError
 from tests.checkpoint.snapshots import COMPONENT, page, snapshot
 
 pytest.importorskip("cryptography")
@@ -38,6 +39,26 @@ def team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     assert main.main(["archive", "key", "--directory", str(directory)]) == 0
     assert f"{directory}/keys/archive.key is the archive key: carry it" in capsys.readouterr().out
     return directory
+
+
+def test_the_public_half_is_written_beside_a_key_that_has_none(team: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    public, key = signature.public_path(team), sealed.key_path(team).read_bytes()
+    expected = signature.public_of(sealed.read_key(team))
+    assert signature.read_public(team) == expected and public.stat().st_mode & 0o777 == 0o644
+    public.unlink()
+    assert main.main(["archive", "key", "--directory", str(team)]) == 0
+    assert signature.read_public(team) == expected and sealed.key_path(team).read_bytes() == key
+    assert f"{public} opens nothing: carry it" in capsys.readouterr().out
+    sealed.key_path(team).unlink()
+    assert main.main(["archive", "key", "--directory", str(team)]) == main.FAILED
+    assert "belongs to another archive key: remove it" in capsys.readouterr().err
+    for spoiled in ("", "ab", "x" * 64):
+        public.write_text(spoiled)
+        with pytest.raises(ArchiveError, match="holds no public key of 64 hexadecimal digits; failover archive key writes it"):
+            signature.read_public(team)
+    public.unlink()
+    with pytest.raises(ArchiveError, match=r"cannot read .*archive\.public: No such file"):
+        signature.read_public(team)
 
 
 def archive(team: Path) -> Archive:
@@ -167,6 +188,7 @@ def test_a_configuration_that_cannot_be_read_is_named(
         (None, "no archive is named"),
         ("[store", "does not say where the archive is"),
         ('[store]\ns3 = "x"\n', "which is no place"),
+        ('[store]\nwitness = "gate"\n', "the copies are at witness gate, which gives them to agents: failover-agent recover"),
     ):
         if text is not None:
             config.write_text(text)

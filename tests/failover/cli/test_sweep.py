@@ -256,6 +256,7 @@ def test_with_an_archive_that_cannot_be_opened(act: str, capsys: pytest.CaptureF
         Path("team/keys/archive.key").write_bytes(content)
         Path("team/keys/archive.key").chmod(0o600)
         assert told(capsys, "archive", *asked, *places[0], "--directory", "team") == main.FAILED
+    Path("team/keys/archive.public").write_text("of another key")
     assert told(capsys, "archive", "key", "--directory", "team") == main.FAILED
     assert not Path("new").exists() and not Path("nowhere").exists()
 
