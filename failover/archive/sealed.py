@@ -1,10 +1,14 @@
-"""Seals an archive's objects, so that the owner of their place reads nothing and alters nothing unnoticed: AES-256-GCM.
+"""Seals an archive's objects, so that the owner of their place reads nothing and alters nothing unnoticed.
+
+By AES-256-GCM, or ChaCha20-Poly1305 where the processor has no instructions for AES: without these AES is slow, and the time that
+it takes tells of its key. An object says by which it was sealed, and opens on any robot.
 
 The byte table is in ``ARCHIVE.md``. One key for the team, the *archive key*: 32 random bytes, ``keys/archive.key`` in the team
 directory. Each object has a key of its own, derived from that, from a random salt and from the object's name: an object under
 another name is refused. Its frames are numbered, and the last one is marked: a part is refused.
 
-Sources: RFC 5869 (HKDF); NIST SP 800-38D (GCM); Hoang, Reyhanitabar, Rogaway, Vizár, CRYPTO 2015 (STREAM: numbered frames).
+Sources: RFC 5869 (HKDF); NIST SP 800-38D (GCM); RFC 8439 (ChaCha20-Poly1305); Hoang, Reyhanitabar, Rogaway,
+Vizár, CRYPTO 2015 (STREAM: numbered frames).
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -19,14 +24,17 @@ from checkpoint.store.whole_file import sync_directory
 from failover.archive.objects import Readable
 from failover.errors import ArchiveError
 
-MAGIC: Final = b"FOARCHV1"
+AES: Final = b"FOARCHV1"
+CHACHA: Final = b"FOARCHC1"
+MAGIC_SIZE: Final = 8
 SALT_SIZE: Final = 32
-HEAD_SIZE: Final = len(MAGIC) + SALT_SIZE
+HEAD_SIZE: Final = MAGIC_SIZE + SALT_SIZE
 FRAME_SIZE: Final = 1 << 20
 TAG_SIZE: Final = 16
 KEY_SIZE: Final = 32
 KEY_FILE: Final = "archive.key"
 FRAMES_MAX: Final = 1 << 32
+PROCESSOR: Final = Path("/proc/cpuinfo")
 CURE: Final = "failover archive key makes one; every robot and server of the team needs the same"
 
 
@@ -97,9 +105,9 @@ def seal(key: bytes, name: str, parts: Iterator[bytes], file: BinaryIO) -> int:
         ArchiveError: the library is not installed.
         OSError: the file does not take it.
     """
-    salt = secrets.token_bytes(SALT_SIZE)
-    cipher = _cipher(key, salt, name)
-    size = file.write(MAGIC + salt)
+    head = (AES if has_aes() else CHACHA) + secrets.token_bytes(SALT_SIZE)
+    cipher = _cipher(key, head, name)
+    size = file.write(head)
     number, held = 0, bytearray()
     for part in parts:
         held += part
@@ -117,9 +125,9 @@ def unsealed(key: bytes, name: str, source: Readable) -> Iterator[bytes]:
         ArchiveError: it was altered, cut off, put under another name, or sealed with another key.
     """
     head = exactly(source, HEAD_SIZE)
-    if head[: len(MAGIC)] != MAGIC or len(head) < HEAD_SIZE:
+    if head[:MAGIC_SIZE] not in (AES, CHACHA) or len(head) < HEAD_SIZE:
         raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
-    cipher, number = _cipher(key, head[len(MAGIC) :], name), 0
+    cipher, number = _cipher(key, head, name), 0
     frame = exactly(source, FRAME_SIZE + TAG_SIZE)
     while following := exactly(source, FRAME_SIZE + TAG_SIZE):
         yield _opened(cipher, number, False, frame, name)
@@ -137,7 +145,7 @@ def check_end(key: bytes, name: str, head: bytes, size: int, frame: bytes) -> No
         ArchiveError: as `unsealed`.
     """
     number = (last_frame(size) - HEAD_SIZE) // (FRAME_SIZE + TAG_SIZE)
-    _opened(_cipher(key, head[len(MAGIC) :], name), number, True, frame, name)
+    _opened(_cipher(key, head, name), number, True, frame, name)
 
 
 def last_frame(size: int) -> int:
@@ -171,14 +179,25 @@ def _nonce(number: int, is_last: bool) -> bytes:
     return number.to_bytes(11, "big") + bytes([is_last])
 
 
-def _cipher(key: bytes, salt: bytes, name: str) -> Any:
-    """AES-256-GCM with the key of one object."""
+@cache
+def has_aes() -> bool:
+    """Whether the processor has instructions for AES; both kinds of processor call them so."""
     try:
-        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+        return "aes" in PROCESSOR.read_text().split()
+    except OSError:
+        return False
+
+
+def _cipher(key: bytes, head: bytes, name: str) -> Any:
+    """The cipher that an object's head names, with the key of that object."""
+    magic, salt = head[:MAGIC_SIZE], head[MAGIC_SIZE:]
+    try:
+        from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
         from cryptography.hazmat.primitives.hashes import SHA256
         from cryptography.hazmat.primitives.kdf.hkdf import HKDF
     except ImportError as error:
         raise ArchiveError(
             "an archive needs the library cryptography, which is not installed: pip install 'failover[s3]'"
         ) from error
-    return AESGCM(HKDF(SHA256(), KEY_SIZE, salt, b"failover-archive-1\0" + name.encode()).derive(key))
+    kind, meant = (ChaCha20Poly1305, b"failover-archive-1 chacha\0") if magic == CHACHA else (AESGCM, b"failover-archive-1\0")
+    return kind(HKDF(SHA256(), KEY_SIZE, salt, meant + name.encode()).derive(key))

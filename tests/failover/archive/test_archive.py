@@ -86,10 +86,18 @@ def check_end(content: bytes) -> None:
     sealed.check_end(KEY, NAME, content[: sealed.HEAD_SIZE], len(content), content[last:])
 
 
+@pytest.fixture(params=[sealed.AES, sealed.CHACHA], ids=["AES", "ChaCha20"])
+def magic(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bytes:
+    """How objects begin at a robot whose processor has AES, or has not."""
+    monkeypatch.setattr(sealed, "has_aes", lambda: request.param == sealed.AES)
+    return bytes(request.param)
+
+
 @pytest.mark.parametrize("size", [0, 1, sealed.FRAME_SIZE - 1, sealed.FRAME_SIZE, sealed.FRAME_SIZE + 1, 3 * sealed.FRAME_SIZE])
-def test_what_was_sealed_comes_back(size: int) -> None:
+def test_what_was_sealed_comes_back(size: int, magic: bytes) -> None:
     content = os.urandom(size)
     closed = seal(content)
+    assert closed[: sealed.MAGIC_SIZE] == magic
     assert opened(closed) == content
     assert size < 8 or content[:8] not in closed
     check_end(closed)
@@ -99,7 +107,17 @@ def test_two_seals_of_one_content_share_no_byte_beyond_chance() -> None:
     assert seal(b"secret")[: sealed.HEAD_SIZE] != seal(b"secret")[: sealed.HEAD_SIZE]
 
 
-def test_every_change_is_refused() -> None:
+@pytest.mark.parametrize(("flags", "has"), [("flags\t: fpu aes avx", True), ("Features\t: fp asimd", False), (None, False)])
+def test_a_processor_tells_whether_it_has_aes(
+    flags: str | None, has: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sealed, "PROCESSOR", tmp_path / "cpuinfo")
+    if flags is not None:
+        (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{flags}\n")
+    assert sealed.has_aes.__wrapped__() is has
+
+
+def test_every_change_is_refused(magic: bytes) -> None:
     closed = seal(os.urandom(sealed.FRAME_SIZE + 100))
     frame = sealed.FRAME_SIZE + sealed.TAG_SIZE
     one, two = closed[sealed.HEAD_SIZE : sealed.HEAD_SIZE + frame], closed[sealed.HEAD_SIZE + frame :]
@@ -114,6 +132,7 @@ def test_every_change_is_refused() -> None:
         "nothing": b"",
         "only a head": head,
         "another kind of file": b"x" * 5000,
+        "the other cipher": (sealed.CHACHA if magic == sealed.AES else sealed.AES) + closed[sealed.MAGIC_SIZE :],
     }
     for at in [*range(sealed.HEAD_SIZE), *random.Random(1).sample(range(sealed.HEAD_SIZE, len(closed)), 8), len(closed) - 1]:
         wrong[f"a bit at {at}"] = closed[:at] + bytes([closed[at] ^ 1]) + closed[at + 1 :]
