@@ -91,7 +91,7 @@ class SealedCopies:
 
     def load(self) -> None:
         """Find what is kept. Raises ArchiveError, OSError."""
-        self.directory.mkdir(mode=0o700, exist_ok=True)
+        self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         for left_over in self.directory.rglob(f"{TEMPORARY_PREFIX}*"):
             left_over.unlink()
         self._kept = {one.name: _Kept(one.size, one.at_s) for one in self._objects.listed("")}
