@@ -69,7 +69,7 @@ class S3Objects:
         except ImportError as error:
             raise ArchiveError(
                 "an archive in S3 needs the library obstore, which is not installed: pip install 'failover[s3]'; "
-                "the Debian package has archives in folders only"
+                "the Debian package has archives in folders and at witnesses only"
             ) from error
         self._library, self._errors = obstore, exceptions
         self._place = f"s3://{bucket}/{prefix}".rstrip("/") + (f" at {endpoint}" if endpoint else "")
