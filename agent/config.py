@@ -411,6 +411,7 @@ def check_team(settings: Settings, team: Team) -> None:
     _check_keys(path, config, team)
     _check_rule(path, config, team)
     _check_components(path, config, team)
+    _check_archive(path, config, team)
 
 
 def _check_keys(path: Path, config: Config, members: Team) -> None:

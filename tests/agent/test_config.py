@@ -481,3 +481,12 @@ def test_who_keeps_sealed_copies_is_a_witness(lines: tuple[str, ...], said: str,
     with pytest.raises(ConfigError, match=said):
         configuration.load(written(directory, "[store]", *lines))
     assert configuration.load(written(directory, "[store]", 'witness = "robot2"')).config.store.place == "of witness robot2"
+
+
+def test_a_team_without_the_witness_that_keeps_its_copies_is_refused_before_it_is_one(directory: Path) -> None:
+    with_witness = Team("lab", {"robot1": ROBOT, "robot2": replace(ROBOT, role="witness"), "robot3": ROBOT})
+    team.write(directory / "team", with_witness)
+    settings = configuration.load(written(directory, "[store]", 'witness = "robot2"'))
+    configuration.check_team(settings, with_witness)
+    with pytest.raises(ConfigError, match="witness = 'robot2', which is no witness of the team"):
+        configuration.check_team(settings, Team("lab", {"robot1": ROBOT, "robot3": ROBOT}))
