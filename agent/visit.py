@@ -14,9 +14,8 @@ from typing import Any, Final
 from agent.config import Settings
 from agent.errors import AgentError, LaneError
 from agent.worker.network.connections import keys_of
-from agent.worker.network.remote_orders import Errands
+from agent.worker.network.remote_orders import SEALED, Errands
 from agent.worker.network.replication_link import Callbacks, LinkState, ReplicationLink
-from failover.archive.witness import VERB
 from failover.core.wire.messages import Bulk, ErrandDone, Hello
 from failover.errors import ArchiveError
 
@@ -33,7 +32,7 @@ class Visit:
     def ask(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `failover.archive.witness.Witness.ask`."""
         try:
-            return self._loop.run_until_complete(self._errands.send(self._witness, VERB, arguments))
+            return self._loop.run_until_complete(self._errands.send(self._witness, SEALED, arguments))
         except AgentError as error:
             raise ArchiveError(f"the witness does not give its sealed copies: {error}") from error
 

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from agent.errors import AgentError
-from agent.worker.network.remote_orders import Errands
+from agent.worker.network.remote_orders import SEALED, Errands
 from agent.worker.network.replication_link import Callbacks, Keys, LinkState, ReplicationLink, new_keys
 from agent.worker.replication.sealed_copies import SealedCopies
 from agent.worker.replication.send_sealed import Courier
 from agent.worker.replication.transfer import Receiver, Shipper
 from checkpoint.errors import CheckpointError
 from failover.archive import signature
-from failover.archive.witness import VERB
 from failover.cli.demo.robots import free_ports
 from failover.core.wire.messages import Bulk, Cancel, Chunk, Content, Credit, Errand, ErrandDone, Refuse, Taken
 from failover.errors import ArchiveError, FailoverError
@@ -69,7 +68,8 @@ class Gate:
 
         self.robot, self.gate = link(ROBOT, GATE, self._hear_at_robot), link(GATE, ROBOT, self._hear_at_gate)
         self._receiver = Receiver(self.gate, self.directory, self.copies)
-        self._answers = Errands(self.gate.say, lambda _: "", {}, {VERB: self.copies.answer})
+        self.copies.arriving = self._receiver.arriving
+        self._answers = Errands(self.gate.say, lambda _: "", {}, {SEALED: self.copies.answer})
         self._shipper = Shipper(self.robot)
         self._errands = Errands(self.robot.say, lambda _: "", {})
         self.courier = Courier(self._errands, self._shipper, GATE)
@@ -104,6 +104,15 @@ class Gate:
         """See `failover.archive.witness.Witness.ship`."""
         with told():
             self.call(self.courier.ship(Content(0, size, digest), descriptor))
+
+    def drop_transfers(self) -> None:
+        """Have both ends give up what is on its way, as where the link is lost."""
+
+        async def drop() -> None:
+            self._receiver.lost(ROBOT)
+            self._shipper.lost(GATE)
+
+        self.call(drop())
 
     async def end(self) -> None:
         """Cut both off."""

@@ -29,7 +29,8 @@ from checkpoint.snapshot import format
 from checkpoint.store.chain_files import fold_to
 from checkpoint.store.fold_rules import count_at_once
 from failover.archive import sealed
-from failover.archive.archive import Archive, object_store, require_room
+from failover.archive.archive import Archive, object_store
+from failover.archive.objects import require_room
 from failover.archive.witness import Witness, WitnessObjects
 from failover.core import vote_record
 from failover.errors import ArchiveError, FailoverError

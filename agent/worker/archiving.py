@@ -170,6 +170,8 @@ class Archiving:
         if self._is_current(name, shelf) and not shelf.trouble:
             return
         try:
+            if self._courier is not None:
+                self._courier.check_way()
             lacking = await self._copy_files(name, shelf) if self._settings.config.bring else []
             if not self._is_current(name, shelf):
                 await self._copy_checkpoint(name, shelf)

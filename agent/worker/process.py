@@ -158,7 +158,7 @@ class Worker(Switchboard):
             from agent.worker.replication.send_sealed import Courier
 
             witness = self.settings.config.store.witness
-            courier = Courier(self.errands, self._shipper, witness, self._links.hindrance) if witness else None
+            courier = Courier(self.errands, self._shipper, witness, lambda: self._way_is_shut(witness)) if witness else None
             self._archiving = Archiving(self.settings, store, self._running_here, self._sources.open, self.tell, courier)
             self._task(self._archiving.run())
         found = await self._find_guards(records)
@@ -347,6 +347,12 @@ class Worker(Switchboard):
                 self._contents.cancelled(peer, message)
             case Credit() | Taken() | Refuse():
                 self._shipper.heard(peer, message)
+
+    def _way_is_shut(self, witness: str) -> str:
+        """Why no sealed copy can go to its witness now; "" if one can."""
+        if hindrance := self._links.hindrance():
+            return hindrance
+        return f"cannot reach {witness}: {hindrance}" if (hindrance := self.hindrance(witness)) else ""
 
     def link_lost(self, peer: str) -> None:
         """The bulk lane to a peer is gone, and every transfer on it."""

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from agent.config import Settings
-from agent.errors import AgentError, RefusedError
+from agent.errors import RefusedError
 from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.worker.control.queries import Questions
 from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.hub import Switchboard, live
+from agent.worker.network.remote_orders import SEALED
 from checkpoint.keeper.messages import Channel
-from failover.archive.witness import VERB
+from checkpoint.sentences import in_words
 from failover.config.quantities import size_bytes
 from failover.core import acts
 from failover.core.wire.messages import Bulk, Cancel, Chunk, Content, Offer, Refuse
@@ -36,6 +37,8 @@ NO_COPIES: Final = (
     "{0} is a witness that keeps no sealed copies: set sealed_size in [store] of its agent.toml, and restart its agent"
 )
 
+NOT_FOUND: Final = "{0} cannot keep sealed copies in {1}: {2}; repair that folder, and restart its agent"
+
 log = logging.getLogger("failover.lanes")
 
 
@@ -44,34 +47,40 @@ class Witness(Switchboard):
 
     def __init__(self, settings: Settings, main_loop: Channel[ToWorker]) -> None:
         super().__init__(settings, main_loop)
-        self.connect(Questions(self, self.gate), {VERB: self._asked_for_a_copy})
+        self.connect(Questions(self, self.gate), {SEALED: self._asked_for_a_copy})
         self._sealed: SealedCopies | None = None
+        self._no_copies = NO_COPIES.format(settings.config.robot)
         self._receiver: Receiver | None = None
 
     async def prepare(self) -> Inventory:
         """Nothing runs here; the core hears of no copy that could not be opened here."""
-        config = self.settings.config
-        if config.store.sealed_size:
-            from agent.worker.replication import sealed_copies, transfer  # here: a witness that keeps none does not load them
-            from failover.archive.signature import read_public
-
-            directory = Path(config.state_directory) / sealed_copies.FOLDER
-            self._sealed = sealed_copies.SealedCopies(
-                directory,
-                size_bytes(config.store.sealed_size),
-                config.robot,
-                lambda: read_public(Path(config.team_directory)),
-            )
-            try:
-                await asyncio.to_thread(self._sealed.load)
-            except ArchiveError as error:
-                raise AgentError(str(error)) from error
-            self._receiver = transfer.Receiver(self._replication_link, directory, self._sealed)
+        if self.settings.config.store.sealed_size:
+            await self._prepare_copies()
         return Inventory((), ())
+
+    async def _prepare_copies(self) -> None:
+        """Find the sealed copies. Where their folder is harmed, the witness says so, keeps none, and votes as before."""
+        from agent.worker.replication import sealed_copies, transfer  # here: a witness that keeps none does not load them
+        from failover.archive.signature import read_public
+
+        config = self.settings.config
+        directory = Path(config.state_directory) / sealed_copies.FOLDER
+        size_max, team = size_bytes(config.store.sealed_size), Path(config.team_directory)
+        sealed = sealed_copies.SealedCopies(directory, size_max, config.robot, lambda: read_public(team))
+        try:
+            await asyncio.to_thread(sealed.load)
+        except (ArchiveError, OSError) as error:
+            why = in_words(error) if isinstance(error, OSError) else str(error)
+            self._no_copies = NOT_FOUND.format(config.robot, directory, why)
+            self._own_troubles.append(self._no_copies)
+            log.error("%s", self._no_copies)
+            return
+        self._receiver = transfer.Receiver(self._replication_link, directory, sealed)
+        sealed.arriving, self._sealed = self._receiver.arriving, sealed
 
     async def _asked_for_a_copy(self, peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
         if self._sealed is None:
-            raise RefusedError(NO_COPIES.format(self.settings.config.robot))
+            raise RefusedError(self._no_copies)
         return await self._sealed.answer(peer, arguments)
 
     def link_is_new(self, peer: str) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -18,11 +18,12 @@ from msgspec import Struct
 
 from checkpoint.errors import UNDECODABLE, FormatError
 from checkpoint.snapshot import format
+from checkpoint.snapshot.canonical_state import Header
 from checkpoint.snapshot.required_files import Need
 from checkpoint.store.content_store import digest_of_descriptor
 from checkpoint.store.index import BASE_SUFFIX, FOLDER_PREFIX, file_name, folder_name, order_of_name
 from failover.archive import sealed
-from failover.archive.objects import FolderObjects, ObjectStore
+from failover.archive.objects import FULL, FolderObjects, ObjectStore, PutRefusedError, require_room
 from failover.config.store import S3
 from failover.errors import ArchiveError
 
@@ -34,9 +35,6 @@ LABEL_SIZE_MAX: Final = sealed.FRAME_SIZE - 4
 
 STAMP_MS_MAX: Final = 253_402_300_799_999
 """The last millisecond of the year 9999."""
-
-RESERVE_SIZE: Final = 256 << 20
-"""Bytes of a disk that stay free for the checkpoints of the standbys."""
 
 _NAMES: Final = "failover-archive-1 names of contents"
 """Context of the digests by which contents are named: who has not the key cannot tell which programs a team runs."""
@@ -142,13 +140,23 @@ class Archive:
         for copy in before:
             if copy.file == file and not self._refusal(copy.name, copy.size):
                 return copy.name, copy.size
+        try:
+            return self._put_now(checkpoint, header, robot, spec, before)
+        except PutRefusedError as error:
+            if error.why == FULL:
+                raise
+            return self._put_now(checkpoint, header, robot, spec, self.copies(header.component))  # another member was first
+
+    def _put_now(self, checkpoint: BinaryIO, header: Header, robot: str, spec: bytes, before: list[Copy]) -> tuple[str, int]:
+        """Keep a checkpoint as the newest copy, later than those before. Where there is no room, older ones of it go first."""
         now_s = time.time()
         stamp_ms = min(max([int(1000 * now_s), *(copy.stamp_ms + 1 for copy in before[:1])]), STAMP_MS_MAX)
-        name = f"{self._team}/{folder_name(header.component)}/{stamp_ms:012x}-{file}{SUFFIX}"
+        name = f"{self._team}/{folder_name(header.component)}/{stamp_ms:012x}-{file_name(header)}{SUFFIX}"
         label = msgspec.msgpack.encode(Label(robot, now_s, spec))
         if len(label) > LABEL_SIZE_MAX:
             raise ArchiveError(f"the specification of {header.component} has {len(spec)} bytes: {LABEL_SIZE_MAX} is the limit")
-        return name, self._kept(name, _joined(len(label).to_bytes(4, "little") + label, checkpoint), _size(checkpoint))
+        parts = _joined(len(label).to_bytes(4, "little") + label, checkpoint)
+        return name, self._kept(name, parts, _size(checkpoint), spare=[copy.name for copy in before[1:]])
 
     def holds_whole(self, digest: bytes) -> bool:
         """Whether the content of this digest is here, with both ends of its object unharmed."""
@@ -183,14 +191,25 @@ class Archive:
             self._objects.remove(copy.name)
         return len(gone)
 
-    def _kept(self, name: str, parts: Iterator[bytes], size: int, prove: Callable[[], None] = lambda: None) -> int:
-        """Seal parts of so many bytes, prove them, and put them; the size of the object."""
+    def _kept(
+        self,
+        name: str,
+        parts: Iterator[bytes],
+        size: int,
+        prove: Callable[[], None] = lambda: None,
+        spare: Sequence[str] = (),
+    ) -> int:
+        """Seal parts of so many bytes, prove them, and put them; the size of the object.
+
+        Args:
+            spare: objects that give way where the place is full, the last one first.
+        """
         require_room(self._aside, size)
         with tempfile.TemporaryFile(dir=self._aside) as file:
             there = sealed.seal(self._key, name, parts, file)
             prove()
             file.flush()
-            is_ours = self._objects.put(name, file)
+            is_ours = self._put_in_room(name, file, spare)
             if not is_ours:  # another member was first
                 there = self._objects.size(name) or 0
         if refusal := self._refusal(name, there):
@@ -199,6 +218,17 @@ class Archive:
                     self._objects.remove(name)
             raise ArchiveError(f"{name} was put into the archive, and does not come back from it: {refusal}; it is put again")
         return there
+
+    def _put_in_room(self, name: str, file: BinaryIO, spare: Sequence[str]) -> bool:
+        """Put an object; whether it is ours."""
+        for older in reversed(spare):
+            try:
+                return self._objects.put(name, file)
+            except PutRefusedError as error:
+                if error.why != FULL:
+                    raise
+            self._objects.remove(older)
+        return self._objects.put(name, file)
 
     def _refusal(self, name: str, size: int) -> str:
         """Why an object is not whole; "" where its size and its two ends prove it: this key, this name, the last frame."""
@@ -283,22 +313,6 @@ class Archive:
     def _content_name(self, digest: bytes) -> str:
         keyed = blake3(self._key + digest, derive_key_context=_NAMES).hexdigest()
         return f"{self._team}/{CONTENTS}/{keyed}{SUFFIX}"
-
-
-def require_room(folder: Path, size: int) -> None:
-    """Refuse to begin what could take a disk the room that checkpoints need.
-
-    Raises:
-        ArchiveError: it has not so many bytes and `RESERVE_SIZE`.
-        OSError: it does not say.
-    """
-    disk = os.statvfs(folder)
-    free = disk.f_bavail * disk.f_frsize
-    if free < size + RESERVE_SIZE:
-        raise ArchiveError(
-            f"the disk of {folder} has {free >> 20} MB free: a copy needs {(size >> 20) + 1} MB, and "
-            f"{RESERVE_SIZE >> 20} MB stay free for checkpoints; free some space"
-        )
 
 
 def _stamp(word: str) -> int | None:

@@ -14,13 +14,32 @@ import secrets
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Final, Protocol
 
 from msgspec import Struct
 
 from checkpoint.store.atomic_files import TEMPORARY_PREFIX
 from checkpoint.store.disk import Disk, DiskFile
 from failover.errors import ArchiveError
+
+RESERVE_SIZE: Final = 256 << 20
+"""Bytes of a disk that stay free for the checkpoints of the standbys."""
+
+FULL: Final = "full"
+OLDER: Final = "older"
+"""Why a place did not take an object, where who puts it can do something about it: `PutRefusedError`."""
+
+
+class PutRefusedError(ArchiveError):
+    """The place does not take an object now.
+
+    Attributes:
+        why: `FULL`: it would if older copies of this component were gone; `OLDER`: a newer copy of it came meanwhile.
+    """
+
+    def __init__(self, why: str, message: str) -> None:
+        super().__init__(message)
+        self.why = why
 
 
 class Stored(Struct, frozen=True):
@@ -49,6 +68,9 @@ class ObjectStore(Protocol):
 
         Returns:
             False: there is an object of that name, which stays as it is.
+
+        Raises:
+            PutRefusedError: not now.
         """
         ...
 
@@ -77,22 +99,36 @@ class FolderObjects:
 
     def put(self, name: str, content: BinaryIO) -> bool:
         """See `ObjectStore.put`."""
-        final, disk = self._path(name), Disk()
-        aside = final.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}")
+        final, disk, source = self._path(name), Disk(), content.fileno()
         with self._told(f"write {name}"):
             self._make_folder(final.parent)
-            descriptor = disk.create(aside)
             try:
-                DiskFile(disk, descriptor).copy_from(content.fileno())
-                disk.sync_file(descriptor)
-                os.link(aside, final)  # as a rename, but it replaces nothing
+                if not self._is_named(disk, source, final):
+                    self._copy(disk, source, final)
             except FileExistsError:
                 return False
-            finally:
-                os.close(descriptor)
-                disk.remove(aside)
             disk.sync_folder(final.parent)
         return True
+
+    @staticmethod
+    def _is_named(disk: Disk, source: int, final: Path) -> bool:
+        """Give a file of this disk that has no name yet this one, in place of a copy. Raises FileExistsError."""
+        if not disk.is_unnamed(source):
+            return False
+        disk.sync_file(source)
+        return disk.name(source, final)
+
+    @staticmethod
+    def _copy(disk: Disk, source: int, final: Path) -> None:
+        aside = final.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}")
+        descriptor = disk.create(aside)
+        try:
+            DiskFile(disk, descriptor).copy_from(source)
+            disk.sync_file(descriptor)
+            os.link(aside, final)  # as a rename, but it replaces nothing
+        finally:
+            os.close(descriptor)
+            disk.remove(aside)
 
     def _make_folder(self, folder: Path) -> None:
         self._require_root()
@@ -151,3 +187,19 @@ class FolderObjects:
             if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
                 why += "; the agent's service needs ReadWritePaths= for it (systemctl edit failover-agent)"
             raise ArchiveError(f"cannot {tried} in the archive {self._root}: {why}") from error
+
+
+def require_room(folder: Path, size: int) -> None:
+    """Refuse to begin what could take a disk the room that checkpoints need.
+
+    Raises:
+        ArchiveError: it has not so many bytes and `RESERVE_SIZE`.
+        OSError: it does not say.
+    """
+    disk = os.statvfs(folder)
+    free = disk.f_bavail * disk.f_frsize
+    if free < size + RESERVE_SIZE:
+        raise ArchiveError(
+            f"the disk of {folder} has {free >> 20} MB free: a copy needs {(size >> 20) + 1} MB, and "
+            f"{RESERVE_SIZE >> 20} MB stay free for checkpoints; free some space"
+        )

@@ -124,10 +124,7 @@ def unsealed(key: bytes, name: str, source: Readable) -> Iterator[bytes]:
     Raises:
         ArchiveError: it was altered, cut off, put under another name, or sealed with another key.
     """
-    head = exactly(source, HEAD_SIZE)
-    if head[:MAGIC_SIZE] not in (AES, CHACHA) or len(head) < HEAD_SIZE:
-        raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
-    cipher, number = _cipher(key, head, name), 0
+    cipher, number = _cipher(key, exactly(source, HEAD_SIZE), name), 0
     frame = exactly(source, FRAME_SIZE + TAG_SIZE)
     while following := exactly(source, FRAME_SIZE + TAG_SIZE):
         yield _opened(cipher, number, False, frame, name)
@@ -189,7 +186,9 @@ def has_aes() -> bool:
 
 
 def _cipher(key: bytes, head: bytes, name: str) -> Any:
-    """The cipher that an object's head names, with the key of that object."""
+    """The cipher that an object's head names, with the key of that object. Raises ArchiveError: it names none."""
+    if head[:MAGIC_SIZE] not in (AES, CHACHA) or len(head) < HEAD_SIZE:
+        raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
     magic, salt = head[:MAGIC_SIZE], head[MAGIC_SIZE:]
     try:
         from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305

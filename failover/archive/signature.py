@@ -21,7 +21,6 @@ from failover.errors import ArchiveError
 PUBLIC_FILE: Final = "archive.public"
 PUBLIC_MODE: Final = 0o644
 KEY_SIZE: Final = 32
-SIGNATURE_SIZE: Final = 64
 PUT: Final = "put"
 REMOVE: Final = "remove"
 _PAIR: Final = "failover-archive-1 signatures"
@@ -41,8 +40,8 @@ def public_of(key: bytes) -> bytes:
     return public
 
 
-def write_public(team: Path, key: bytes) -> bool:
-    """Write the public half beside its archive key; False: it is there already.
+def write_public(team: Path, key: bytes) -> None:
+    """Write the public half beside its archive key, unless it is there.
 
     Raises:
         ArchiveError: another one is there, or it cannot be written.
@@ -52,7 +51,7 @@ def write_public(team: Path, key: bytes) -> bool:
         with contextlib.suppress(FileNotFoundError):
             if path.read_bytes() != text.encode():
                 raise ArchiveError(f"{path} belongs to another archive key: remove it, and give the command again")
-            return False
+            return
         with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, PUBLIC_MODE), "w") as file:
             file.write(text)
             file.flush()
@@ -60,7 +59,6 @@ def write_public(team: Path, key: bytes) -> bool:
         sync_directory(path.parent)
     except OSError as error:
         raise ArchiveError(f"cannot write {path}: {error.strerror}") from error
-    return True
 
 
 def read_public(team: Path) -> bytes:

@@ -11,18 +11,18 @@ from collections.abc import Iterator
 from typing import Any, BinaryIO, Final, Protocol
 
 import msgspec
-from blake3 import blake3
 from msgspec import Struct
 
+from checkpoint.store.content_store import digest_of_descriptor
 from failover.archive import signature
-from failover.archive.objects import Readable, Stored
+from failover.archive.objects import FULL, OLDER, PutRefusedError, Readable, Stored
 from failover.errors import ArchiveError
-
-VERB: Final = "sealed"
-"""Of the orders by which a witness is asked."""
 
 READ_MAX: Final = 192 << 10
 """Bytes of one answer: it travels as one message."""
+
+HEAD: Final = 64
+"""Bytes that are asked for first: who looks at an object's head needs no more."""
 
 LISTED_MAX: Final = 500
 """Objects of one answer."""
@@ -30,7 +30,10 @@ LISTED_MAX: Final = 500
 WANTED: Final = "wanted"
 KEPT: Final = "kept"
 OTHER: Final = "other"
-"""What a witness answers to a `Put`: its bytes are wanted; it keeps them; it keeps an object of that name that has others."""
+"""What a witness answers to a `Put`: its bytes are wanted; it keeps them; it keeps an object of that name that has others.
+
+Or `failover.archive.objects.FULL` or ``OLDER``.
+"""
 
 
 class Size(Struct, frozen=True, tag_field="act", tag="size"):
@@ -47,10 +50,11 @@ class Listed(Struct, frozen=True, tag_field="act", tag="listed"):
 
 
 class Read(Struct, frozen=True, tag_field="act", tag="read"):
-    """The bytes of an object from one on. Answer: ``content``."""
+    """Bytes of an object from one on, ``size`` of them or `READ_MAX` at most. Answer: ``content``."""
 
     name: str
     first: int
+    size: int = READ_MAX
 
 
 class Put(Struct, frozen=True, tag_field="act", tag="put"):
@@ -78,13 +82,14 @@ class Answer(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
     Attributes:
         size: of the object; None: there is none.
         content: at most `READ_MAX` bytes; b"" at the object's end.
-        found: `WANTED`, `KEPT` or `OTHER`.
+        found: of a `Put`; ``why``: the sentence, where it is not taken.
         objects: (name, size, seconds since 1970), in the order of names, at most `LISTED_MAX`; ``more``: there are more.
     """
 
     size: int | None = None
     content: bytes = b""
     found: str = ""
+    why: str = ""
     objects: tuple[tuple[str, int, float], ...] = ()
     more: bool = False
 
@@ -114,11 +119,17 @@ class WitnessObjects:
 
     def put(self, name: str, content: BinaryIO) -> bool:
         """See `ObjectStore.put`."""
-        size, digest = os.fstat(content.fileno()).st_size, _digest(content.fileno())
+        size, digest = os.fstat(content.fileno()).st_size, digest_of_descriptor(content.fileno())
         request = Put(name, size, digest, signature.sign(self._key, signature.PUT, name, size, digest))
-        if self._ask(request).found != WANTED:
+        answer = self._ask(request)
+        if answer.found in (FULL, OLDER):
+            raise PutRefusedError(answer.found, answer.why)
+        if answer.found != WANTED:
             return False
-        self._witness.ship(digest, size, content.fileno())
+        try:
+            self._witness.ship(digest, size, content.fileno())
+        except ArchiveError as error:
+            raise ArchiveError(f"{name} did not come to the witness: {error}") from error
         return self._ask(request).found == KEPT
 
     def size(self, name: str) -> int | None:
@@ -127,7 +138,7 @@ class WitnessObjects:
 
     def open(self, name: str, first: int = 0) -> Readable:
         """See `ObjectStore.open`."""
-        return _Body(self, name, first, self._read(name, first))
+        return _Body(self, name, first, self._read(name, first, HEAD))
 
     def listed(self, folder: str) -> Iterator[Stored]:
         """See `ObjectStore.listed`."""
@@ -145,8 +156,8 @@ class WitnessObjects:
         """See `ObjectStore.remove`."""
         self._ask(Remove(name, signature.sign(self._key, signature.REMOVE, name)))
 
-    def _read(self, name: str, first: int) -> bytes:
-        return self._ask(Read(name, first)).content
+    def _read(self, name: str, first: int, size: int = READ_MAX) -> bytes:
+        return self._ask(Read(name, first, size)).content
 
     def _ask(self, request: Request) -> Answer:
         answer = self._witness.ask(msgspec.to_builtins(request, builtin_types=(bytes,)))
@@ -175,11 +186,3 @@ class _Body:
     def close(self) -> None:
         """Ask for no more."""
         self._rest = memoryview(b"")
-
-
-def _digest(descriptor: int) -> bytes:
-    digest, offset = blake3(), 0
-    while part := os.pread(descriptor, 1 << 20, offset):
-        digest.update(part)
-        offset += len(part)
-    return digest.digest()

@@ -28,6 +28,9 @@ PATIENCE_S: Final = 75.0
 UNDER_WAY_MAX: Final = 64
 """Errands of one peer that are carried out at a time; more are refused."""
 
+SEALED: Final = "sealed"
+"""The verb by which a robot asks a witness about sealed copies (`failover.archive.witness`)."""
+
 CONTENT_MAX: Final = CHUNK_SIZE_MAX
 """Bytes of an answer: the replication link takes no larger message than a chunk of a snapshot."""
 

@@ -334,6 +334,10 @@ class Receiver:
         """The sender gave up."""
         self._drop((peer, message.transfer))
 
+    def arriving(self) -> int:
+        """Bytes of all transfers under way, whole. From any thread."""
+        return sum(transfer.offer.size for transfer in list(self._incoming.values()))
+
     def lost(self, peer: str) -> None:
         """The peer is gone: its unfinished transfers leave no trace."""
         for key in [key for key in self._incoming if key[0] == peer]:

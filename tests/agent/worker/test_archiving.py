@@ -23,7 +23,10 @@ from agent.archive.messages import KeepCheckpoint
 from agent.archive.process import Archivist
 from agent.errors import LaneError
 from agent.worker.archiving import Archiving
+from agent.worker.network.remote_orders import Errands
 from agent.worker.replication.send_files import Reader
+from agent.worker.replication.send_sealed import Courier
+from agent.worker.replication.transfer import Shipper
 from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
@@ -37,6 +40,7 @@ from failover.archive.objects import FolderObjects
 from failover.config import team
 from failover.config.team import Robot, Role, Team
 from failover.core.events import Event
+from failover.core.wire.messages import Bulk, Chunk, Offer
 from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
 
 pytest.importorskip("cryptography")
@@ -68,6 +72,16 @@ class Member:
     def archived(self, component: str = COMPONENT) -> list[int]:
         """The numbers of the copies, the newest first."""
         return [copy.sequence for copy in self.archive().copies(component)]
+
+
+class Nowhere:
+    """A link that does not stand."""
+
+    def say(self, peer: str, message: Bulk) -> bool:
+        return False
+
+    async def ship(self, peer: str, chunk: Chunk | Offer) -> None:
+        raise LaneError(f"the replication link to {peer} is not connected")
 
 
 async def nothing(component: str, need: Need) -> int:
@@ -118,6 +132,23 @@ async def until(condition: Callable[[], Any]) -> None:
     async with asyncio.timeout(PATIENCE_S):
         while not condition():
             await asyncio.sleep(0.02)
+
+
+def test_nothing_is_folded_or_sealed_while_no_copy_can_leave_for_its_witness(tmp_path: Path) -> None:
+    with member(tmp_path) as one:
+        one.put(snapshot({1: page("x")}))
+        one.running.add(COMPONENT)
+        courier = Courier(
+            Errands(lambda *_: None, lambda _: "", {}), Shipper(Nowhere()), "gate", lambda: "wlan0 is the only link"
+        )
+        archiving = Archiving(one.archiving._settings, one.store, lambda: one.running, nothing, one.events.append, courier)
+        one.archiving = archiving
+
+        async def work() -> None:
+            await until(lambda: "sealed copies wait: wlan0 is the only link" in "".join(archiving.complaints()))
+
+        run(one, work)
+        assert archiving._child is None, "the archive's process was not even started"
 
 
 def test_a_robot_archives_what_runs_here_and_a_server_all_that_it_keeps(tmp_path: Path) -> None:

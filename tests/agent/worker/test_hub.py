@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from agent import config as configuration
+from agent.errors import RefusedError
 from agent.main_loop.messages import Happened, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
@@ -155,3 +156,29 @@ def test_a_former_member_is_admitted_and_connected_to(shrunk: configuration.Sett
 def test_a_witness_may_pass_a_change_of_the_team_on(settings: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     order = Errand(3, "team_taken", b"\x80", 0)
     assert heard(settings, "gate", order, monkeypatch) == [order]
+
+
+@pytest.mark.parametrize("is_link", [False, True], ids=["a file", "a link that leads nowhere"])
+def test_a_witness_whose_folder_for_sealed_copies_is_harmed_says_so_and_votes_all_the_same(
+    settings: configuration.Settings, is_link: bool
+) -> None:
+    settings.path.write_text(settings.path.read_text().replace("robot1", "gate") + '[store]\nsealed_size = "1GB"\n')
+    folder = Path(settings.config.state_directory) / "sealed"
+    folder.parent.mkdir(exist_ok=True)
+    if is_link:
+        folder.symlink_to("nowhere/at/all")
+    else:
+        folder.write_text("")
+
+    async def begin() -> None:
+        ours, theirs = pair()
+        with ours, theirs:
+            worker = Witness(configuration.load(settings.path), Channel(ours, ToWorker))
+            assert await worker.prepare() == Inventory((), ())
+            (notice,) = (one for one in worker.notices() if str(folder) in one)
+            assert notice.startswith(f"gate cannot keep sealed copies in {folder}: ")
+            assert notice.endswith("; repair that folder, and restart its agent")
+            with pytest.raises(RefusedError, match="gate cannot keep sealed copies"):
+                await worker._asked_for_a_copy("robot1", {"act": "listed", "folder": "lab"})
+
+    asyncio.run(begin())

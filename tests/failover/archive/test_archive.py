@@ -103,6 +103,13 @@ def test_what_was_sealed_comes_back(size: int, magic: bytes) -> None:
     check_end(closed)
 
 
+@pytest.mark.parametrize("at", range(sealed.MAGIC_SIZE))
+def test_both_ends_of_an_object_do_not_prove_it_where_its_first_bytes_name_no_cipher(at: int, magic: bytes) -> None:
+    closed = seal(b"secret")
+    with pytest.raises(ArchiveError, match="is no sealed object of this version of failover"):
+        check_end(closed[:at] + bytes([closed[at] ^ 0x80]) + closed[at + 1 :])
+
+
 def test_two_seals_of_one_content_share_no_byte_beyond_chance() -> None:
     assert seal(b"secret")[: sealed.HEAD_SIZE] != seal(b"secret")[: sealed.HEAD_SIZE]
 
@@ -309,7 +316,7 @@ def test_a_needed_file_that_changes_while_it_is_sealed_leaves_no_object(place: P
 
 
 def test_a_disk_that_is_nearly_full_takes_no_copy(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("failover.archive.archive.RESERVE_SIZE", 1 << 60)
+    monkeypatch.setattr("failover.archive.objects.RESERVE_SIZE", 1 << 60)
     with pytest.raises(ArchiveError, match=r"MB free: a copy needs 1 MB, and .* stay free for checkpoints; free some space"):
         put(archive(place), history(1)[0])
     assert archive(place).copies() == []

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import msgspec
 import pytest
@@ -15,9 +16,10 @@ from blake3 import blake3
 
 from checkpoint.snapshot import format
 from checkpoint.store.index import folder_name
-from failover.archive import signature
+from failover.archive import sealed, signature
 from failover.archive.archive import Archive
-from failover.archive.witness import WANTED, Put, Read, WitnessObjects
+from failover.archive.objects import OLDER, FolderObjects, PutRefusedError
+from failover.archive.witness import WANTED, Listed, Put, Read, Size, WitnessObjects
 from failover.errors import ArchiveError
 from tests import witnesses
 from tests.checkpoint.snapshots import COMPONENT, page, pages_of, snapshot
@@ -51,8 +53,8 @@ def put(gate: Gate, name: str, content: BinaryIO, signed: str = "", key: bytes =
     size, true = os.fstat(content.fileno()).st_size, blake3(os.pread(content.fileno(), 1 << 30, 0)).digest()
     proof = signature.sign(key, signature.PUT, signed or name, size, true)
     asked = Put(name, size, digest or true, proof)
-    found: str = gate.ask(msgspec.to_builtins(asked, builtin_types=(bytes,)))["found"]
-    return found
+    answer = gate.ask(msgspec.to_builtins(asked, builtin_types=(bytes,)))
+    return str(answer.get("why") or answer["found"])
 
 
 @contextlib.contextmanager
@@ -88,7 +90,7 @@ def test_bytes_that_were_altered_or_cut_off_on_their_way_are_not_kept(gate: Gate
         (lambda part: part[:-1], "was due"),
     ):
         gate.spoil = spoil
-        with pytest.raises(ArchiveError, match=said):
+        with pytest.raises(ArchiveError, match=f"{FIRST} did not come to the witness: .*{said}"):
             objects.put(FIRST, content)
         assert objects.size(FIRST) is None and not [one for one in gate.directory.rglob("*") if one.is_file()]
     gate.spoil = lambda part: part
@@ -120,9 +122,11 @@ def test_an_older_copy_is_refused_by_name_also_where_it_was_here_before(gate: Ga
     assert objects.put(FIRST, content) and objects.put(THIRD, content)
     objects.remove(FIRST)
     for old in (FIRST, SECOND):
-        with pytest.raises(ArchiveError) as refusal:
-            put(gate, old, content)
-        assert f"refused the sealed copy {old} of {ROBOT}: it is older than the newest copy here, {THIRD}" in str(refusal.value)
+        said = f"refused the sealed copy {old} of {ROBOT}: it is older than the newest copy here, {THIRD}"
+        assert put(gate, old, content) == said
+        with pytest.raises(PutRefusedError, match="it is older than") as refusal:
+            objects.put(old, content)
+        assert refusal.value.why == OLDER
     assert put(gate, OF_ANOTHER, content) == WANTED, "each component has an order of its own"
 
 
@@ -156,33 +160,45 @@ def test_a_name_leads_nowhere_else(name: str, gate: Gate, content: BinaryIO) -> 
         put(gate, name, content)
     with pytest.raises(ArchiveError, match="keeps no sealed copy"):
         gate.ask(msgspec.to_builtins(Read(name, 0)))
+    with pytest.raises(ArchiveError, match="is the name of no sealed copy"):
+        WitnessObjects(gate, KEY).remove(name)
 
 
-def test_a_request_that_is_none_is_told_in_a_sentence(gate: Gate) -> None:
+def test_a_request_that_is_none_is_told_in_a_sentence(gate: Gate, content: BinaryIO) -> None:
     for strange in ({}, {"act": "open"}, {"act": "read", "name": 1}, {"act": "put", "name": "x"}):
         with pytest.raises(ArchiveError, match="the request about a sealed copy was not understood"):
             gate.ask(strange)
+    assert WitnessObjects(gate, KEY).put(FIRST, content)
+    for first, size in ((1 << 63, 1), ((1 << 64) - 1, 1), ((3 << 20) + 1, 1), (-1, 1), (0, 0), (0, -1)):
+        with pytest.raises(ArchiveError, match=f"{FIRST} has 3145728 bytes: there are no {size} from byte {first} on"):
+            gate.ask(msgspec.to_builtins(Read(FIRST, first, size)))
+    for size in (0, -1, 1 << 63, (1 << 64) - 1):
+        with pytest.raises(ArchiveError, match=f"of {size} bytes is no sealed copy"):
+            gate.ask(msgspec.to_builtins(Put(SECOND, size, bytes(32), bytes(64)), builtin_types=(bytes,)))
+    assert gate.ask(msgspec.to_builtins(Size("lab/\0"))) == {}
+    assert gate.ask(msgspec.to_builtins(Listed("/etc"))) == {}
 
 
 def test_more_than_the_witness_gives_is_refused_with_the_cure(tmp_path: Path, content: BinaryIO) -> None:
     with witnesses.keeping(tmp_path, KEY, size_max=4 << 20) as gate:
         objects = WitnessObjects(gate, KEY)
         objects.put(FIRST, content)
-        with pytest.raises(ArchiveError, match=r"no room for .*; raise it, or lower s3_keep at the robots"):
-            objects.put(SECOND, content)
-        objects.remove(FIRST)
-        assert objects.put(SECOND, content)
+        said = rf"no room for {OF_ANOTHER} of 3145728 bytes: {GATE} keeps 3145728 bytes .*; raise it, lower s3_keep at the robots"
+        with pytest.raises(ArchiveError, match=said):
+            objects.put(OF_ANOTHER, content)
+        (gate.directory / FIRST).unlink()
+        assert objects.put(OF_ANOTHER, content), "the third cure that it names: somebody removes a copy there"
 
 
 def test_the_next_life_of_a_witness_keeps_what_this_one_kept(tmp_path: Path, content: BinaryIO) -> None:
     with witnesses.keeping(tmp_path, KEY) as gate:
         WitnessObjects(gate, KEY).put(SECOND, content)
     (gate.directory / "lab" / "arriving-1").write_bytes(b"a half")
+    (gate.directory / "arriving-team").mkdir()
     with witnesses.keeping(tmp_path, KEY) as again:
         assert [one.name for one in WitnessObjects(again, KEY).listed("lab")] == [SECOND]
         assert not (gate.directory / "lab" / "arriving-1").exists()
-        with pytest.raises(ArchiveError, match="it is older than"):
-            put(again, FIRST, content)
+        assert "it is older than" in put(again, FIRST, content)
 
 
 def test_a_witness_that_alters_exchanges_or_cuts_off_is_found_out_before_a_byte_is_used(gate: Gate, tmp_path: Path) -> None:
@@ -199,3 +215,146 @@ def test_a_witness_that_alters_exchanges_or_cuts_off_is_found_out_before_a_byte_
             with pytest.raises(ArchiveError, match="in the archive"):
                 ours.fetch(copy, back)
             assert back.seek(0, os.SEEK_END) == 0
+
+
+def test_transfers_that_do_not_arrive_leave_room_for_the_next(tmp_path: Path, content: BinaryIO) -> None:
+    """Each try has another digest, as a copy that is sealed anew has."""
+    with witnesses.keeping(tmp_path, KEY, size_max=4 << 20) as gate:
+        objects = WitnessObjects(gate, KEY)
+        spoilt = (lambda part: part[:-1] + bytes([part[-1] ^ 1]), lambda part: part[:-1])
+        for spoil in spoilt:
+            gate.spoil = spoil
+            with pytest.raises(ArchiveError, match="did not come to the witness"):
+                objects.put(FIRST, content)
+            content.seek(0)
+            content.write(os.urandom(32))
+            content.flush()
+        for number in range(3):  # asked for, and never offered
+            content.seek(0)
+            content.write(os.urandom(32))
+            content.flush()
+            assert put(gate, SECOND.replace("-1-2-3-", f"-1-2-{number}-"), content) == WANTED
+        gate.spoil = lambda part: part
+        assert objects.put(SECOND, content)
+
+
+def test_what_is_under_way_takes_room(tmp_path: Path, content: BinaryIO) -> None:
+    with witnesses.keeping(tmp_path, KEY, size_max=4 << 20) as gate:
+        assert put(gate, FIRST, content) == WANTED
+        gate.copies.arriving = lambda: 2 << 20
+        with pytest.raises(ArchiveError, match="2097152 are on their way, and its sealed_size is 4194304"):
+            gate.ship(blake3(os.pread(content.fileno(), 1 << 30, 0)).digest(), 3 << 20, content.fileno())
+        with pytest.raises(ArchiveError, match="2097152 are on their way"):
+            put(gate, FIRST, content)
+
+
+def test_where_a_witness_is_full_older_copies_of_that_component_go_and_never_the_newest(tmp_path: Path) -> None:
+    with witnesses.keeping(tmp_path, KEY, size_max=10_000) as gate:
+        ours = archive(gate, tmp_path)
+        names = []
+        for number in range(12):
+            with checkpoint(os.urandom(400).hex()) as made:
+                names.append(ours.put(made, ROBOT)[0])
+            assert ours.copies(COMPONENT)[0].name == names[-1], number
+        kept = [copy.name for copy in reversed(ours.copies(COMPONENT))]
+        assert 2 <= len(kept) < 12 and kept == names[-len(kept) :], "the oldest went first"
+        with checkpoint(os.urandom(400).hex(), component=COMPONENT + "2") as made, pytest.raises(ArchiveError, match="no room"):
+            ours.put(made, ROBOT)
+        with tempfile.TemporaryFile() as large:
+            large.write(os.urandom(9_500))
+            large.flush()
+            for _ in range(2):
+                with pytest.raises(ArchiveError, match="no room for lab/contents/"):
+                    ours.put_content(blake3(os.pread(large.fileno(), 1 << 20, 0)).digest(), large)
+        assert [copy.name for copy in reversed(ours.copies(COMPONENT))] == kept, "for others none of them goes"
+
+
+def test_a_copy_that_another_member_overtook_is_sealed_anew_with_a_later_time(
+    gate: Gate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    ours, theirs = archive(gate, tmp_path), archive(gate, tmp_path)
+    overtaken: list[str] = []
+    whole = ours._put_in_room
+
+    def overtake(name: str, file: BinaryIO, spare: Sequence[str]) -> bool:
+        if not overtaken:
+            with checkpoint("theirs") as made:
+                overtaken.append(theirs.put(made, "robot2")[0])
+        return whole(name, file, spare)
+
+    monkeypatch.setattr(ours, "_put_in_room", overtake)
+    with checkpoint("ours") as made:
+        name, _ = ours.put(made, ROBOT)
+    assert [copy.name for copy in ours.copies(COMPONENT)] == [name, *overtaken]
+    assert not caplog.records, "nobody did anything wrong"
+
+
+def test_a_transfer_that_is_dropped_while_its_copy_is_stored_leaves_a_copy_that_counts(
+    gate: Gate, content: BinaryIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored, dropped = threading.Event(), threading.Event()
+    whole = FolderObjects.put
+
+    def slow(self: FolderObjects, name: str, file: BinaryIO) -> bool:
+        is_ours = whole(self, name, file)
+        stored.set()
+        dropped.wait()
+        return is_ours
+
+    monkeypatch.setattr(FolderObjects, "put", slow)
+
+    def try_to_put() -> None:
+        with contextlib.suppress(ArchiveError):
+            WitnessObjects(gate, KEY).put(FIRST, content)
+
+    putting = threading.Thread(target=try_to_put)
+    putting.start()
+    stored.wait()
+    gate.drop_transfers()
+    dropped.set()
+    putting.join()
+    assert WitnessObjects(gate, KEY).size(FIRST) == 3 << 20
+
+
+def test_the_witness_sees_what_was_removed_or_changed_on_its_disk(gate: Gate, content: BinaryIO) -> None:
+    objects = WitnessObjects(gate, KEY)
+    for name in (FIRST, SECOND, THIRD):
+        objects.put(name, content)
+    (gate.directory / THIRD).unlink()
+    assert [one.name for one in objects.listed("lab")] == [FIRST, SECOND]
+    (gate.directory / SECOND).unlink()
+    assert objects.size(SECOND) is None
+    (gate.directory / FIRST).write_bytes(b"short")
+    assert objects.size(FIRST) == 5
+    (gate.directory / FIRST).unlink()
+    with pytest.raises(ArchiveError, match="keeps no sealed copy"):
+        objects.open(FIRST)
+    assert objects.put(FIRST, content), "nothing newer is there any more"
+
+
+def test_a_disk_keeps_its_reserve(gate: Gate, content: BinaryIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("failover.archive.objects.RESERVE_SIZE", 1 << 60)
+    with pytest.raises(ArchiveError, match=r"MB free: a copy needs 4 MB, and .* stay free for checkpoints; free some space"):
+        WitnessObjects(gate, KEY).put(FIRST, content)
+
+
+def test_who_reads_the_head_of_an_object_is_sent_little(gate: Gate, content: BinaryIO) -> None:
+    objects = WitnessObjects(gate, KEY)
+    objects.put(FIRST, content)
+    sent: list[int] = []
+    whole = gate.ask
+
+    def ask(arguments: dict[str, Any]) -> dict[str, Any]:
+        answer = whole(arguments)
+        sent.append(len(answer.get("content", b"")))
+        return answer
+
+    gate.ask = ask  # type: ignore[method-assign]
+    assert sealed.exactly(objects.open(FIRST), sealed.HEAD_SIZE) == os.pread(content.fileno(), sealed.HEAD_SIZE, 0)
+    assert sum(sent) <= 64
+
+
+def test_a_name_with_a_line_break_forges_no_line_of_the_log(gate: Gate, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ArchiveError, match="is the name of no sealed copy"):
+        WitnessObjects(gate, OTHER_KEY).remove("lab/x\nrefused the sealed copy lab/y of robot2")
+    assert not any("\n" in record.getMessage() for record in caplog.records)
