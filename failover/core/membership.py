@@ -195,7 +195,8 @@ class Membership:
         self._loyalty_ns, self._grace_ns = config.loyalty_ns, config.grace_ns
         self._elects = config.by_majority
         self._rule = RULES.index(config.rule)
-        lesser = (peer for peer in config.peers if weight(peer) < weight(config.robot))
+        others = (peer for peer in config.peers if peer != config.coordinator)  # etcd hears no heartbeat and sends none
+        lesser = (peer for peer in others if weight(peer) < weight(config.robot))
         self._before_us = tuple(sorted(lesser, key=weight))
 
     def change(self, config: Config, now_ns: int) -> None:
@@ -382,7 +383,8 @@ class Membership:
 
     def echoes(self, now_ns: int) -> tuple[Echo, ...]:
         """Whom we hear, for the next beat. Under majority a peer that has not heard us for long may not act on that."""
-        return tuple(self._echo(peer, now_ns) for peer in self.peers.values() if peer.boot)
+        heard = (peer for peer in self.peers.values() if peer.boot and peer.robot != self._config.coordinator)
+        return tuple(self._echo(peer, now_ns) for peer in heard)
 
     def _echo(self, peer: Peer, now_ns: int) -> Echo:
         counter = 0 if peer.at_odds else peer.counter
@@ -516,7 +518,8 @@ class Membership:
             return "unheard"
         if now_ns >= peer.loyal_until_ns:
             return "restarting" if now_ns < peer.awaited_until_ns else "dead"
-        return "suspect" if now_ns - peer.heard_ns > SUSPECT_BEATS * self._config.beat_ns else "alive"
+        is_suspect = now_ns - peer.heard_ns > SUSPECT_BEATS * self._config.beat_ns and peer.robot != self._config.coordinator
+        return "suspect" if is_suspect else "alive"
 
     def _view(self, peer: Peer, now_ns: int) -> PeerView:
         silent_ns = now_ns - peer.heard_ns

@@ -15,6 +15,7 @@ from failover.core.beat_builder import Speaker, entry_of
 from failover.core.beat_pace import BeatPace
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import lease, majority, pair, votes
+from failover.core.election.coordinator import Word
 from failover.core.events import (
     ActFailed,
     Captured,
@@ -229,6 +230,10 @@ class Node:
     def primaries(self) -> dict[str, tuple[str, int]]:
         """Component → its primary, as far as this robot knows, and the epoch."""
         return {name: (one.primary, one.epoch) for name, one in self._components.items() if one.primary and one.epoch}
+
+    def word(self) -> Word:
+        """For etcd: all that this robot holds, once the last ``Ready.persist`` is durable, and its newest heartbeat."""
+        return Word(self._boot, self._speaker.counter, tuple(self._entries().values()))
 
     def _turn(self, now_ns: int) -> Turn:
         counter, leaving = self._speaker.counter + 1, self._leaving_ns > 0

@@ -55,10 +55,18 @@ class WhenAlone(enum.StrEnum):
 
 
 class Rule(enum.StrEnum):
-    """How a silent primary is replaced: by each robot that hears it no longer, or by the majority of all that vote."""
+    """How a silent primary is replaced: by each robot that hears it no longer, or by the majority of all that vote.
+
+    ``etcd``: by a majority in which etcd has a vote, as the member `COORDINATOR`.
+    """
 
     PAIR = "pair"
     MAJORITY = "majority"
+    ETCD = "etcd"
+
+
+COORDINATOR = "etcd"
+"""Under the rule ``etcd``: the witness of that name is etcd, see `failover.core.election.coordinator`."""
 
 
 class OnUnsupported(enum.StrEnum):
@@ -333,6 +341,8 @@ class Config(Struct, frozen=True, dict=True):
             raise RulesError("margin_percent must be at least 2 and margin_ms_min at least 1: clocks drift, freezing takes time")
         if self.robot in self.peers:
             raise RulesError(f"robot {self.robot!r} is listed among its own peers; remove it there")
+        if self.coordinator and self.coordinator not in self.witnesses:
+            raise RulesError(f"rule = {self.rule} needs the witness {COORDINATOR}, which is etcd; no other member has that name")
         if len(self.peers) > PEERS_MAX:
             raise RulesError(f"{len(self.peers)} peers: at most {PEERS_MAX} robots share a team")
         if not self.by_majority and (self.servers or self.witnesses):
@@ -344,7 +354,12 @@ class Config(Struct, frozen=True, dict=True):
     @functools.cached_property
     def by_majority(self) -> bool:
         """Whether primaries are elected."""
-        return self.rule is Rule.MAJORITY
+        return self.rule is not Rule.PAIR
+
+    @functools.cached_property
+    def coordinator(self) -> str:
+        """The member that is etcd; "" where it has no vote."""
+        return COORDINATOR if self.rule is Rule.ETCD else ""
 
     @functools.cached_property
     def place(self) -> int:

@@ -11,11 +11,12 @@ from failover.core import beat_builder
 from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Restart, Rule, Rules, WhenAlone
 from tests.simulation import planned
+from tests.simulation.coordinator import Coordination, Fault
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
-from tests.simulation.teams import elective, pair
-from tests.simulation.troubles import Trouble
+from tests.simulation.teams import coordinated, elective, pair
+from tests.simulation.troubles import PAUSES_MS, Trouble
 from tests.simulation.world import World
 
 TROUBLE_NS = 3_000 * MS
@@ -58,6 +59,12 @@ BOOT_PATIENCE_MS = 1_500
 LIARS_TEAMS = tuple(team for team in TEAMS if sum(team) > 2)
 """Those that vote: of two, a liar is the other half of every decision."""
 
+COORDINATED = (2, 2, 2, 4, 3)
+"""Robots that vote together with etcd."""
+
+DEAF_LIVES = 0.3
+"""Of their lives: those in which they hear each other no more from some instant on, until all is healed."""
+
 LIE_NS = 300 * MS
 """After so long, on the average, a liar says something else."""
 
@@ -72,6 +79,7 @@ def life(
     faults: int = 0,
     *,
     liars: bool = False,
+    etcd: bool = False,
     restart: Restart = Restart.UNDECLARED,
     restarts: int = 0,
 ) -> World:
@@ -83,6 +91,7 @@ def life(
         restart: of all components, without a limit.
         restarts: of agents, planned, at random instants; a life is as long as they take at least.
         liars: an attacker has the key of a member, and lies by it until the world is healed.
+        etcd: the robots decide by the rule ``etcd``, and etcd has faults, too.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
@@ -92,6 +101,8 @@ def life(
     configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
+    if etcd:
+        configs = coordinated(COORDINATED[seed // HARSH % len(COORDINATED)], specs, 150 if seed % HARSH else LONG_LEASE_MS)
     narrow = NARROW_BEAT_SIZE + ECHO_SIZE * (len(configs) - 2)
     size_max = beat_size_max if seed % NARROW else lambda _: narrow
     if restarts:
@@ -103,7 +114,7 @@ def life(
 def _live(
     seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int, restarts: int, *, liars: bool
 ) -> World:
-    votes = configs[0].rule is Rule.MAJORITY
+    votes = configs[0].rule is not Rule.PAIR
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
     invariants = Invariants(safe=safe, votes=votes)
     world = World(seed, configs, (invariants,), random.choice(DRIFTS))
@@ -117,6 +128,8 @@ def _live(
     for _ in range(faults or (random.randrange(4, 16) if votes else random.randrange(1, 9))):
         world.at(random.randrange(trouble_ns), Trouble(world, invariants, random, specs, endless=faults > 0))
     planned.beside_faults(world, Random(seed ^ 0x9E57A27), restarts, trouble_ns)
+    if world.coordination is not None:
+        _trouble_etcd(world, world.coordination, Random(seed ^ 0xE7CD), trouble_ns, faults)
     if liars:
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3:
@@ -159,6 +172,27 @@ def _make_harsh(world: World) -> None:
         robot.slow, robot.clock.rate = 1, 1 + DRIFT_MAX * (1 if place else -1)
 
 
+def _trouble_etcd(world: World, etcd: Coordination, random: Random, until_ns: int, faults: int) -> None:
+    """Faults of etcd, half of them where something acts; some while the robots do not hear each other, or never do."""
+    names, specs = list(world.robots), [spec.name for spec in next(iter(world.robots.values())).config.components]
+    ways = {(one, other) for one in names for other in names if one != other}
+    if random.random() < DEAF_LIVES:
+        world.at(random.choice((0, random.randrange(until_ns // 2))), lambda: world.network.cuts.update(ways))
+    for _ in range(faults or random.randrange(2, 12)):
+        fault, name, for_ns = (
+            random.choice(etcd.faults()),
+            random.choice(names),
+            random.choice(PAUSES_MS) * MS + random.randrange(2),
+        )
+
+        def happen(fault: Fault = fault, name: str = name, for_ns: int = for_ns) -> None:
+            world.faults += 1
+            acting = [robot for component in specs for robot in world.acting(component)]
+            fault(acting[0] if acting and for_ns % 2 else name, for_ns)
+
+        world.at(random.randrange(until_ns), happen)
+
+
 def _let_one_lie(world: World, invariants: Invariants, random: Random, until_ns: int) -> None:
     """A member, and one lie after the other."""
     name = random.choice(list(world.robots))
@@ -193,6 +227,8 @@ def _lose_a_disk(world: World, random: Random) -> None:
 def _heal(world: World) -> None:
     world.note("healing")
     world.network.heal()
+    if world.coordination is not None:
+        world.coordination.heal()
     for name, robot in world.robots.items():
         robot.slow, robot.broken_store, robot.lie = 1, False, None
         world.power_on(name)

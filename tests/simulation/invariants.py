@@ -152,8 +152,11 @@ class Invariants:
             key = (robot, record.name, record.epoch)
             before = self.given.setdefault(key, record.primary)
             for_it = sum((name, *key[1:], record.primary) in self.cast for name in world.robots)
+            voters = len(world.robots)
+            if world.coordination is not None:
+                voters, for_it = voters + 1, for_it + ((*key[1:], record.primary) in world.coordination.etcd.votes)
             self.cast.add((*key, record.primary))
-            if before == robot and for_it > len(world.robots) // 2:
+            if before == robot and for_it > voters // 2:
                 self.given[key] = record.primary  # its own claim was in vain: it follows the one that was elected
             elif before != record.primary:
                 story = f"{robot} votes for {before} and {record.primary} in epoch {record.epoch} of {record.name}"

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from failover.core import acts, node, peer_claims
 from failover.core.component import Component, Turn
 from failover.core.election import lease, majority, pair, votes
+from failover.core.election.coordinator import Arbiter
 from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.replication import servers, standby, warm_standby
 from failover.core.transitions import drain, exits, handover, restarts
@@ -596,6 +597,33 @@ def drained_all_the_same() -> Any:
 def waits_for_every_restart() -> Any:
     """No component is taken over while the agent of any member restarts."""
     return patch.object(pair, "_is_passed_over", lambda *_: False)
+
+
+# Mistakes in the rule ``etcd``; tests/failover/core/election/test_coordinator.py catches those that need an instant of bad luck
+
+
+def no_fence_at_the_end() -> Any:
+    """A primary that was granted a lease once goes on when that is over."""
+    honest = majority.granted_ns
+
+    def endless(component: Component, turn: Turn) -> int:
+        until_ns = honest(component, turn)
+        return until_ns and max(until_ns, turn.now_ns + turn.config.lease_ns)
+
+    return patch.object(majority, "granted_ns", endless)
+
+
+def trusts_etcds_clock() -> Any:
+    """A robot counts as silent as soon as its lease at etcd is over."""
+    return patch.object(Arbiter, "_silent_ns", lambda self, robot: 0 if robot in self._leased else 1 << 60)
+
+
+ETCD_MUTANTS: tuple[tuple[Mutant, int], ...] = (
+    (lease_from_the_answer, 10),
+    (no_fence_at_the_end, 8),
+    (trusts_etcds_clock, 94),
+)
+"""Mistakes that lives with etcd catch, and the seed that caught each last."""
 
 
 SPOILERS: tuple[tuple[Mutant, str], ...] = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from failover.core.types import ComponentSpec, Config, Rule
+from failover.core.types import COORDINATOR, ComponentSpec, Config, Rule
 
 
 def pair(
@@ -40,4 +40,19 @@ def elective(
             components=components if config.robot in names["robot"] else (),
         )
         for config in pair(components, sum(names.values(), ()))
+    ]
+
+
+def coordinated(robots: int, components: tuple[ComponentSpec, ...] = (), lease_ms: int = 150) -> list[Config]:
+    """Configurations of robots that vote together with etcd."""
+    configs = elective(robots, components, witnesses=1, lease_ms=lease_ms)
+    return [
+        replace(
+            config,
+            rule=Rule.ETCD,
+            peers=(*(peer for peer in config.peers if peer != "witness1"), COORDINATOR),
+            witnesses=(COORDINATOR,),
+        )
+        for config in configs
+        if config.robot != "witness1"
     ]

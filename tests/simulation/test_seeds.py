@@ -11,7 +11,7 @@ from tests.simulation import planned
 from tests.simulation.__main__ import FAULTS_A_LIFE, RESTARTS_A_LIFE
 from tests.simulation.chaos import TEAMS, life
 from tests.simulation.invariants import Broken
-from tests.simulation.mutants import AS_THE_SEED_SAYS, CAUGHT_BY, ELECTIVE_MUTANTS, MUTANTS, Mutant, mistaken
+from tests.simulation.mutants import AS_THE_SEED_SAYS, CAUGHT_BY, ELECTIVE_MUTANTS, ETCD_MUTANTS, MUTANTS, Mutant, mistaken
 
 SEEDS = int(os.environ.get("FAILOVER_SEEDS", "300"))
 BLOCK = 50
@@ -35,6 +35,31 @@ def test_every_promise_holds_whatever_goes_wrong(first: int) -> None:
             life(seed)
         except Broken as story:
             raise Broken(f"seed {seed} (again: python -m tests.simulation --first {seed} --seeds 1): {story}") from None
+
+
+@pytest.mark.parametrize("first", range(0, SEEDS, BLOCK))
+def test_every_promise_holds_whatever_goes_wrong_with_etcd(first: int) -> None:
+    for seed in range(first, first + BLOCK):
+        try:
+            life(seed, etcd=True)
+        except Broken as story:
+            raise Broken(f"seed {seed} (again: python -m tests.simulation --etcd --first {seed} --seeds 1): {story}") from None
+
+
+def test_a_life_with_etcd_in_which_an_end_came_beside_a_claim_keeps_its_promises_now() -> None:
+    life(590, etcd=True)
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("mutant", "first"), ETCD_MUTANTS, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_mistake_in_the_rule_of_etcd_is_caught_by_some_seed(mutant: Mutant, first: int) -> None:
+    with mistaken(mutant):
+        for seed in sorted(range(SEEDS_TO_CATCH), key=lambda seed: (seed != first, seed)):
+            try:
+                life(seed, etcd=True)
+            except AssertionError:
+                return
+    pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
 
 
 @pytest.mark.parametrize("seed", ONCE_BROKEN)

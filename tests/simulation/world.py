@@ -23,6 +23,7 @@ from failover.core.node import Node
 from failover.core.types import MS, Config, Found, Held
 from failover.core.vote_record import decode, encode
 from failover.core.wire.messages import Beat
+from tests.simulation.coordinator import Coordination
 from tests.simulation.deeds import Deeds
 from tests.simulation.liars import fitting
 from tests.simulation.robots import KEEPS_STATE, KEY, TEAM, Clock, Network, NewDisk, Program, Robot
@@ -65,12 +66,15 @@ class World:
         self._order = itertools.count()
         self._deeds = Deeds(self)
         self._requests = itertools.count(1)
+        self.coordination: Coordination | None = None
         self.robots: dict[str, Robot] = {}
         for config in configs:
             clock = Clock(
                 1 + self.random.choice((-1, 1, -1, 1, self.random.uniform(-1, 1))) * drift, self.random.randrange(10**15)
             )
             self.robots[config.robot] = Robot(config.robot, config, clock)
+        if configs[0].coordinator:
+            self.coordination = Coordination(self, self.random)
 
     # Time
 
@@ -311,7 +315,10 @@ class World:
             self._deeds.carry_out(robot, act)
         if robot.away_ns is not None and robot.node is not None and robot.node.may_go(self.local(robot)):
             self._leave(robot, robot.away_ns)
-        elif robot.inbox:
+            return
+        if self.coordination is not None:
+            self.coordination.look(robot)
+        if robot.inbox:
             self.after(0, lambda: self._work(robot))
         elif robot.node is not None:
             self.at(robot.clock.true(robot.node.next_deadline_ns()), lambda: self._work(robot))

@@ -498,8 +498,11 @@ def heard_of_checkpoints(component: Component, entry: Entry) -> None:
 
 
 def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
-    """Record an end that a robot tells of; a copy that acted all the time goes on above it. Servers and witnesses end nothing."""
-    if not turn.config.runs(sender):
+    """Record an end that a robot tells of; a copy that acted all the time goes on above it. Servers and witnesses end nothing.
+
+    etcd has each end from the robot where it was, and keeps it.
+    """
+    if not turn.config.runs(sender) and sender != turn.config.coordinator:
         return
     if component.holding:
         if entry.epoch > component.epoch and _acted_all_along(component, turn):

@@ -16,6 +16,10 @@ def grounds(turn: Turn) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(peer.robot for peer in living if peer.at_odds), tuple(peer.robot for peer in living)
 
 
+ETCD_DELAY_S = 2
+"""A lease at etcd lasts for whole seconds, and etcd looks twice a second which ones are over."""
+
+
 def team(turn: Turn) -> str:
     """The promise of the rule in force, given the robots that are heard."""
     at_odds, living = grounds(turn)
@@ -24,6 +28,8 @@ def team(turn: Turn) -> str:
             f"{turn.me} decides by rule = {turn.config.rule}, {' and '.join(at_odds)} by another: between them they start, "
             "take over, move and protect nothing until all have the same rule in agent.toml."
         )
+    if turn.config.coordinator:
+        return _coordinated(turn, living)
     if not turn.team.peers:
         return f"{turn.me} is alone in its team: a lost robot takes its programs with it."
     if turn.config.by_majority:
@@ -48,6 +54,28 @@ def _elected(turn: Turn, heard: int) -> str:
         f"{turn.me} hears {heard} of {voters} that vote, itself among them, and {quorum} are a majority: no component acts at "
         f"two robots at once; a robot that is silent for {_silence(turn)} is replaced when a majority agrees."
     )
+
+
+def _coordinated(turn: Turn, living: tuple[str, ...]) -> str:
+    """The promise where etcd has a vote: what it adds, or what is lost while it does not answer."""
+    robots, quorum = [robot for robot in living if robot != turn.config.coordinator], turn.config.quorum
+    others, heard = len(turn.config.peers) - 1, 1 + len(robots)
+    hears = f"{turn.me} hears {len(robots)} of {others} other members"
+    if turn.config.coordinator in living and 1 + len(living) >= quorum:
+        after_s = turn.config.loyalty_ns / (1_000 * MS)
+        return (
+            f"{hears} and reaches etcd; {quorum} of {len(turn.config.peers) + 1} votes decide, one of them etcd's: no component "
+            f"acts at two robots at once; a robot that is silent is replaced after {after_s:.1f} s to "
+            f"{after_s + ETCD_DELAY_S:.1f} s."
+        )
+    if turn.config.coordinator in living:
+        return f"{hears} and reaches etcd, and {quorum} votes decide: its programs stand still until it hears more."
+    if heard < quorum:
+        return f"{hears} and does not reach etcd, and {quorum} votes decide: its programs stand still until it hears more."
+    lost = (
+        "a lost robot is replaced all the same" if heard > quorum else "nobody is taken over, and who is left alone stands still"
+    )
+    return f"{hears} and does not reach etcd: programs run on while the members hear each other; {lost}, until etcd is back."
 
 
 def one(component: Component, turn: Turn, protection: Protection) -> str:
