@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from agent.alerts_config import AlertsConfig
+from agent.coordinator_config import EXAMPLE, CoordinatorConfig
 from agent.errors import ConfigError
 from agent.hook_kinds import KINDS, check_told
 from agent.task_config import TaskConfig, declaration
@@ -29,6 +30,7 @@ from failover.core.types import (
     BEAT_MS_MAX,
     BEATS_IN_LEASE_MIN,
     COMPONENTS_MAX,
+    COORDINATOR,
     CPU_SHARES,
     GRACE_MS_MAX,
     PERIOD_MS_MAX,
@@ -43,6 +45,9 @@ PATIENCE_S_MAX: Final = 86_400
 GRACE_S_MAX: Final = GRACE_MS_MAX // 1_000
 KEEP_MAX: Final = 10_000
 """Files of one component; each is asked for its age when the agent starts."""
+
+ETCD_LEASE_MS_MIN, ETCD_LEASE_MS = 1_000, 1_800
+"""With the rule etcd: the least, and one whose margin ends with a lease of etcd that lasts for two seconds."""
 
 HOOK_S_MAX: Final = 50
 """The rules give a restore a minute."""
@@ -198,7 +203,8 @@ class Config:
         boot_patience_s: under the pair rule: how long a robot that starts waits for the robots that may run a component.
         restart_grace_s: how long the peers are asked to wait for this agent when it restarts, and the most that it waits for
             theirs; 0: neither.
-        rule: how the team decides to replace a silent robot: pair, majority, or auto: a majority wherever more than two belong.
+        rule: how the team decides to replace a silent robot: pair, majority, etcd (a majority in which etcd has a vote), or
+            auto: a majority wherever more than two belong.
         when_alone: under the pair rule: while this robot hears no other one, components started here run on, or are held still.
         snapshot_period_ms: between two snapshots of a component; grows by itself when link or standby is slower.
         cpu_share: the most that the captures of a component may take of one core's time; 0 for no limit.
@@ -217,6 +223,7 @@ class Config:
         media: how frames leave over an interface, by its name.
         alerts: commands that tell an operator.
         store: copies of checkpoints that no robot keeps.
+        coordinator: where etcd is, under rule = etcd.
     """
 
     robot: str = ""
@@ -229,7 +236,7 @@ class Config:
     components_per_user: int = 64
     beat_ms: int = 20
     lease_ms: int = 200
-    rule: Literal["auto", "pair", "majority"] = "auto"
+    rule: Literal["auto", "pair", "majority", "etcd"] = "auto"
     when_alone: Literal["run", "freeze"] = "run"
     patience_s: int = 30
     boot_patience_s: int = 60
@@ -253,6 +260,7 @@ class Config:
     tasks: dict[str, TaskConfig] = field(default_factory=dict)
     alerts: AlertsConfig = field(default_factory=AlertsConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
+    coordinator: CoordinatorConfig = field(default_factory=CoordinatorConfig)
 
     @property
     def xor_cache_size(self) -> int:
@@ -430,6 +438,25 @@ def _check_rule(path: Path, config: Config, members: Team) -> None:
     by_pair = config.rule == "pair" or (config.rule == "auto" and len(members.robots) <= 2)
     if voters and by_pair:
         raise ConfigError(f'{path}: {", ".join(voters)} would have no vote; set rule = "majority" on every member of the team')
+    if config.rule == "etcd":
+        _check_etcd(path, config, members)
+    elif config.coordinator.endpoints:
+        raise ConfigError(f'{path}: [coordinator] has no effect without rule = "etcd"; set that on every member, or remove it')
+
+
+def _check_etcd(path: Path, config: Config, members: Team) -> None:
+    """etcd's leases count in seconds, and its place among the members is taken by no other."""
+    if not config.coordinator.endpoints:
+        raise ConfigError(f'{path}: rule = "etcd" needs to know where etcd is; add [coordinator] {EXAMPLE}')
+    if config.lease_ms < ETCD_LEASE_MS_MIN:
+        raise ConfigError(
+            f'{path}: lease_ms is {config.lease_ms}; leases at etcd last for seconds: with rule = "etcd" give at least '
+            f"{ETCD_LEASE_MS_MIN}, such as lease_ms = {ETCD_LEASE_MS}"
+        )
+    if COORDINATOR in members.robots:
+        raise ConfigError(
+            f'{path}: a member has the name {COORDINATOR}, which means etcd with rule = "etcd"; give it another one'
+        )
 
 
 def _check_components(path: Path, config: Config, members: Team) -> None:

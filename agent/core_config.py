@@ -39,15 +39,16 @@ def team_config(settings: Settings) -> types.Config:
     Raises:
         RulesError: the values contradict each other; `agent.config.check_team` finds that before.
     """
-    config = settings.config
+    config, rule = settings.config, _rule(settings)
+    etcd = (types.COORDINATOR,) if rule is Rule.ETCD else ()
     return types.Config(
         robot=config.robot,
-        peers=tuple(sorted(settings.peers)),
+        peers=tuple(sorted((*settings.peers, *etcd))),
         beat_ms=config.beat_ms,
         lease_ms=config.lease_ms,
-        rule=_rule(settings),
+        rule=rule,
         servers=_members(settings, "server"),
-        witnesses=_members(settings, "witness"),
+        witnesses=(*_members(settings, "witness"), *etcd),
         patience_ms=config.patience_s * 1_000,
         boot_patience_ms=config.boot_patience_s * 1_000,
         seat=settings.me.seat,

@@ -39,6 +39,10 @@ class DirectoryError(AgentError):
     """The organisation's directory cannot be asked who a user is, or its answer cannot be used."""
 
 
+class CoordinatorError(AgentError):
+    """etcd does not answer, or refuses what it is asked: it has no vote meanwhile."""
+
+
 class RefusedError(AgentError):
     """A request on the control socket cannot be served.
 

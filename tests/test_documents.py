@@ -17,6 +17,7 @@ import checkpoint.errors
 import failover.errors
 from agent.alerts_config import AlertsConfig
 from agent.config import ComponentConfig, Config, HooksConfig, MediumConfig
+from agent.coordinator_config import CoordinatorConfig
 from agent.worker.control import status_view
 from agent.worker.network.replication_link import LinkState
 from failover.cli import parser
@@ -138,6 +139,7 @@ def defaults(kind: type[Any]) -> dict[str, object]:
         ("agent.toml: hooks of one component", HooksConfig),
         ("agent.toml: alerts", AlertsConfig),
         ("agent.toml: store", StoreConfig),
+        ("agent.toml: coordinator", CoordinatorConfig),
         ("team.toml: who belongs", Robot),
         ("team.toml: the board", BoardConfig),
         ("team.toml: one item of the board", ItemConfig),

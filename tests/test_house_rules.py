@@ -287,6 +287,7 @@ DATACLASSES = {
     "failover/config/strict_toml.py": "reads TOML into them",
     "failover/config/choices.py": "what is read from TOML is made of them",
     "agent/alerts_config.py": "read from TOML by its fields",
+    "agent/coordinator_config.py": "read from TOML by its fields",
     "agent/config.py": "read from TOML by its fields",
     "agent/task_config.py": "read from TOML by its fields",
     "agent/worker/components/supervisor.py": "fields that its beginning fills in",

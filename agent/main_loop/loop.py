@@ -62,11 +62,14 @@ from failover.core.frames.lane import FrameLane
 from failover.core.frames.lanes import FrameLanes, medium_of
 from failover.core.frames.roster import Roster
 from failover.core.node import Node
+from failover.core.types import COORDINATOR
+from failover.core.types import Config as CoreConfig
 from failover.core.wire.messages import Beat
 from failover.errors import FailoverError
 
 if TYPE_CHECKING:
     from agent.main_loop.board_link import BoardLink
+    from agent.main_loop.coordinator_link import CoordinatorLink
 
 NANOSECONDS_A_SECOND: Final = 1_000_000_000
 SLEEP_LIMIT_S: Final = 0.5
@@ -83,6 +86,9 @@ GAP_BEATS: Final = 3
 
 REST_SHARE: Final = 3
 """While the main loop rests it reads beats so often in a lease: its echoes are fresh enough for one to be granted at once."""
+
+REST_NS_MAX: Final = NANOSECONDS_A_SECOND // 20
+"""With a longer lease, too: robots that are well are not to look suspect in the status."""
 
 WORKER_SILENCE_NS: Final = 4 * NANOSECONDS_A_SECOND
 """How long the worker may say nothing; then another one takes its place. Meanwhile the guards' leases are not renewed."""
@@ -140,6 +146,7 @@ class MainLoop:
         self._beat: Beat | None = None
         self._has_board = has_board and settings.me.role == "robot"
         self._board: BoardLink | None = None
+        self._etcd: CoordinatorLink | None = None
         self._round = self._round_ns = self._sent_ns = 0
         self._urgent_ns: int | None = None
         self._is_told = False
@@ -160,7 +167,8 @@ class MainLoop:
         self._departure = Departure(settings.config.restart_grace_s * NANOSECONDS_A_SECOND)
         self._listens = True
         self._deaf_until_ns = 0
-        self._read_ns, self._rest_ns = 0, settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE
+        self._read_ns = 0
+        self._rest_ns = min(settings.config.lease_ms * NANOSECONDS_A_SECOND // 1_000 // REST_SHARE, REST_NS_MAX)
         self._worker_deaths = 0
         self._turned_ns = clock.now_ns()
         self._worker_silent_ns = self._worker_unseen_ns = 0
@@ -310,8 +318,38 @@ class MainLoop:
             if late_ns >= 0:
                 self._late_us_max = max(self._late_us_max, late_ns // 1_000)
                 self._step(Tick())
+        if self._etcd is not None and self._node is not None:
+            self._ask_etcd(self._etcd, self._node, now_ns)
         if self._departure.is_begun and self._node is not None:
             self._ending = self._ending or self._may_end(self._node)
+
+    def _open_etcd(self, config: CoreConfig) -> None:
+        """Begin to ask etcd, or tell its process of a team that has changed."""
+        if self._etcd is not None:
+            self._etcd.change(config)
+        elif config.coordinator:
+            from agent.main_loop.coordinator_link import CoordinatorLink  # here: a team that does not need it does not load it
+
+            self._etcd = CoordinatorLink(self._settings, config)
+            self._attend(self._etcd.fileno(), self._hear_etcd)
+
+    def _ask_etcd(self, etcd: CoordinatorLink, node: Node, now_ns: int) -> None:
+        """Begin a round with all that this robot holds, once it is on the disk."""
+        if etcd.is_over(now_ns):
+            etcd.replace()
+            self._attend(etcd.fileno(), self._hear_etcd)
+        if etcd.wants_word and not self._outbox.waiting:
+            etcd.look(node.word(), now_ns)
+
+    def _hear_etcd(self) -> None:
+        etcd, now_ns = self._etcd, clock.now_ns()
+        if etcd is None:
+            return
+        beat = etcd.receive(now_ns)
+        if etcd.has_ended:
+            self._neglect(etcd.fileno())
+        if beat is not None:
+            self._step(Received(beat, COORDINATOR, paces=False))
 
     def _rest(self) -> None:
         """While there is no component anywhere, what peers say is read a few times a lease only: half the turns, less in each.
@@ -356,6 +394,8 @@ class MainLoop:
         deadline_ns = self._node.next_deadline_ns()
         if self._urgent_ns is not None:
             deadline_ns = min(deadline_ns, self._urgent_ns)
+        if self._etcd is not None and (round_ns := self._etcd.next_ns()) is not None:
+            deadline_ns = min(deadline_ns, round_ns)
         slot_ns = self._media.wakes_ns()
         if slot_ns is not None and self._beat is not None:
             deadline_ns = min(deadline_ns, slot_ns)
@@ -529,7 +569,9 @@ class MainLoop:
         self._unlike.intersection_update(robots)
         if self._board is not None:
             self._open_board()  # the worker has made the files of those that came
-        self._step(TeamChanged(team_config(settings)))
+        changed = team_config(settings)
+        self._step(TeamChanged(changed))
+        self._open_etcd(changed)
         log.info("the team is %s now", ", ".join(sorted(robots)))
 
     def _take_inventory(self, inventory: Inventory) -> None:
@@ -545,6 +587,7 @@ class MainLoop:
         config = node_config(self._settings)
         durable = self._outbox.durable
         self._node = Node(config, boot, durable, clock.now_ns(), inventory.held, inventory.found)
+        self._open_etcd(config)
         self._notifier.ready(STARTED)
         log.info("robot %s sends heartbeats, life %d", self._me, boot)
 
@@ -673,7 +716,8 @@ class MainLoop:
             self._items_left_out(),
         )
         unlike = map(UNLIKE.format, sorted(self._unlike))
-        sentences = (self._persister.trouble, self._event_log.trouble, *unlike, *self._media.troubles())
+        etcd = self._etcd.trouble if self._etcd is not None else ""
+        sentences = (self._persister.trouble, self._event_log.trouble, etcd, *unlike, *self._media.troubles())
         troubles = tuple(filter(None, sentences))
         if question.what == "why":
             return Told(question.number, now_ns, unwritten=self._event_log.unwritten(), beats=counts, troubles=troubles)
@@ -692,6 +736,8 @@ class MainLoop:
         self._event_log.close(PERSIST_PATIENCE_S)
         self._worker.wait()
         self._beats.close()
+        if self._etcd is not None:
+            self._etcd.close()
         self._close_board()
         self._alarm.close()
         self._poll.close()

@@ -98,6 +98,7 @@ media: [{link, cast, because, by_unicast, period_ms, no_slots, bytes, slots}]: h
         reference: the robot whose frames give the phase; round_us: the last round, longer than period_ms where it was stretched
         offset_us: from a member's slot to its last frame; lost: of the awaited frames those that did not come
         deaf: [[listener, speaker], …]; hears: whom a member hears; seen: not | insert | run | remove
+coordinator: {name: etcd, state: unknown | live | dead, last_heard_ms}: where it has a vote; null by another rule
 peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, lane, doubted, drained, notes}]
     role: robot | server | witness; state: unknown | live | suspect | restarting | dead; links: ours, by which it was heard lately
     lane: connected | connecting | refused | down

@@ -19,6 +19,7 @@ import pytest
 from agent import config as configuration
 from agent.alerts_config import AlertsConfig
 from agent.config import ComponentConfig, Config, MediumConfig
+from agent.coordinator_config import CoordinatorConfig
 from agent.core_config import level_of, node_config, started_here
 from agent.errors import ConfigError
 from agent.main import main as agent_main
@@ -55,9 +56,11 @@ def test_every_key_and_its_default_stand_in_the_documented_file() -> None:
     (task,) = documented.pop("tasks").values()
     (medium,) = documented.pop("media").values()
     assert documented.pop("alerts") == dataclasses.asdict(AlertsConfig())
+    assert documented.pop("coordinator") == dataclasses.asdict(CoordinatorConfig())
     assert documented.pop("store") == dataclasses.asdict(StoreConfig())
     defaults = dataclasses.asdict(Config())
     del defaults["components"], defaults["tasks"], defaults["media"], defaults["alerts"], defaults["store"]
+    del defaults["coordinator"]
     assert documented == defaults
     assert set(component) == {one.name for one in dataclasses.fields(ComponentConfig)}
     assert msgspec.convert(component, ComponentConfig) == ComponentConfig()
@@ -205,7 +208,7 @@ def test_a_level_that_no_processor_has_is_refused_with_those_there_are(lines: tu
         (('[components."/lab/a".hooks]', 'after_resmue = ["x"]'), 5, "did you mean 'after_resume'"),
         (("# fine", 'beat_ms = "often"'), 5, "Expected `int`"),
         (('when_alone = "panic"',), 4, "when_alone: 'panic' is none of run, freeze"),
-        (('rule = "majorty"',), 4, "rule: 'majorty' is none of auto, pair, majority; did you mean 'majority'?"),
+        (('rule = "majorty"',), 4, "rule: 'majorty' is none of auto, pair, majority, etcd; did you mean 'majority'?"),
         (("# fine", "snapshots_over = 3"), 5, "snapshots_over: 3 is none of wired, any"),
         (('log_level = "warn"',), 4, "'warn' is none of debug, info, warning, error; did you mean 'warning'?"),
         (('portable = "x86-64-v9"',), 4, "; did you mean 'x86-64-v"),
@@ -466,6 +469,16 @@ def test_a_witness_has_nothing_to_tell_of_and_nothing_to_archive(directory: Path
     assert configuration.load(written(directory, "[store]", 'sealed_size = "20GB"')).config.store.place == ""
 
 
+ETCD = ('rule = "etcd"', "lease_ms = 1800", "[coordinator]", 'endpoints = ["http://10.0.0.5:2379"]')
+
+
+def test_etcd_is_one_more_member_that_only_votes(directory: Path) -> None:
+    config = node_config(configuration.load(written(directory, *ETCD)))
+    assert (config.rule, config.coordinator, config.quorum) == (Rule.ETCD, "etcd", 2)
+    assert set(config.peers) == {"robot2", "etcd"} and config.witnesses == ("etcd",)
+    assert config.loyalty_ns <= 2 * 10**9, "the usual lease of etcd lasts for two seconds"
+
+
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
@@ -490,3 +503,18 @@ def test_a_team_without_the_witness_that_keeps_its_copies_is_refused_before_it_i
     configuration.check_team(settings, with_witness)
     with pytest.raises(ConfigError, match="witness = 'robot2', which is no witness of the team"):
         configuration.check_team(settings, Team("lab", {"robot1": ROBOT, "robot3": ROBOT}))
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (ETCD[:2], "needs to know where etcd is; add [coordinator] endpoints"),
+        (("lease_ms = 999", ETCD[0], *ETCD[2:]), "give at least 1000, such as lease_ms = 1800"),
+        (ETCD[1:], '[coordinator] has no effect without rule = "etcd"'),
+        ((*ETCD[:3], 'endpoints = ["10.0.0.5:2379"]'), "'10.0.0.5:2379' is no address of etcd; write endpoints"),
+    ],
+)
+def test_a_robot_that_could_not_ask_etcd_does_not_start(directory: Path, lines: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        configuration.load(written(directory, *lines))
+    assert said in str(caught.value)

@@ -21,7 +21,7 @@ from agent.worker.network.replication_link import LinkState, PeerConnection
 from checkpoint.device_rules import merged, missing
 from checkpoint.engine import COOPERATIVE, PTRACE
 from failover.core.frames.terms import SlotsView
-from failover.core.types import COMMITTED, IMMEDIATE, ComponentView, PeerView, Protection, State, StatusView
+from failover.core.types import COMMITTED, COORDINATOR, IMMEDIATE, ComponentView, PeerView, Protection, Rule, State, StatusView
 
 if TYPE_CHECKING:  # a witness shows its status too, and has none of these
     from agent.worker.components.statistics import Commits, Figures, Memory, Resumed
@@ -112,6 +112,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "reservations": [],
         "links": ours.interfaces,
         "media": [_medium(one) for one in told.media],
+        "coordinator": _coordinator(view),
         "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in _members(view, settings)],
         "components": [
             _component(one, ours.supervisors.get(one.name), settings, ours.store)
@@ -138,6 +139,15 @@ def _descriptors(pid: int) -> int | None:
         return len(os.listdir(f"/proc/{pid}/fd"))
     except OSError:
         return None
+
+
+def _coordinator(view: StatusView | None) -> dict[str, Any] | None:
+    """etcd, where it has a vote."""
+    etcd = next((peer for peer in view.peers if peer.robot == COORDINATOR), None) if view and view.rule == Rule.ETCD else None
+    if etcd is None:
+        return None
+    silent_ms = etcd.silent_ns // NANOSECONDS_A_MILLISECOND if etcd.boot else None
+    return {"name": etcd.robot, "state": PEER_STATES.get(etcd.state, etcd.state), "last_heard_ms": silent_ms}
 
 
 def _members(view: StatusView | None, settings: Settings) -> list[PeerView]:

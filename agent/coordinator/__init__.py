@@ -1,0 +1,1 @@
+"""etcd as a voter (``rule = "etcd"``): the process that speaks with it."""

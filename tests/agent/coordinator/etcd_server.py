@@ -1,0 +1,70 @@
+"""A real etcd for tests, on free ports of this machine, or in a network namespace of its own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+REQUIRED: Final = "FAILOVER_TEST_ETCD"
+"""With the value ``required`` in the environment, what is missing here is an error."""
+
+
+def why_not() -> str:
+    """Why there can be no such server here; "" if there can.
+
+    Raises:
+        RuntimeError: there must be one, because the environment says so.
+    """
+    reason = "" if shutil.which("etcd") else "needs etcd: ./run test as root installs etcd-server"
+    if reason and os.environ.get(REQUIRED) == "required":
+        raise RuntimeError(reason)
+    return reason
+
+
+class EtcdServer:
+    """One member, which is a cluster. ``before``: words of the command line in front of etcd's; ``options``: behind them."""
+
+    def __init__(
+        self, place: Path, host: str, port: int, peer_port: int, *, before: Sequence[str] = (), options: Sequence[str] = ()
+    ) -> None:
+        self._place, self._before = place, before
+        self.scheme = "https" if "--cert-file" in options else "http"
+        self.endpoint = f"{self.scheme}://{host}:{port}"
+        peer = f"http://127.0.0.1:{peer_port}"
+        listens = f"{self.scheme}://0.0.0.0:{port}" if before else self.endpoint
+        self._options = (
+            *("--name", "one", "--data-dir", str(place / "data"), "--logger", "zap"),
+            *("--listen-client-urls", listens, "--advertise-client-urls", self.endpoint),
+            *("--listen-peer-urls", peer, "--initial-advertise-peer-urls", peer, "--initial-cluster", f"one={peer}"),
+            *options,
+        )
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it; what it kept before is there again."""
+        self._place.mkdir(exist_ok=True)
+        with (self._place / "log").open("ab") as log:
+            command = [*self._before, "etcd", *self._options]
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+
+    def kill(self) -> None:
+        """End it at once; its files stay."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+        self.process = None
+
+    def stop(self) -> None:
+        """Stop all of it, as a machine that is overloaded does."""
+        assert self.process is not None
+        self.process.send_signal(signal.SIGSTOP)
+
+    def go_on(self) -> None:
+        """Let it run again."""
+        assert self.process is not None
+        self.process.send_signal(signal.SIGCONT)

@@ -1,0 +1,189 @@
+"""The client against a real etcd: leases, compare-and-set, accounts, certificates, and a server that does not answer."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from agent.coordinator.etcd import Etcd
+from agent.coordinator_config import CoordinatorConfig
+from agent.errors import CoordinatorError
+from failover.cli.demo.robots import free_ports
+from failover.core.election.coordinator import Grant, KeepAlive, Leased, Swap, Swapped
+from tests.agent.coordinator.etcd_server import EtcdServer, why_not
+
+pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "etcd is here")
+
+PREFIX = "failover/lab/"
+PATIENCE_S = 60
+ROOT = "of root"
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[EtcdServer]:
+    one = EtcdServer(tmp_path / "etcd", "127.0.0.1", *free_ports(2))
+    one.start()
+    yield one
+    one.kill()
+
+
+def until_answers(etcd: Etcd) -> str:
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            return etcd.version()
+        except CoordinatorError:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+def opened(server: EtcdServer, **keys: str) -> Etcd:
+    etcd = Etcd(CoordinatorConfig([server.endpoint], **keys), 5.0)
+    assert until_answers(etcd).startswith("3.")
+    return etcd
+
+
+def swap(etcd: Etcd, compared: dict[str, int], puts: dict[str, bytes], lease: int = 0) -> Swapped:
+    told = etcd.answer(Swap(PREFIX, tuple(compared.items()), tuple((key, value, lease) for key, value in puts.items())))
+    assert isinstance(told, Swapped)
+    return told
+
+
+def granted(etcd: Etcd, ttl_ms: int) -> int:
+    told = etcd.answer(Grant(ttl_ms))
+    assert isinstance(told, Leased) and told.lease
+    return told.lease
+
+
+def test_a_key_is_put_only_on_top_of_the_revision_that_was_compared(server: EtcdServer) -> None:
+    etcd, key = opened(server), f"{PREFIX}component/lab/mapper"
+    first = swap(etcd, {key: 0}, {key: b"one"})
+    value, revision = first.found[key]
+    assert first.is_done and value == b"one" and revision == first.revision
+
+    again = swap(etcd, {key: 0}, {key: b"two"})
+    assert not again.is_done and again.found[key] == (b"one", revision)
+
+    third = swap(etcd, {key: revision, f"{PREFIX}word/r2": 0}, {key: b"", f"{PREFIX}word/r1": b"\0"})
+    assert third.is_done and third.found == {key: (b"", third.revision), f"{PREFIX}word/r1": (b"\0", third.revision)}
+
+
+def test_only_what_is_below_the_prefix_is_read(server: EtcdServer) -> None:
+    etcd = opened(server)
+    swap(etcd, {}, {"failover/lab": b"", "failover/lab0": b"", "failover/other/word/r1": b""})
+    assert not swap(etcd, {}, {}).found
+
+
+def test_a_key_lives_as_long_as_its_lease_which_can_be_lengthened(server: EtcdServer) -> None:
+    etcd, key = opened(server), f"{PREFIX}alive/r1"
+    kept, left = granted(etcd, 1_000), granted(etcd, 1_000)
+    swap(etcd, {}, {key: b"", f"{PREFIX}alive/r2": b""}, kept)
+    swap(etcd, {}, {f"{PREFIX}alive/r2": b""}, left)
+    deadline = time.monotonic() + PATIENCE_S
+    while f"{PREFIX}alive/r2" in swap(etcd, {}, {}).found:
+        assert etcd.answer(KeepAlive(kept)) == Leased(kept)
+        assert time.monotonic() < deadline
+    assert key in swap(etcd, {}, {}).found
+    assert etcd.answer(KeepAlive(left)) == Leased(0)
+    with pytest.raises(CoordinatorError, match=r"refuses kv/txn: .*lease not found"):
+        swap(etcd, {}, {key: b""}, left)
+
+
+def test_the_next_endpoint_is_asked_when_one_does_not_answer(server: EtcdServer) -> None:
+    (nobody,) = free_ports(1)
+    etcd = Etcd(CoordinatorConfig([f"http://127.0.0.1:{nobody}", server.endpoint]), 5.0)
+    assert until_answers(etcd).startswith("3.")
+
+
+def test_a_server_that_is_gone_is_named_and_found_again(server: EtcdServer) -> None:
+    etcd, key = opened(server), f"{PREFIX}word/r1"
+    swap(etcd, {}, {key: b"here"})
+    server.kill()
+    with pytest.raises(CoordinatorError, match=r"no etcd answers \(http://127.*check \[coordinator\] endpoints"):
+        etcd.version()
+    server.start()
+    until_answers(etcd)
+    assert swap(etcd, {}, {}).found[key][0] == b"here"
+
+
+def test_a_server_that_stands_still_is_not_waited_for(server: EtcdServer) -> None:
+    etcd = Etcd(CoordinatorConfig([server.endpoint]), 0.3)
+    until_answers(etcd)
+    server.stop()
+    with pytest.raises(CoordinatorError, match="timed out"):
+        etcd.version()
+    server.go_on()
+    until_answers(etcd)
+
+
+def test_an_account_of_etcd_is_used_and_its_token_renewed(server: EtcdServer, tmp_path: Path) -> None:
+    plain = opened(server)
+    for method, body in (
+        ("auth/user/add", {"name": "root", "password": ROOT}),
+        ("auth/user/grant", {"user": "root", "role": "root"}),
+        ("auth/enable", {}),
+    ):
+        plain._ask(method, body)
+    with pytest.raises(CoordinatorError, match=r"refuses kv/txn"):
+        swap(plain, {}, {f"{PREFIX}word/r1": b""})
+
+    password = tmp_path / "password"
+    password.write_text("wrong\n")
+    keys = {"user": "root", "password_file": str(password)}
+    with pytest.raises(CoordinatorError, match=r"refuses .*authentication failed"):
+        swap(Etcd(CoordinatorConfig([server.endpoint], **keys), 5.0), {}, {})
+    password.write_text(ROOT + "\n")
+    etcd = Etcd(CoordinatorConfig([server.endpoint], **keys), 5.0)
+    assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
+    etcd._token = "over"
+    assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
+
+
+def certificate(place: Path, name: str, signer: str = "") -> tuple[str, str]:
+    """A certificate and its key, signed by another one, or by itself."""
+    paths = str(place / f"{name}.crt"), str(place / f"{name}.key")
+    signed = ["-CA", str(place / f"{signer}.crt"), "-CAkey", str(place / f"{signer}.key")] if signer else []
+    subject = ["-subj", f"/CN={name}", "-addext", "subjectAltName=IP:127.0.0.1"]
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-out", paths[0], "-keyout", paths[1]]
+    subprocess.run([*command, *subject, *signed], check=True, capture_output=True)
+    return paths
+
+
+def test_certificates_are_checked_on_both_sides(tmp_path: Path) -> None:
+    authority, _ = certificate(tmp_path, "authority")
+    theirs, ours, strangers = (certificate(tmp_path, name, "authority") for name in ("server", "robot", "other"))
+    alone = certificate(tmp_path, "alone")
+    options = ("--cert-file", theirs[0], "--key-file", theirs[1], "--trusted-ca-file", authority, "--client-cert-auth")
+    server = EtcdServer(tmp_path / "etcd", "127.0.0.1", *free_ports(2), options=options)
+    server.start()
+    try:
+        etcd = opened(server, ca=authority, certificate=ours[0], key=ours[1])
+        assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
+        config = CoordinatorConfig([server.endpoint], ca=alone[0], certificate=strangers[0], key=strangers[1])
+        with pytest.raises(CoordinatorError, match=r"certificate verify failed|CERTIFICATE_VERIFY_FAILED"):
+            Etcd(config, 5.0).version()
+        with pytest.raises(CoordinatorError, match="no etcd answers"):
+            Etcd(CoordinatorConfig([server.endpoint], ca=authority), 5.0).version()
+    finally:
+        server.kill()
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"endpoints": ["10.0.0.5:2379"]},
+        {"endpoints": ["https://10.0.0.5"]},
+        {"endpoints": ["https://10.0.0.5:2379/v3"]},
+        {"endpoints": ["https://u@10.0.0.5:2379"]},
+        {"endpoints": ["http://10.0.0.5:2379"] * 17},
+        {"certificate": "robot.crt"},
+        {"user": "robot"},
+    ],
+)
+def test_what_reaches_no_etcd_is_refused(keys: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=r"write endpoints|at most|belong together"):
+        CoordinatorConfig(**keys)  # type: ignore[arg-type]
