@@ -73,9 +73,10 @@ def is_healthy(status: Mapping[str, Any]) -> bool:
     """Whether all that should be protected is, as far as any robot that answered knows.
 
     No component is degraded, failed, unprotected, without a standby that can run it, or where no answer came from; no robot
-    counts a peer as dead, or has lately heard one say more than it may.
+    counts a peer as dead, or has lately heard one say more than it may. Where etcd has a vote, it is reached.
     """
     unwell = any(map(is_unwell, status["components"]))
     unwell |= any(peer.get("doubted") for peer in status["peers"]) or any((status.get("doubted_elsewhere") or {}).values())
+    unwell |= (status.get("coordinator") or {}).get("state") == "dead"
     peers = {peer["name"]: peer["state"] for peer in status["peers"]}
     return not unwell and all("dead" not in seen.values() for seen in (peers, *(status.get("peers_elsewhere") or {}).values()))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,16 +27,20 @@ pytestmark = [
 ETCD_HOST, ETCD_PORT = "10.71.9.1", 2379
 SETTINGS = f'rule = "etcd"\n[coordinator]\nendpoints = ["http://{ETCD_HOST}:{ETCD_PORT}"]\n'
 PACE = Pace(20, 1_800)
+LEAPS_S = 8
+"""Longer than a takeover takes where nothing hinders it."""
+
 COUNTS = "import time\ni = 0\nwhile True:\n    print(i, flush=True)\n    i += 1\n    time.sleep(0.02)\n"
 
 
 @dataclass
 class Site:
-    """Two robots, and an etcd that each of them reaches over a cable of its own."""
+    """Two robots, and an etcd that each of them reaches over a cable of its own; ``place``: a process in its network."""
 
     first: RobotMachine
     second: RobotMachine
     etcd: EtcdServer
+    place: int
 
     def reach(self, robot: RobotMachine, *, is_on: bool) -> None:
         """Let a robot reach etcd, or cut it off."""
@@ -64,7 +71,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
             for number, robot in enumerate((first, second), start=1):
                 lay_to(place.pid, robot, number)
             robots.until(lambda: all(reaches(robot) for robot in (first, second)), "both robots to reach etcd")
-            yield Site(first, second, etcd)
+            yield Site(first, second, etcd, place.pid)
     finally:
         etcd.kill()
         place.kill()
@@ -146,6 +153,8 @@ def test_while_etcd_is_gone_programs_run_on_and_nobody_is_taken_over(site: Site)
     epoch = robots.component(site.first, "count")["epoch"]
     site.etcd.kill()
     until_told(site.first, "does not reach etcd", "nobody is taken over", "no etcd answers")
+    assert robots.failover(site.first, "status").returncode == 1
+    assert "no etcd answers" in robots.failover(site.first, "check").stdout
     for _ in range(3):
         counts_on(site.first)
     assert (role(site.first), role(site.second)) == ("primary", "standby")
@@ -174,6 +183,36 @@ def test_a_primary_that_does_not_reach_etcd_runs_on_as_long_as_it_hears_its_neig
     site.lay_cable(site.first)
     robots.until(lambda: role(site.first) == "standby", "it to follow the one that etcd voted for")
     robots.until_protected(site.second)
+
+
+def test_a_lease_clock_of_etcd_that_leaps_moves_nothing(site: Site) -> None:
+    """etcd ends every lease too soon, as after a leap of its clock, again and again for longer than a takeover takes."""
+    started(site)
+    epoch = robots.component(site.first, "count")["epoch"]
+    site.pull_cable(site.first)
+    until_told(site.second, "hears 0 of 1 other members and reaches etcd")
+    within = ["nsenter", "--net", f"--target={site.place}"]
+    until_s = time.monotonic() + LEAPS_S
+    while time.monotonic() < until_s:
+        for lease in asked(within, "lease/leases", {}).get("leases", ()):
+            asked(within, "lease/revoke", {"ID": lease["ID"]})
+        assert role(site.second) == "standby"
+    counts_on(site.first)
+    assert (role(site.first), robots.component(site.first, "count")["epoch"]) == ("primary", epoch)
+
+
+def asked(within: list[str], method: str, body: dict[str, str]) -> dict[str, Any]:
+    """etcd's answer to a request from its own network."""
+    script = (
+        "import sys, urllib.request as u; "
+        "print(u.urlopen(u.Request(sys.argv[1], sys.argv[2].encode()), timeout=30).read().decode())"
+    )
+    url = f"http://{ETCD_HOST}:{ETCD_PORT}/v3/{method}"
+    ran = subprocess.run(
+        [*within, sys.executable, "-c", script, url, json.dumps(body)], capture_output=True, text=True, check=False
+    )
+    told: dict[str, Any] = json.loads(ran.stdout) if ran.returncode == 0 else {}  # a lease may be gone already
+    return told
 
 
 def test_a_primary_that_hears_no_neighbour_runs_on_with_etcds_vote(site: Site) -> None:

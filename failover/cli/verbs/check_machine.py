@@ -52,7 +52,7 @@ def check_machine(arguments: argparse.Namespace) -> int:
         *([_real_time(), _memory_lock()] if status is None else _of_agent(status)),
         _watchdog(),
         _network(),
-        *([] if status is None else _standing_by(status)),
+        *([] if status is None else [*_coordinator(status), *_standing_by(status)]),
     ]
     able = all(offer.verdict != "missing" for offer in offers)
     if arguments.json:
@@ -80,6 +80,17 @@ def _of_agent(status: Mapping[str, Any]) -> list[Offer]:
     if not status["realtime"]:
         return [Offer("lesser", "real-time priority", "the agent does not ask for it: agent.toml says realtime = false")]
     return [Offer("good", "real-time priority", "the agent's main loop has it, and its memory is locked")]
+
+
+def _coordinator(status: Mapping[str, Any]) -> list[Offer]:
+    """Whether etcd is reached, where it has a vote."""
+    etcd = status.get("coordinator")
+    if etcd is None:
+        return []
+    if etcd["state"] == "live":
+        return [Offer("good", "etcd", f"answered {etcd['last_heard_ms'] / 1_000:.1f} s ago")]
+    why = [note for note in status["notes"] if "etcd" in note]
+    return [Offer("lesser", "etcd", why[0] if why else "it has not answered yet; see failover status")]
 
 
 def _standing_by(status: Mapping[str, Any]) -> list[Offer]:
