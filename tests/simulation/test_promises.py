@@ -9,8 +9,9 @@ from msgspec.structs import replace
 from failover.core import acts
 from failover.core.events import Handover, Promote
 from failover.core.types import MS, ComponentSpec, Launch, OnLoss, Rule, Rules, State, WhenAlone
+from tests.simulation.coordinator import Coordination
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.teams import elective, pair
+from tests.simulation.teams import coordinated, elective, pair
 from tests.simulation.world import Watcher, World
 
 PART = "/team/part"
@@ -292,3 +293,79 @@ def test_the_vote_of_a_member_that_decides_by_another_rule_does_not_count() -> N
     assert three.after(2_000) == []
     three.world.power_on("robot1")
     assert three.after(2_000) in (["robot1"], ["robot2"])
+
+
+# rule = "etcd"
+
+
+def with_etcd(robots: int = 2) -> Team:
+    specs = (ComponentSpec(PART, launch=Launch(("part",))),)
+    invariants = Invariants(safe={PART}, votes=True)
+    world = World(1, coordinated(robots, specs), (invariants,))
+    for name in world.robots:
+        world.power_on(name)
+    world.run(SETTLED_NS)
+    assert world.acting(PART) == ["robot1"] and seen_at(world, "robot1", PART).standby == "robot2"
+    return Team(world, invariants)
+
+
+def etcd_of(team: Team) -> Coordination:
+    assert team.world.coordination is not None
+    return team.world.coordination
+
+
+def test_with_etcd_a_lost_robot_of_two_is_replaced_and_nothing_acts_twice() -> None:
+    two = with_etcd()
+    says = two.says("robot1")
+    assert "hears 1 of 1 other members and reaches etcd; 2 of 3 votes decide" in says
+    assert "no component acts at two robots at once; a robot that is silent is replaced after 0.2 s" in says
+    two.world.power_off("robot1")
+    assert two.after(160) == []
+    assert two.after(600) == ["robot2"]
+
+
+def test_while_etcd_is_gone_programs_run_on_and_nobody_is_taken_over() -> None:
+    two = with_etcd()
+    etcd_of(two).down = True
+    assert two.after(60_000) == ["robot1"]
+    assert "does not reach etcd: programs run on while the members hear each other" in two.says("robot1")
+    assert "nobody is taken over, and who is left alone stands still, until etcd is back" in two.says("robot2")
+    assert seen_at(two.world, "robot1", PART).protection == "protected"
+
+    two.world.power_off("robot1")
+    assert two.after(10_000) == []
+    assert "its programs stand still until it hears more" in two.says("robot2")
+    etcd_of(two).heal()
+    assert two.after(600) == ["robot2"]
+
+
+def test_a_primary_that_does_not_reach_etcd_runs_on_beside_its_standby_and_stands_still_alone() -> None:
+    two = with_etcd()
+    etcd_of(two).cut.add("robot1")
+    assert two.after(10_000) == ["robot1"]
+    assert seen_at(two.world, "robot1", PART).epoch == 1
+    two.cut("robot1", "robot2")
+    assert two.after(170) == []
+    assert two.after(600) == ["robot2"]
+
+
+def test_robots_that_never_hear_each_other_run_it_once() -> None:
+    specs = (ComponentSpec(PART, launch=Launch(("part",))),)
+    world = World(1, coordinated(2, specs), (Invariants(safe={PART}, votes=True),))
+    world.network.cuts = {("robot1", "robot2"), ("robot2", "robot1")}
+    for name in world.robots:
+        world.power_on(name)
+    world.run(5_000 * MS)
+    (first,) = world.acting(PART)
+    world.run(world.now_ns + 10_000 * MS)
+    assert world.acting(PART) == [first]
+
+
+def test_with_four_and_etcd_a_lost_robot_is_replaced_also_while_etcd_is_gone() -> None:
+    four = with_etcd(4)
+    etcd_of(four).down = True
+    four.after(2_000)
+    assert "a lost robot is replaced all the same" in four.says("robot2")
+    four.world.power_off("robot1")
+    assert four.after(1_000) == ["robot2"]
+    assert "nobody is taken over" in four.says("robot2"), "three of five votes are left"
