@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -199,6 +201,22 @@ def test_a_lease_clock_of_etcd_that_leaps_moves_nothing(site: Site) -> None:
         assert role(site.second) == "standby"
     counts_on(site.first)
     assert (role(site.first), robots.component(site.first, "count")["epoch"]) == ("primary", epoch)
+
+
+def speakers(robot: RobotMachine) -> list[int]:
+    """The processes of the robot that speak with etcd."""
+    return [pid for pid in robot.processes() if b"agent.coordinator.process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def test_another_process_takes_the_place_of_one_that_speaks_with_etcd_and_ends(site: Site) -> None:
+    (ended,) = speakers(site.first)
+    os.kill(ended, signal.SIGKILL)
+    told = "the process that speaks with etcd has ended"
+    robots.until(lambda: told in " ".join(site.first.status()["notes"]), "the status to tell of it")
+    robots.until(lambda: speakers(site.first) not in ([], [ended]), "another one")
+    robots.until(lambda: reaches(site.first) and not site.first.status()["notes"], "etcd to be reached again")
+    site.first.cut_power()
+    robots.until(lambda: not site.first.processes(), "nothing of the robot to be left")
 
 
 def asked(within: list[str], method: str, body: dict[str, str]) -> dict[str, Any]:
