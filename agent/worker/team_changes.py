@@ -29,7 +29,7 @@ from agent.worker.network.remote_orders import Errands, OrderOfPeer
 from failover.config import team as team_file
 from failover.config.team import Robot, Team
 from failover.core import acts, events
-from failover.core.team_changes import TWO_KEYS, USE_NS, Grants, missing, step
+from failover.core.team_changes import TWO_KEYS, USE_NS, Grants, acts_unheard, missing, step
 from failover.core.types import ENDED, HOLDING, PeerView
 from failover.errors import FailoverError
 
@@ -358,6 +358,12 @@ class TeamChanges:
             return "its agent is starting; try again"
         peer = next((one for one in status.peers if one.robot == robot), None)
         lives = peer is not None and _may_live(peer)
+        before = self._lines.settings.team.robots
+        if not lives and self._lines.settings.config.rule == "etcd" and before[robot].role == "robot" and acts_unheard(len(before)):
+            return (
+                f"nobody hears {robot}, which may act by etcd's vote all the same. Bring it back, then take it out; if it is lost for "
+                'good, see "A robot that is lost for good" in docs/coordinator.md'
+            )
         living = {self._lines.settings.config.robot, *(one.robot for one in status.peers if one.state in ALIVE)}
         open_ones = [one for one in status.components if one.state not in ENDED]
         if lives and (runs := [one.name for one in open_ones if one.primary == robot]):

@@ -11,6 +11,9 @@ majority of the other. That member's vote and that member's echo count once. Two
 granted, for each robot that asks needs the other one's grant. Source: Ongaro, Consensus: Bridging Theory and Practice, section
 4.2 (changes by one server); a majority of grants, as there, would let a member fall behind by two.
 
+With rule = etcd a robot that no member hears may act by etcd's vote, if its own and etcd's are a majority: of at most three votes.
+Such a robot is not taken out without its grant (`acts_unheard`): the next change would make a majority that knows neither.
+
 Two robots that are alone (rule = pair) promise less: where each takes the other one for dead, each may take the other one out.
 
 A robot replaces its key by two changes: the first puts a new key beside the old one, the second takes the old one out. As no
@@ -121,6 +124,12 @@ def missing(team: Collection[str], granted: Collection[str], removed: str = "", 
         removed: the member that is to leave; ``lives``: a member sees it alive.
     """
     return sorted(member for member in team if member not in granted and (lives or member != removed))
+
+
+def acts_unheard(members: int) -> bool:
+    """Whether a robot that no member hears may act by etcd's vote, in a team of so many members beside etcd."""
+    own_and_etcds = 2
+    return own_and_etcds > (members + 1) // 2
 
 
 def seats(members: Mapping[str, int], order: Collection[str], mark: int = 0) -> dict[str, int]:

@@ -16,6 +16,7 @@ import pytest
 from msgspec.structs import replace as changed
 
 from agent import config as configuration
+from agent.coordinator_config import CoordinatorConfig
 from agent.errors import RefusedError
 from agent.main_loop.messages import Told
 from agent.worker import team_changes
@@ -387,6 +388,24 @@ def test_a_member_that_one_of_the_others_hears_is_not_taken_out_as_lost(tmp_path
     town["b"].runs = [view("/x", "c")]
     with pytest.raises(RefusedError, match="b: c runs /x"):
         asyncio.run(town["a"].change("remove", "c"))
+
+
+def test_with_etcd_a_robot_that_nobody_hears_stays_in_a_team_of_two_where_etcds_vote_lets_it_act(tmp_path: Path) -> None:
+    """Else a third one joins, and is a majority with the second one that shares no vote with that of the first one and etcd."""
+    for names, is_refused in (("ab", True), ("abc", False)):
+        town = Town(tmp_path / names, *names)
+        etcd = CoordinatorConfig(["http://127.0.0.1:2379"])
+        for member in town.members.values():
+            config = replace(member.settings.config, rule="etcd", lease_ms=1_800, coordinator=etcd)
+            member.settings = replace(member.settings, config=config)
+        town.cut_off("a")
+        if is_refused:
+            with pytest.raises(RefusedError, match="nobody hears a, which may act by etcd's vote"):
+                asyncio.run(town["b"].change("remove", "a"))
+            assert town["b"].on_disk == ["a", "b"]
+        else:
+            asyncio.run(town["b"].change("remove", "a"))
+            assert town["b"].on_disk == ["b", "c"]
 
 
 def test_a_robot_that_was_lost_hears_that_it_is_out_stops_its_copy_and_ends(tmp_path: Path, ended: list[str]) -> None:
