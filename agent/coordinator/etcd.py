@@ -19,7 +19,7 @@ import msgspec
 
 from agent.coordinator_config import CoordinatorConfig
 from agent.errors import CoordinatorError
-from failover.core.election.coordinator import Answer, Grant, KeepAlive, Leased, Request, Swap, Swapped
+from failover.core.election.coordinator import Answer, Grant, KeepAlive, Leased, Put, Request, Swap, Swapped
 
 MS_A_SECOND: Final = 1_000
 ANSWER_SIZE_MAX: Final = 16 << 20
@@ -69,22 +69,16 @@ class Etcd:
         self._connection = None
 
     def _swap(self, request: Swap) -> Swapped:
-        compared = [
-            {"key": _encoded(key), "target": "MOD", "result": "EQUAL", "mod_revision": str(revision)}
-            for key, revision in request.compared
-        ]
-        puts: list[dict[str, Any]] = [
-            {"request_put": {"key": _encoded(key), "value": _encoded(value), "lease": str(lease)}}
-            for key, value, lease in request.puts
-        ]
         prefix = request.prefix.encode()
         last = prefix[:-1] + bytes((prefix[-1] + 1,))
         whole = {"request_range": {"key": _encoded(prefix), "range_end": _encoded(last)}}
-        told = self._ask("kv/txn", {"compare": compared, "success": [*puts, whole], "failure": [whole]})
+        told = self._ask("kv/txn", {"success": [*map(_put, request.puts), whole]})
+        *done, read = told["responses"]
+        is_done = all(one["response_txn"].get("succeeded", False) for one in done)
         found = {}
-        for one in told["responses"][-1]["response_range"].get("kvs", ()):
+        for one in read["response_range"].get("kvs", ()):
             found[_decoded(one["key"]).decode()] = _decoded(one.get("value", "")), int(one["mod_revision"])
-        return Swapped(bool(told.get("succeeded", False)), int(told["header"]["revision"]), found)
+        return Swapped(is_done, int(told["header"]["revision"]), found)
 
     def _ask(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
         """The answer of the first endpoint that gives one. An earlier one may have carried the request out: revisions tell."""
@@ -150,6 +144,16 @@ class _RefusedError(Exception):
             said = str(msgspec.json.decode(content).get("error", said))
         super().__init__(f"{said[:BODY_SHOWN].strip()} (status {status})")
         self.is_token = status == UNAUTHORIZED or "invalid auth token" in said
+
+
+def _put(put: Put) -> dict[str, Any]:
+    """A transaction within the transaction: what is compared here holds up nothing else."""
+    compared = [
+        {"key": _encoded(key), "target": "MOD", "result": "EQUAL", "mod_revision": str(revision)}
+        for key, revision in put.compared
+    ]
+    done = {"request_put": {"key": _encoded(put.key), "value": _encoded(put.value), "lease": str(put.lease)}}
+    return {"request_txn": {"compare": compared, "success": [done]}}
 
 
 def _words(error: Exception) -> str:

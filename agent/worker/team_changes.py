@@ -359,7 +359,12 @@ class TeamChanges:
         peer = next((one for one in status.peers if one.robot == robot), None)
         lives = peer is not None and _may_live(peer)
         before = self._lines.settings.team.robots
-        if not lives and self._lines.settings.config.rule == "etcd" and before[robot].role == "robot" and acts_unheard(len(before)):
+        if (
+            not lives
+            and self._lines.settings.config.rule == "etcd"
+            and before[robot].role == "robot"
+            and acts_unheard(len(before))
+        ):
             return (
                 f"nobody hears {robot}, which may act by etcd's vote all the same. Bring it back, then take it out; if it is lost for "
                 'good, see "A robot that is lost for good" in docs/coordinator.md'

@@ -18,6 +18,7 @@ from failover.core.election.coordinator import (
     Grant,
     KeepAlive,
     Leased,
+    Put,
     Request,
     Round,
     Said,
@@ -75,21 +76,22 @@ class Etcd:
         return self._swap(request)
 
     def _swap(self, request: Swap) -> Answer | None:
-        if any(lease and lease not in self.leases for _, _, lease in request.puts):
+        if any(put.lease and put.lease not in self.leases for put in request.puts):
             return None
-        is_done = all((self.kept[key][1] if key in self.kept else 0) == revision for key, revision in request.compared)
-        if is_done:
+        before = dict(self.kept)
+        done = [put for put in request.puts if all((before[key][1] if key in before else 0) == at for key, at in put.compared)]
+        if done:
             self.revision += 1
-            self.kept.update({key: (value, self.revision, lease) for key, value, lease in request.puts})
-            self._note_votes(request)
+            self.kept.update({put.key: (put.value, self.revision, put.lease) for put in done})
+            self._note_votes(request.prefix, done)
         found = {key: kept[:2] for key, kept in self.kept.items() if key.startswith(request.prefix)}
-        return Swapped(is_done, self.revision, found)
+        return Swapped(len(done) == len(request.puts), self.revision, found)
 
-    def _note_votes(self, request: Swap) -> None:
-        for key, value, _ in request.puts:
-            kind, _, name = key.removeprefix(request.prefix).partition("/")
+    def _note_votes(self, prefix: str, done: list[Put]) -> None:
+        for put in done:
+            kind, _, name = put.key.removeprefix(prefix).partition("/")
             if kind == "component":
-                seat = msgspec.msgpack.decode(value, type=Seat)
+                seat = msgspec.msgpack.decode(put.value, type=Seat)
                 self.votes.add((f"/{name}", seat.epoch, seat.primary))
 
 

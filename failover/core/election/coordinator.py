@@ -17,6 +17,7 @@ compare-and-set; `failover.core.node` hears the result as it hears the heartbeat
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Generator, Iterator
 from typing import Final
 
@@ -32,6 +33,12 @@ ROUNDS_IN_LEASE: Final = 8
 
 TRIES_MAX: Final = 3
 """For a word that is put on top of what an earlier request of this robot left."""
+
+VOTES_MAX: Final = 100
+"""In one transaction. etcd allows 128 operations in one, a vote's comparisons and those around it together."""
+
+ROUND_SHARE: Final = 4
+"""A round that takes longer than this part of a lease ends: the next one begins with a newer word. It has cast some votes at least."""
 
 STEP_SHARE: Final = 4
 """Between two looks at etcd no more than this part of a lease counts as watched: a clock that leaps ahead proves no silence."""
@@ -79,20 +86,24 @@ class Leased(msgspec.Struct, frozen=True):
     lease: int
 
 
-class Swap(msgspec.Struct, frozen=True):
-    """One transaction: put these keys if all compared ones have these revisions (0: there is none), then read the prefix.
+class Put(msgspec.Struct, frozen=True):
+    """Put a key if all compared ones have these revisions (0: there is none). ``lease``: 0 for a key that stays."""
 
-    Attributes:
-        puts: (key, value, lease), 0 for a key that stays.
-    """
+    key: str
+    value: bytes
+    compared: tuple[tuple[str, int], ...]
+    lease: int = 0
+
+
+class Swap(msgspec.Struct, frozen=True):
+    """One transaction: each of the puts for itself, then read the prefix."""
 
     prefix: str
-    compared: tuple[tuple[str, int], ...]
-    puts: tuple[tuple[str, bytes, int], ...]
+    puts: tuple[Put, ...]
 
 
 class Swapped(msgspec.Struct, frozen=True):
-    """The answer: whether it was done, the revision of the store, and key → (value, the key's own revision)."""
+    """The answer: whether all was put, the revision of the store, and key → (value, the key's own revision)."""
 
     is_done: bool
     revision: int
@@ -142,22 +153,36 @@ class Arbiter:
             lease = _leased((yield Grant(self._loyalty_ns // MS))[0])
         self._lease = lease
         own, alive = self._key("word", self._me), self._key("alive", self._me)
-        puts = (own, msgspec.msgpack.encode(word), 0), (alive, b"", lease)
         for _ in range(TRIES_MAX):
-            if self._look(*(yield Swap(self._prefix, ((own, self._own_revision),), puts))):
+            compared = ((own, self._own_revision),)
+            puts = Put(own, msgspec.msgpack.encode(word), compared), Put(alive, b"", compared, lease)
+            answer, begun_ns = yield Swap(self._prefix, puts)
+            if self._look(answer, begun_ns):
                 break
         else:
             return Said(0, 0)
         self._note_ends(word)
-        for entry in word.entries:
-            wanted = self._wanted(entry)
-            if wanted is not None:
-                seat, compared = wanted
-                key = self._key("component", entry.name)
-                compared = ((key, self._seats[entry.name][1] if entry.name in self._seats else 0), *compared)
-                self._look(*(yield Swap(self._prefix, compared, ((key, msgspec.msgpack.encode(seat), 0),))))
-                self._note_ends(word)
+        wanted, now_ns = word.entries, begun_ns
+        while wanted and now_ns - begun_ns < self._lease_ns // ROUND_SHARE:
+            votes = tuple(itertools.islice(filter(None, map(self._vote, wanted)), VOTES_MAX))
+            if not votes:
+                break
+            asked = {vote.key for vote in votes}
+            wanted = tuple(entry for entry in wanted if self._key("component", entry.name) not in asked)
+            answer, now_ns = yield Swap(self._prefix, votes)
+            self._look(answer, now_ns)
+            self._note_ends(word)
         return Said(word.boot, word.counter, tuple(self._entries(word)))
+
+    def _vote(self, entry: Entry) -> Put | None:
+        """That this robot may have etcd cast for it; a comparison that fails stops no other one."""
+        wanted = self._wanted(entry)
+        if wanted is None:
+            return None
+        seat, compared = wanted
+        key = self._key("component", entry.name)
+        revision = self._seats[entry.name][1] if entry.name in self._seats else 0
+        return Put(key, msgspec.msgpack.encode(seat), ((key, revision), *compared))
 
     def _key(self, kind: str, name: str) -> str:
         return f"{self._prefix}{kind}/{name.removeprefix('/')}"

@@ -13,7 +13,7 @@ from agent.coordinator.etcd import Etcd
 from agent.coordinator_config import CoordinatorConfig
 from agent.errors import CoordinatorError
 from failover.cli.demo.robots import free_ports
-from failover.core.election.coordinator import Grant, KeepAlive, Leased, Swap, Swapped
+from failover.core.election.coordinator import VOTES_MAX, Grant, KeepAlive, Leased, Put, Swap, Swapped
 from tests.agent.coordinator.etcd_server import EtcdServer, why_not
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "etcd is here")
@@ -48,7 +48,7 @@ def opened(server: EtcdServer, **keys: str) -> Etcd:
 
 
 def swap(etcd: Etcd, compared: dict[str, int], puts: dict[str, bytes], lease: int = 0) -> Swapped:
-    told = etcd.answer(Swap(PREFIX, tuple(compared.items()), tuple((key, value, lease) for key, value in puts.items())))
+    told = etcd.answer(Swap(PREFIX, tuple(Put(key, value, tuple(compared.items()), lease) for key, value in puts.items())))
     assert isinstance(told, Swapped)
     return told
 
@@ -70,6 +70,15 @@ def test_a_key_is_put_only_on_top_of_the_revision_that_was_compared(server: Etcd
 
     third = swap(etcd, {key: revision, f"{PREFIX}word/r2": 0}, {key: b"", f"{PREFIX}word/r1": b"\0"})
     assert third.is_done and third.found == {key: (b"", third.revision), f"{PREFIX}word/r1": (b"\0", third.revision)}
+
+
+def test_as_many_as_are_asked_for_at_once_are_put_each_for_itself(server: EtcdServer) -> None:
+    etcd, keys = opened(server), [f"{PREFIX}component/lab/part{number}" for number in range(VOTES_MAX)]
+    swap(etcd, {}, {keys[3]: b"before"})
+    word, alive = (f"{PREFIX}word/r1", 0), (f"{PREFIX}alive/r1", 0)
+    told = etcd.answer(Swap(PREFIX, tuple(Put(key, b"mine", ((key, 0), word, alive)) for key in keys)))
+    assert isinstance(told, Swapped) and not told.is_done
+    assert {key for key, (value, _) in told.found.items() if value == b"mine"} == {*keys} - {keys[3]}
 
 
 def test_only_what_is_below_the_prefix_is_read(server: EtcdServer) -> None:

@@ -5,7 +5,20 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from failover.core.election.consent import STATES
-from failover.core.election.coordinator import Arbiter, Dialogue, Grant, KeepAlive, Request, Round, Said, Swap, Swapped, Word
+from failover.core.election.coordinator import (
+    ROUND_SHARE,
+    VOTES_MAX,
+    Arbiter,
+    Dialogue,
+    Grant,
+    KeepAlive,
+    Request,
+    Round,
+    Said,
+    Swap,
+    Swapped,
+    Word,
+)
 from failover.core.types import COORDINATOR, MS, Config, Rule, State
 from failover.core.wire.messages import FREE, OPEN, ORDERED, Entry
 from tests.simulation.coordinator import Etcd
@@ -49,7 +62,7 @@ class Site:
     def until_swap(self, steps: Round, key: str) -> Swap:
         """Play a round up to the request that puts this kind of key."""
         request: Request | Said = next(steps)
-        while not (isinstance(request, Swap) and f"/{key}/" in request.puts[0][0]):
+        while not (isinstance(request, Swap) and f"/{key}/" in request.puts[0].key):
             assert not isinstance(request, Said)
             request = self.asked(steps, request)
         return request
@@ -210,6 +223,32 @@ def test_an_older_checkpoint_waits_for_the_robots_with_the_newest() -> None:
 def test_the_robot_that_was_entrusted_goes_on_at_once() -> None:
     site = running(5)
     assert voted(site.watch("robot2", claims(site, 2, sequence=5), 440)) == (2, "robot2")
+
+
+def test_a_robot_takes_many_over_in_one_round_and_one_that_changes_meanwhile_stops_no_other() -> None:
+    site, names = running(), [f"/lab/part{number}" for number in range(2 * VOTES_MAX)]
+    word = claims(site, 2)
+    many = replace(word, entries=tuple(replace(word.entries[0], name=name) for name in names))
+    site.watch("robot2", standby(site), 280)
+    site.watch("robot1", absent(site), 280)
+    steps = site.arbiters["robot2"].round(many)
+    request = site.until_swap(steps, "component")
+    assert len(request.puts) == VOTES_MAX
+    site.round("robot1", replace(word, entries=(replace(word.entries[0], name=names[0], primary="robot1"),)))
+    said = site.rest(steps, request)
+    voted_for = {entry.name: entry.primary for entry in said.entries if entry.name in names}
+    assert [name for name in names if voted_for.get(name) != "robot2"] == names[:1]
+
+
+def test_a_round_that_takes_long_ends_so_that_a_newer_word_is_put() -> None:
+    site, word = running(), claims(running(), 2)
+    many = replace(word, entries=tuple(replace(word.entries[0], name=f"/lab/part{number}") for number in range(3 * VOTES_MAX)))
+    site.watch("robot2", standby(site), 280)
+    steps = site.arbiters["robot2"].round(many)
+    request: Request | Said = site.until_swap(steps, "component")
+    site.wait(ROBOT1.lease_ms // ROUND_SHARE)
+    request = site.asked(steps, request)
+    assert isinstance(request, Said) and len(request.entries) == 1 + VOTES_MAX
 
 
 def test_whom_a_majority_elected_without_etcd_gets_its_vote() -> None:
