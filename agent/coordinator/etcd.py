@@ -78,7 +78,7 @@ class Etcd:
         found = {}
         for one in read["response_range"].get("kvs", ()):
             found[_decoded(one["key"]).decode()] = _decoded(one.get("value", "")), int(one["mod_revision"])
-        return Swapped(is_done, int(told["header"]["revision"]), found)
+        return Swapped(is_done, int(told["header"]["revision"]), found, int(told["header"]["cluster_id"]))
 
     def _ask(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
         """The answer of the first endpoint that gives one. An earlier one may have carried the request out: revisions tell."""

@@ -19,6 +19,7 @@ from agent.errors import AgentError, CoordinatorError
 from agent.system import clock
 from checkpoint.keeper.messages import Channel, ChannelError
 from failover.core.election.coordinator import Arbiter, Said, Word
+from failover.errors import RulesError
 
 PATIENCES_IN_LEASE: Final = 4
 """A step of a request may take so long a part of a lease: the next try is still in time."""
@@ -43,7 +44,7 @@ class Coordinator:
             case Begin(word):
                 try:
                     return Ended(self._round(word))
-                except CoordinatorError as error:
+                except (CoordinatorError, RulesError) as error:
                     return Ended(Said(0, 0), str(error))
 
     def _round(self, word: Word) -> Said:

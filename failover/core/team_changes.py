@@ -11,7 +11,7 @@ majority of the other. That member's vote and that member's echo count once. Two
 granted, for each robot that asks needs the other one's grant. Source: Ongaro, Consensus: Bridging Theory and Practice, section
 4.2 (changes by one server); a majority of grants, as there, would let a member fall behind by two.
 
-With rule = etcd a robot that no member hears may act by etcd's vote, if its own and etcd's are a majority: of at most three votes.
+With rule = etcd a robot that no member hears may act by etcd's vote, if its own and etcd's are a majority (two of three votes).
 Such a robot is not taken out without its grant (`acts_unheard`): the next change would make a majority that knows neither.
 
 Two robots that are alone (rule = pair) promise less: where each takes the other one for dead, each may take the other one out.

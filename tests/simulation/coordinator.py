@@ -54,6 +54,7 @@ class Etcd:
     leases: dict[int, tuple[int, int]] = field(default_factory=dict)
     granted: int = 0
     votes: set[tuple[str, int, str]] = field(default_factory=set)
+    cluster: int = 1
 
     def answer(self, request: Request, true_ns: int) -> Answer | None:
         """Carry a request out; None for an error."""
@@ -85,7 +86,7 @@ class Etcd:
             self.kept.update({put.key: (put.value, self.revision, put.lease) for put in done})
             self._note_votes(request.prefix, done)
         found = {key: kept[:2] for key, kept in self.kept.items() if key.startswith(request.prefix)}
-        return Swapped(len(done) == len(request.puts), self.revision, found)
+        return Swapped(len(done) == len(request.puts), self.revision, found, self.cluster)
 
     def _note_votes(self, prefix: str, done: list[Put]) -> None:
         for put in done:

@@ -27,6 +27,7 @@ from checkpoint.model import Position
 from failover.core.election.consent import STATES, state_of
 from failover.core.types import COORDINATOR, ENDED, HOLDING, MS, Config, State
 from failover.core.wire.messages import FREE, OPEN, ORDERED, RULES, Beat, Echo, Entry
+from failover.errors import RulesError
 
 ROUNDS_IN_LEASE: Final = 8
 """So often in a lease a robot asks etcd where nothing changes: a few answers may be late or lost."""
@@ -38,7 +39,7 @@ VOTES_MAX: Final = 100
 """In one transaction. etcd allows 128 operations in one, a vote's comparisons and those around it together."""
 
 ROUND_SHARE: Final = 4
-"""A round that takes longer than this part of a lease ends: the next one begins with a newer word. It has cast some votes at least."""
+"""A round that takes longer than this part of a lease ends, with some votes cast: the next one begins with a newer word."""
 
 STEP_SHARE: Final = 4
 """Between two looks at etcd no more than this part of a lease counts as watched: a clock that leaps ahead proves no silence."""
@@ -103,11 +104,12 @@ class Swap(msgspec.Struct, frozen=True):
 
 
 class Swapped(msgspec.Struct, frozen=True):
-    """The answer: whether all was put, the revision of the store, and key → (value, the key's own revision)."""
+    """The answer: whether all was put, the revision of the store, key → (value, the key's own revision), which etcd."""
 
     is_done: bool
     revision: int
     found: dict[str, tuple[bytes, int]]
+    cluster: int = 0
 
 
 Request = KeepAlive | Grant | Swap
@@ -130,8 +132,9 @@ class Arbiter:
         self._me = config.robot
         self._quorum, self._lease_ns, self._loyalty_ns = config.quorum, config.lease_ns, config.loyalty_ns
         self._patience_ns = config.patience_ms * MS
+        self._members = {config.robot, *config.peers}
         self._prefix = f"failover/{team}/"
-        self._lease = self._own_revision = self._revision = 0
+        self._lease = self._own_revision = self._revision = self._cluster = 0
         self._seats: dict[str, tuple[Seat, int]] = {}
         self._words: dict[str, tuple[Word, int]] = {}
         self._leased: set[str] = set()
@@ -192,27 +195,46 @@ class Arbiter:
     def _look(self, answer: Answer, now_ns: int) -> bool:
         """Take in all that etcd has; whether the transaction was done."""
         assert isinstance(answer, Swapped)
-        if answer.revision < self._revision:
-            self._begin_anew()
-        self._revision = answer.revision
+        before, revision, cluster = {**self._seats}, self._revision, self._cluster
+        words = {robot: at for robot, (_, at) in self._words.items()}
+        self._revision, self._cluster = answer.revision, answer.cluster
         if self._looked_ns is not None:
             self._watched_ns += min(max(now_ns - self._looked_ns, 0), self._lease_ns // STEP_SHARE)
         self._looked_ns = now_ns
-        self._seats, self._words, self._leased = {}, {}, set()
-        for key, (value, revision) in answer.found.items():
-            kind, _, name = key.removeprefix(self._prefix).partition("/")
-            if kind == "component":
-                self._seats[f"/{name}"] = (msgspec.msgpack.decode(value, type=Seat), revision)
-            elif kind == "word":
-                self._words[name] = (msgspec.msgpack.decode(value, type=Word), revision)
-            elif kind == "alive":
-                self._leased.add(name)
+        self._read(answer.found)
         self._own_revision = self._revision_of(self._me)
+        is_other = cluster not in (0, answer.cluster) or answer.revision < revision
+        if is_other or self._have_lost(before) or any(self._revision_of(robot) < at for robot, at in words.items()):
+            self._begin_anew()
         seated = (robot for seat, _ in self._seats.values() for robot in (seat.primary, seat.standby) if robot)
         for robot in {*self._words, *seated}:
             self._note(self._since, robot, self._revision_of(robot))
             self._note(self._lives, robot, self._words[robot][0].boot if robot in self._words else 0)
         return answer.is_done
+
+    def _read(self, found: dict[str, tuple[bytes, int]]) -> None:
+        seats: dict[str, tuple[Seat, int]] = {}
+        words: dict[str, tuple[Word, int]] = {}
+        for key, (value, revision) in found.items():
+            kind, _, name = key.removeprefix(self._prefix).partition("/")
+            try:
+                if kind == "component":
+                    seats[f"/{name}"] = _seat(value), revision
+                elif kind == "word":
+                    words[name] = msgspec.msgpack.decode(value, type=Word), revision
+            except msgspec.MsgspecError as error:
+                raise RulesError(f"etcd has something else than failover's in {key} ({error}); delete that key") from error
+        self._seats, self._words = seats, words
+        alive = self._key("alive", "")
+        self._leased = {key.removeprefix(alive) for key in found if key.startswith(alive)}
+
+    def _have_lost(self, before: dict[str, tuple[Seat, int]]) -> bool:
+        """Whether a seat is gone, or is older than this robot knew it."""
+        for component, (seat, revision) in before.items():
+            now = self._seats.get(component)
+            if now is None or now[1] < revision or now[0].epoch < seat.epoch:
+                return True
+        return False
 
     def _begin_anew(self) -> None:
         """This etcd has lost writes, or is another one: what was watched proves nothing."""
@@ -289,7 +311,7 @@ class Arbiter:
 
     def _is_elected(self, component: str, wanted: Seat) -> bool:
         """Whether a majority names that robot without etcd, none of them with a copy that is being stopped."""
-        said = (word.entry(component) for word, _ in self._words.values())
+        said = (word.entry(component) for robot, (word, _) in self._words.items() if robot in self._members)
         named = (one for one in said if one is not None and state_of(one) is not State.STOPPING)
         return sum((one.epoch, one.primary) == (wanted.epoch, wanted.primary) for one in named) >= self._quorum
 
@@ -324,6 +346,14 @@ class Arbiter:
             sure = [robot for robot in (seat.primary, seat.standby) if robot]
             flags = FREE * is_free | OPEN * (is_free and self._all_lost(component, sure))
             yield Entry(component, seat.state, seat.epoch, seat.primary, standby=seat.standby, flags=flags, status=seat.status)
+
+
+def _seat(value: bytes) -> Seat:
+    """Raises msgspec.MsgspecError: it is none."""
+    seat = msgspec.msgpack.decode(value, type=Seat)
+    if not 0 <= seat.state < len(STATES):
+        raise msgspec.ValidationError(f"no state has the number {seat.state}")
+    return seat
 
 
 def _leased(answer: Answer) -> int:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import msgspec
+import pytest
 from msgspec.structs import replace
 
 from failover.core.election.consent import STATES
@@ -15,12 +19,14 @@ from failover.core.election.coordinator import (
     Request,
     Round,
     Said,
+    Seat,
     Swap,
     Swapped,
     Word,
 )
 from failover.core.types import COORDINATOR, MS, Config, Rule, State
 from failover.core.wire.messages import FREE, OPEN, ORDERED, Entry
+from failover.errors import RulesError
 from tests.simulation.coordinator import Etcd
 from tests.simulation.robots import Clock
 
@@ -275,6 +281,66 @@ def test_an_etcd_that_has_lost_writes_is_watched_anew() -> None:
     site.etcd.revision, site.etcd.kept = before
     assert voted(site.round("robot2", claims(site, 2))) == (1, "robot1")
     assert voted(site.watch("robot2", claims(site, 2), 440)) == (2, "robot2")
+
+
+def deleted(etcd: Etcd) -> None:
+    etcd.kept.clear()
+    etcd.revision += 1
+
+
+def seat_deleted(etcd: Etcd) -> None:
+    etcd.kept = {key: kept for key, kept in etcd.kept.items() if "/component/" not in key}
+
+
+def replaced(etcd: Etcd) -> None:
+    etcd.cluster += 1
+
+
+def restored(etcd: Etcd) -> None:
+    """From a backup, with a revision above all that there were: the seat is as it was in epoch 1."""
+    etcd.kept = {key: (value, 1 if "/component/" in key else at, lease) for key, (value, at, lease) in etcd.kept.items()}
+    etcd.revision += 1_000
+
+
+def word_deleted(etcd: Etcd) -> None:
+    etcd.kept = {key: kept for key, kept in etcd.kept.items() if "/word/robot2" not in key}
+
+
+@pytest.mark.parametrize("lose", [deleted, seat_deleted, replaced, restored, word_deleted])
+def test_an_etcd_that_is_another_one_or_has_lost_keys_is_watched_anew(lose: Callable[[Etcd], None]) -> None:
+    site = running()
+    site.etcd.clock.jump(site.now_ns, 10_000 * MS)
+    site.watch("robot2", standby(site), 600)
+    assert site.arbiters["robot2"]._is_rested
+    lose(site.etcd)
+    said = site.round("robot2", claims(site, 2))
+    assert not site.arbiters["robot2"]._is_rested and "robot2" not in [entry.primary for entry in said.entries]
+    assert voted(site.watch("robot2", claims(site, 2), 440)) == (2, "robot2")
+
+
+def test_a_word_of_a_former_member_is_no_vote() -> None:
+    site = running()
+    site.watch("robot2", standby(site), 80)
+    word = replace(standby(site), entries=(replace(standby(site).entries[0], epoch=2, primary="robot2"),))
+    site.etcd.revision += 1
+    site.etcd.kept["failover/lab/word/robot3"] = msgspec.msgpack.encode(word), site.etcd.revision, 0
+    site.round("robot1", site.word(State.PRIMARY, 1, "robot1"))
+    assert voted(site.round("robot2", claims(site, 2))) == (1, "robot1")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("component/lab/other", b"\x93\x01"),
+        ("component/lab/other", msgspec.msgpack.encode(Seat(1, "robot1", state=99))),
+        ("word/robot3", b"made by hand"),
+    ],
+)
+def test_a_key_that_is_not_of_this_program_is_named(key: str, value: bytes) -> None:
+    site = running()
+    site.etcd.kept[f"failover/lab/{key}"] = value, site.etcd.revision, 0
+    with pytest.raises(RulesError, match=f"in failover/lab/{key} .*delete that key"):
+        site.round("robot1", site.word(State.PRIMARY, 1, "robot1"))
 
 
 def test_an_answer_lets_a_robot_act_from_the_heartbeat_that_it_named() -> None:
