@@ -26,6 +26,17 @@ ANSWER_SIZE_MAX: Final = 16 << 20
 UNAUTHORIZED: Final = 401
 """The status of an answer to a token that is over; etcd's tokens last for five minutes."""
 
+BUSY: Final = 429
+"""This status, and those from 500 on, are the endpoint's own trouble: another one may do better."""
+
+STALE_TOKEN: Final = ("invalid auth token", "revision of auth store is old")
+"""The second: of a token of kind jwt, once any account of etcd has changed."""
+
+STALE_CONNECTION: Final = (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError)
+"""etcd has closed a connection that was kept."""
+
+NO_LEASE: Final = "requested lease not found"
+
 BODY_SHOWN: Final = 200
 """Of an answer that is an error."""
 
@@ -45,6 +56,14 @@ class Etcd:
         Raises:
             CoordinatorError: it did not, as far as is known.
         """
+        try:
+            return self._answer(request)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            raise CoordinatorError(
+                f"{self._endpoints[0]} does not answer as etcd does ({error!r}); check [coordinator]"
+            ) from error
+
+    def _answer(self, request: Request) -> Answer:
         match request:
             case KeepAlive(lease):
                 told = self._ask("lease/keepalive", {"ID": str(lease)}).get("result", {})
@@ -52,7 +71,12 @@ class Etcd:
             case Grant(ttl_ms):
                 told = self._ask("lease/grant", {"TTL": str(math.ceil(ttl_ms / MS_A_SECOND))})
                 return Leased(int(told["ID"]))
-        return self._swap(request)
+        try:
+            return self._swap(request)
+        except CoordinatorError as error:
+            if NO_LEASE not in str(error):
+                raise
+            return Leased(0)
 
     def version(self) -> str:
         """Of the server that answers.
@@ -87,27 +111,49 @@ class Etcd:
             try:
                 return self._asked(method, body)
             except _RefusedError as error:
-                raise CoordinatorError(f"etcd at {self._endpoints[0]} refuses {method}: {error}") from error
-            except (OSError, http.client.HTTPException, ValueError, KeyError) as error:
+                if not error.is_of_the_endpoint:
+                    raise CoordinatorError(f"etcd at {self._endpoints[0]} refuses {method}: {error}") from error
+                troubles.append(f"{self._endpoints[0]}: {error}")
+            except (OSError, http.client.HTTPException, msgspec.MsgspecError, ValueError, KeyError) as error:
                 troubles.append(f"{self._endpoints[0]}: {_words(error)}")
-                self.close()
-                self._endpoints.append(self._endpoints.pop(0))
+            self.close()
+            self._endpoints.append(self._endpoints.pop(0))
         raise CoordinatorError(f"no etcd answers ({'; '.join(troubles)}); check [coordinator] endpoints and the network")
 
     def _asked(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
-        if self._config.user and not self._token:
-            password = Path(self._config.password_file).read_text(encoding="utf-8").rstrip("\n")
-            told = self._posted("auth/authenticate", {"name": self._config.user, "password": password})
-            self._token = str(told["token"])
+        had_token = bool(self._token)
         try:
-            return self._posted(method, body)
+            return self._authenticated(method, body)
         except _RefusedError as error:
-            if not (self._token and error.is_token):
+            if not (error.is_token and had_token):
+                self._token = "" if error.is_token else self._token
                 raise
-            self._token = ""
-            return self._asked(method, body) if self._config.user else {}
+        self._token = ""
+        return self._authenticated(method, body)
+
+    def _authenticated(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
+        if self._config.user and not self._token:
+            told = self._posted("auth/authenticate", {"name": self._config.user, "password": self._password()})
+            self._token = str(told["token"])
+        return self._posted(method, body)
+
+    def _password(self) -> str:
+        try:
+            return Path(self._config.password_file).read_text(encoding="utf-8").rstrip("\n")
+        except OSError as error:
+            raise CoordinatorError(f"cannot read [coordinator] password_file {error.filename}: {error.strerror}") from error
 
     def _posted(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
+        was_kept = self._connection is not None and self._connection.sock is not None
+        try:
+            return self._exchanged(method, body)
+        except STALE_CONNECTION:
+            self.close()
+            if not was_kept:
+                raise
+        return self._exchanged(method, body)
+
+    def _exchanged(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
         connection = self._connected()
         headers = {"Content-Type": "application/json"} | ({"Authorization": self._token} if self._token else {})
         connection.request("POST", f"/v3/{method}", msgspec.json.encode(body), headers)
@@ -129,9 +175,13 @@ class Etcd:
         return self._connection
 
     def _context(self) -> ssl.SSLContext:
-        context = ssl.create_default_context(cafile=self._config.ca or None)
-        if self._config.certificate:
-            context.load_cert_chain(self._config.certificate, self._config.key)
+        try:
+            context = ssl.create_default_context(cafile=self._config.ca or None)
+            if self._config.certificate:
+                context.load_cert_chain(self._config.certificate, self._config.key)
+        except OSError as error:
+            files = ", ".join(filter(None, (self._config.ca, self._config.certificate, self._config.key)))
+            raise CoordinatorError(f"[coordinator] one of the files {files} cannot be used: {_words(error)}") from error
         return context
 
 
@@ -143,7 +193,8 @@ class _RefusedError(Exception):
         with contextlib.suppress(msgspec.DecodeError, AttributeError):
             said = str(msgspec.json.decode(content).get("error", said))
         super().__init__(f"{said[:BODY_SHOWN].strip()} (status {status})")
-        self.is_token = status == UNAUTHORIZED or "invalid auth token" in said
+        self.is_token = status == UNAUTHORIZED or any(words in said for words in STALE_TOKEN)
+        self.is_of_the_endpoint = status == BUSY or status >= http.client.INTERNAL_SERVER_ERROR
 
 
 def _put(put: Put) -> dict[str, Any]:

@@ -366,8 +366,8 @@ class TeamChanges:
             and acts_unheard(len(before))
         ):
             return (
-                f"nobody hears {robot}, which may act by etcd's vote all the same. Bring it back, then take it out. If it is lost "
-                'for good, see "A robot that is lost for good" in docs/coordinator.md'
+                f"nobody hears {robot}, which may act by etcd's vote all the same. Bring it back, then take it out. If it is "
+                'lost for good, see "A robot that is lost for good" in docs/coordinator.md'
             )
         living = {self._lines.settings.config.robot, *(one.robot for one in status.peers if one.state in ALIVE)}
         open_ones = [one for one in status.components if one.state not in ENDED]

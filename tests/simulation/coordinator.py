@@ -56,8 +56,8 @@ class Etcd:
     votes: set[tuple[str, int, str]] = field(default_factory=set)
     cluster: int = 1
 
-    def answer(self, request: Request, true_ns: int) -> Answer | None:
-        """Carry a request out; None for an error."""
+    def answer(self, request: Request, true_ns: int) -> Answer:
+        """Carry a request out."""
         now_ns = self.clock.read(true_ns)
         over = {lease for lease, (until_ns, _) in self.leases.items() if now_ns >= until_ns}
         self.leases = {lease: terms for lease, terms in self.leases.items() if lease not in over}
@@ -76,9 +76,9 @@ class Etcd:
                 return Leased(lease)
         return self._swap(request)
 
-    def _swap(self, request: Swap) -> Answer | None:
+    def _swap(self, request: Swap) -> Answer:
         if any(put.lease and put.lease not in self.leases for put in request.puts):
-            return None
+            return Leased(0)
         before = dict(self.kept)
         done = [put for put in request.puts if all((before[key][1] if key in before else 0) == at for key, at in put.compared)]
         if done:

@@ -113,6 +113,7 @@ class Swapped(msgspec.Struct, frozen=True):
 
 
 Request = KeepAlive | Grant | Swap
+"""etcd answers a Swap by Swapped, or by Leased(0) where it names a lease that is over."""
 Answer = Leased | Swapped
 Round = Generator[Request, tuple[Answer, int], "Said"]
 
@@ -134,7 +135,7 @@ class Arbiter:
         self._patience_ns = config.patience_ms * MS
         self._members = {config.robot, *config.peers}
         self._prefix = f"failover/{team}/"
-        self._lease = self._own_revision = self._revision = self._cluster = 0
+        self._lease = self._own_revision = self._revision = self._cluster = self._alive = 0
         self._seats: dict[str, tuple[Seat, int]] = {}
         self._words: dict[str, tuple[Word, int]] = {}
         self._leased: set[str] = set()
@@ -158,9 +159,14 @@ class Arbiter:
         own, alive = self._key("word", self._me), self._key("alive", self._me)
         for _ in range(TRIES_MAX):
             compared = ((own, self._own_revision),)
-            puts = Put(own, msgspec.msgpack.encode(word), compared), Put(alive, b"", compared, lease)
-            answer, begun_ns = yield Swap(self._prefix, puts)
-            if self._look(answer, begun_ns):
+            puts = [Put(own, msgspec.msgpack.encode(word), compared)]
+            if lease != self._alive or self._me not in self._leased:
+                puts.append(Put(alive, b"", compared, lease))
+            answer, begun_ns = yield Swap(self._prefix, tuple(puts))
+            if isinstance(answer, Leased):  # etcd's clock has leapt meanwhile: that lease is over
+                self._lease = lease = _leased((yield Grant(self._loyalty_ns // MS))[0])
+            elif self._look(answer, begun_ns):
+                self._alive = lease
                 break
         else:
             return Said(0, 0)

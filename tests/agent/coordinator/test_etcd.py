@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import http.server
 import subprocess
+import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -98,8 +102,7 @@ def test_a_key_lives_as_long_as_its_lease_which_can_be_lengthened(server: EtcdSe
         assert time.monotonic() < deadline
     assert key in swap(etcd, {}, {}).found
     assert etcd.answer(KeepAlive(left)) == Leased(0)
-    with pytest.raises(CoordinatorError, match=r"refuses kv/txn: .*lease not found"):
-        swap(etcd, {}, {key: b""}, left)
+    assert etcd.answer(Swap(PREFIX, (Put(key, b"", (), left),))) == Leased(0)
 
 
 def test_the_next_endpoint_is_asked_when_one_does_not_answer(server: EtcdServer) -> None:
@@ -150,6 +153,115 @@ def test_an_account_of_etcd_is_used_and_its_token_renewed(server: EtcdServer, tm
     assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
     etcd._token = "over"
     assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
+
+
+def test_a_change_of_etcds_accounts_costs_a_new_token_and_no_vote(tmp_path: Path) -> None:
+    signed, key = certificate(tmp_path, "token")
+    public = tmp_path / "public.pem"
+    public.write_bytes(
+        subprocess.run(["openssl", "x509", "-in", signed, "-pubkey", "-noout"], check=True, capture_output=True).stdout
+    )
+    tokens = f"jwt,pub-key={public},priv-key={key},sign-method=RS256,ttl=10m"
+    server = EtcdServer(tmp_path / "etcd", "127.0.0.1", *free_ports(2), options=("--auth-token", tokens))
+    server.start()
+    try:
+        plain, password = opened(server), tmp_path / "password"
+        password.write_text(ROOT)
+        plain._ask("auth/user/add", {"name": "root", "password": ROOT})
+        plain._ask("auth/user/grant", {"user": "root", "role": "root"})
+        plain._ask("auth/enable", {})
+        etcd = Etcd(CoordinatorConfig([server.endpoint], user="root", password_file=str(password)), 5.0)
+        assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
+        etcd._ask("auth/user/add", {"name": "another", "password": "of another"})
+        assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
+    finally:
+        server.kill()
+
+
+class Endpoint(http.server.ThreadingHTTPServer):
+    """Answers all alike, as a proxy in front of etcd may. ``asked``: how often each method was; ``hangs_up``: after each answer."""
+
+    def __init__(self, status: int, content: bytes, *, hangs_up: bool = False) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.status, self.content, self.hangs_up = status, content, hangs_up
+        self.asked: Counter[str] = Counter()
+        self.url = f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+
+    def do_POST(self) -> None:
+        assert isinstance(self.server, Endpoint)
+        self.rfile.read(int(self.headers["Content-Length"]))
+        method = self.path.removeprefix("/v3/")
+        self.server.asked[method] += 1
+        is_login = method == "auth/authenticate"
+        status, content = (200, b'{"token":"one"}') if is_login else (self.server.status, self.server.content)
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+        self.close_connection = self.server.hangs_up  # without a word of it, as after a while in which nothing was asked
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def endpoint() -> Iterator[Callable[..., Endpoint]]:
+    made: list[Endpoint] = []
+
+    def make(*terms: Any, **more: Any) -> Endpoint:
+        made.append(Endpoint(*terms, **more))
+        threading.Thread(target=made[-1].serve_forever, daemon=True).start()
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.shutdown()
+        one.server_close()
+
+
+@pytest.mark.parametrize("status", [429, 500, 503])
+def test_an_endpoint_in_trouble_is_left_for_the_next(endpoint: Callable[..., Endpoint], status: int) -> None:
+    bad, good = endpoint(status, b'{"error":"etcdserver: no leader"}'), endpoint(200, b'{"ID":"7"}')
+    etcd = Etcd(CoordinatorConfig([bad.url, good.url]), 5.0)
+    assert [etcd.answer(Grant(1_000)) for _ in range(3)] == [Leased(7)] * 3
+    assert bad.asked.total() == 1
+    with pytest.raises(CoordinatorError, match="no etcd answers .*no leader"):
+        Etcd(CoordinatorConfig([bad.url]), 5.0).answer(Grant(1_000))
+
+
+def test_a_token_that_is_never_taken_is_renewed_once(endpoint: Callable[..., Endpoint], tmp_path: Path) -> None:
+    (tmp_path / "password").write_text(ROOT)
+    stern = endpoint(401, b'{"error":"no"}')
+    etcd = Etcd(CoordinatorConfig([stern.url], user="root", password_file=str(tmp_path / "password")), 5.0)
+    for _ in range(2):
+        with pytest.raises(CoordinatorError, match=r"refuses lease/grant: no \(status 401\)"):
+            etcd.answer(Grant(1_000))
+    assert stern.asked["lease/grant"] <= 4
+
+
+@pytest.mark.parametrize("content", [b"{}", b"[]", b'{"ID":"x","responses":[{}]}', b"no JSON"])
+def test_what_is_no_answer_of_etcd_is_said_to_be_none(endpoint: Callable[..., Endpoint], content: bytes) -> None:
+    etcd = Etcd(CoordinatorConfig([endpoint(200, content).url]), 5.0)
+    for request in (Grant(1_000), Swap(PREFIX, ())):
+        with pytest.raises(CoordinatorError, match="does not answer as etcd does|no etcd answers"):
+            etcd.answer(request)
+
+
+def test_a_connection_that_was_closed_while_nothing_was_asked_is_made_anew(endpoint: Callable[..., Endpoint]) -> None:
+    etcd = Etcd(CoordinatorConfig([endpoint(200, b'{"ID":"7"}', hangs_up=True).url]), 5.0)
+    assert [etcd.answer(Grant(1_000)) for _ in range(3)] == [Leased(7)] * 3
+
+
+def test_a_file_that_is_missing_is_named(endpoint: Callable[..., Endpoint], tmp_path: Path) -> None:
+    url, missing = endpoint(200, b"{}").url, str(tmp_path / "nobody")
+    for keys in ({"user": "root", "password_file": missing}, {"ca": missing}):
+        etcd = Etcd(CoordinatorConfig([url.replace("http:", "https:") if "ca" in keys else url], **keys), 5.0)
+        with pytest.raises(CoordinatorError, match=f"{missing}.*No such file"):
+            etcd.answer(Grant(1_000))
 
 
 def certificate(place: Path, name: str, signer: str = "") -> tuple[str, str]:

@@ -356,6 +356,28 @@ def test_an_answer_lets_a_robot_act_from_the_heartbeat_that_it_named() -> None:
     assert dialogue.beat(Said(0, 0)) is None, "etcd took nothing in"
 
 
+def test_a_lease_that_ends_at_etcd_between_two_requests_costs_no_round() -> None:
+    site = running()
+    arbiter, word = site.arbiters["robot1"], site.word(State.PRIMARY, 1, "robot1")
+    arbiter._alive = 0  # its lease is put
+    steps = arbiter.round(word)
+    request = site.until_swap(steps, "word")
+    site.etcd.leases.clear()
+    said = site.rest(steps, request)
+    assert said.counter == word.counter and voted(said) == (1, "robot1")
+    assert site.etcd.kept["failover/lab/alive/robot1"][2] in site.etcd.leases
+
+
+def test_a_lease_is_put_once_and_again_when_it_is_another() -> None:
+    site = running()
+    revision = site.etcd.kept["failover/lab/alive/robot1"][1]
+    site.round("robot1", site.word(State.PRIMARY, 1, "robot1"))
+    assert site.etcd.kept["failover/lab/alive/robot1"][1] == revision
+    site.etcd.clock.jump(site.now_ns, 10_000 * MS)
+    site.round("robot1", site.word(State.PRIMARY, 1, "robot1"))
+    assert site.etcd.kept["failover/lab/alive/robot1"][1] > revision
+
+
 def test_a_lease_at_etcd_lasts_at_least_as_long_as_a_robot_watches() -> None:
     steps = Arbiter(ROBOT1, "lab").round(Word(1, 1))
     assert next(steps) == Grant(ROBOT1.loyalty_ns // MS)
