@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from dataclasses import dataclass, field
 from typing import Final
 from urllib.parse import urlsplit
@@ -44,6 +45,19 @@ class CoordinatorConfig:
             raise ValueError("certificate and key belong together: name both files, or neither")
         if bool(self.user) != bool(self.password_file):
             raise ValueError("user and password_file belong together: name both, or neither")
+        if self.user and (plain := [one for one in self.endpoints if not _is_private(one)]):
+            raise ValueError(f"the password of user would travel to {plain[0]} in the clear; write https")
+
+
+def _is_private(endpoint: str) -> bool:
+    """Whether nobody between reads what is said to it."""
+    parts = urlsplit(endpoint)
+    if parts.scheme == "https" or parts.hostname == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(str(parts.hostname)).is_loopback
+    except ValueError:
+        return False
 
 
 def _is_sound(endpoint: str) -> bool:

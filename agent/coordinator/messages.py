@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from msgspec import Struct
 
+from agent.coordinator_config import CoordinatorConfig
 from failover.core.election.coordinator import Said, Word
 from failover.core.types import Config
 
 
 class Know(Struct, frozen=True, tag=True):
-    """The team as it is now; comes first, and after each change."""
+    """The team as it is now, its name, and where etcd is; comes first, and after each change."""
 
     config: Config
+    team: str
+    coordinator: CoordinatorConfig
 
 
 class Begin(Struct, frozen=True, tag=True):

@@ -1,6 +1,6 @@
 """The process that speaks with etcd: one round after the other, each begun by the main loop. Ends when the main loop does.
 
-Started as `python -P -m agent.coordinator.process CONFIG DESCRIPTOR`, with all modules of Python: TLS needs some that
+Started as `python -P -m agent.coordinator.process DESCRIPTOR`, with all modules of Python: TLS needs some that
 `agent.system.child_main` leaves out. It keeps nothing on the disk: etcd has all that must not be forgotten.
 """
 
@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import socket
 import sys
-from pathlib import Path
 from typing import Final
 
-from agent import config as configuration
-from agent.config import Settings
 from agent.coordinator.etcd import Etcd
 from agent.coordinator.messages import Begin, Ended, Know, ToCoordinator
-from agent.errors import AgentError, CoordinatorError
+from agent.errors import CoordinatorError
 from agent.system import clock
 from checkpoint.keeper.messages import Channel, ChannelError
 from failover.core.election.coordinator import Arbiter, Said, Word
@@ -30,16 +27,18 @@ MS_A_SECOND: Final = 1_000
 class Coordinator:
     """etcd, and how this robot has it vote."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._team = settings.team.team
-        self._etcd = Etcd(settings.config.coordinator, settings.config.lease_ms / MS_A_SECOND / PATIENCES_IN_LEASE)
+    def __init__(self) -> None:
+        self._etcd: Etcd | None = None
         self._arbiter: Arbiter | None = None
 
     def heed(self, message: ToCoordinator) -> Ended | None:
         """Take a message in; the answer of a round."""
         match message:
-            case Know(config):
-                self._arbiter = Arbiter(config, self._team)  # it watches anew: a new team may mean another majority
+            case Know(config, team, coordinator):
+                if self._etcd is not None:
+                    self._etcd.close()
+                self._etcd = Etcd(coordinator, config.lease_ms / MS_A_SECOND / PATIENCES_IN_LEASE)
+                self._arbiter = Arbiter(config, team)  # it watches anew: a new team may mean another majority
                 return None
             case Begin(word):
                 try:
@@ -48,7 +47,7 @@ class Coordinator:
                     return Ended(Said(0, 0), str(error))
 
     def _round(self, word: Word) -> Said:
-        assert self._arbiter is not None, "Know comes first"
+        assert self._arbiter is not None and self._etcd is not None, "Know comes first"
         steps = self._arbiter.round(word)
         request = next(steps)
         while True:
@@ -62,13 +61,8 @@ class Coordinator:
 
 def main() -> int:
     """Ask etcd until the main loop has gone."""
-    path, descriptor = sys.argv[1:3]
-    channel: Channel[ToCoordinator] = Channel(socket.socket(fileno=int(descriptor)), ToCoordinator)
-    try:
-        coordinator = Coordinator(configuration.load(Path(path)))
-    except AgentError as error:
-        print(f"failover coordinator: {error}", file=sys.stderr)
-        return 1
+    channel: Channel[ToCoordinator] = Channel(socket.socket(fileno=int(sys.argv[1])), ToCoordinator)
+    coordinator = Coordinator()
     while True:
         try:
             message, _ = channel.receive()

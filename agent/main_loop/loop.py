@@ -331,13 +331,19 @@ class MainLoop:
             from agent.main_loop.coordinator_link import CoordinatorLink  # here: a team that does not need it does not load it
 
             self._etcd = CoordinatorLink(self._settings, config)
-            self._attend(self._etcd.fileno(), self._hear_etcd)
+            self._start_etcd(self._etcd)
+
+    def _start_etcd(self, etcd: CoordinatorLink) -> None:
+        if etcd.start(clock.now_ns()):
+            self._attend(etcd.fileno(), self._hear_etcd)
 
     def _ask_etcd(self, etcd: CoordinatorLink, node: Node, now_ns: int) -> None:
         """Begin a round with all that this robot holds, once it is on the disk."""
+        if etcd.is_hung(now_ns):
+            self._neglect(etcd.fileno())
+            etcd.stop(now_ns)
         if etcd.is_over(now_ns):
-            etcd.replace()
-            self._attend(etcd.fileno(), self._hear_etcd)
+            self._start_etcd(etcd)
         if etcd.wants_word and not self._outbox.waiting:
             etcd.look(node.word(), now_ns)
 
@@ -345,9 +351,10 @@ class MainLoop:
         etcd, now_ns = self._etcd, clock.now_ns()
         if etcd is None:
             return
+        descriptor = etcd.fileno()
         beat = etcd.receive(now_ns)
         if etcd.has_ended:
-            self._neglect(etcd.fileno())
+            self._neglect(descriptor)
         if beat is not None:
             self._step(Received(beat, COORDINATOR, paces=False))
 
@@ -394,8 +401,8 @@ class MainLoop:
         deadline_ns = self._node.next_deadline_ns()
         if self._urgent_ns is not None:
             deadline_ns = min(deadline_ns, self._urgent_ns)
-        if self._etcd is not None and (round_ns := self._etcd.next_ns()) is not None:
-            deadline_ns = min(deadline_ns, round_ns)
+        if self._etcd is not None and not self._outbox.waiting:  # while something waits for the disk, no word leaves
+            deadline_ns = min(deadline_ns, self._etcd.next_ns())
         slot_ns = self._media.wakes_ns()
         if slot_ns is not None and self._beat is not None:
             deadline_ns = min(deadline_ns, slot_ns)

@@ -380,7 +380,10 @@ class Dialogue:
     def is_due(self, word: Word, now_ns: int) -> bool:
         """Whether to begin a round now with this word: all of it is on the disk. Only one round is under way at a time."""
         essence = tuple([(one.name, one.state, one.epoch, one.primary, one.standby) for one in word.entries])
-        if not word.counter or (essence == self._essence and now_ns < self._asked_ns + self._period_ns):
+        if not word.counter:
+            self._asked_ns = now_ns  # no heartbeat has left yet: look again a while later
+            return False
+        if essence == self._essence and now_ns < self._asked_ns + self._period_ns:
             return False
         self._essence, self._asked_ns = essence, now_ns
         return True

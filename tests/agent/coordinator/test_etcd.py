@@ -179,7 +179,7 @@ def test_a_change_of_etcds_accounts_costs_a_new_token_and_no_vote(tmp_path: Path
 
 
 class Endpoint(http.server.ThreadingHTTPServer):
-    """Answers all alike, as a proxy in front of etcd may. ``asked``: how often each method was; ``hangs_up``: after each answer."""
+    """Answers all alike, as a proxy in front of etcd may. ``asked``: how often each method; ``hangs_up``: after each answer."""
 
     def __init__(self, status: int, content: bytes, *, hangs_up: bool = False) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -229,7 +229,7 @@ def test_an_endpoint_in_trouble_is_left_for_the_next(endpoint: Callable[..., End
     etcd = Etcd(CoordinatorConfig([bad.url, good.url]), 5.0)
     assert [etcd.answer(Grant(1_000)) for _ in range(3)] == [Leased(7)] * 3
     assert bad.asked.total() == 1
-    with pytest.raises(CoordinatorError, match="no etcd answers .*no leader"):
+    with pytest.raises(CoordinatorError, match=r"no etcd answers .*no leader"):
         Etcd(CoordinatorConfig([bad.url]), 5.0).answer(Grant(1_000))
 
 
@@ -247,7 +247,7 @@ def test_a_token_that_is_never_taken_is_renewed_once(endpoint: Callable[..., End
 def test_what_is_no_answer_of_etcd_is_said_to_be_none(endpoint: Callable[..., Endpoint], content: bytes) -> None:
     etcd = Etcd(CoordinatorConfig([endpoint(200, content).url]), 5.0)
     for request in (Grant(1_000), Swap(PREFIX, ())):
-        with pytest.raises(CoordinatorError, match="does not answer as etcd does|no etcd answers"):
+        with pytest.raises(CoordinatorError, match=r"does not answer as etcd does|no etcd answers"):
             etcd.answer(request)
 
 
@@ -303,8 +303,10 @@ def test_certificates_are_checked_on_both_sides(tmp_path: Path) -> None:
         {"endpoints": ["http://10.0.0.5:2379"] * 17},
         {"certificate": "robot.crt"},
         {"user": "robot"},
+        {"endpoints": ["http://10.0.0.5:2379"], "user": "robot", "password_file": "password"},
+        {"endpoints": ["http://127.evil.example:2379"], "user": "robot", "password_file": "password"},
     ],
 )
 def test_what_reaches_no_etcd_is_refused(keys: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"write endpoints|at most|belong together"):
+    with pytest.raises(ValueError, match=r"write endpoints|at most|belong together|in the clear"):
         CoordinatorConfig(**keys)  # type: ignore[arg-type]
