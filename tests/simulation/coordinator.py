@@ -201,7 +201,7 @@ class Coordination:
     def faults(self) -> tuple[Fault, ...]:
         """Each begins now, hits one robot or etcd, and ends by itself after that time."""
         often = (self._stop, self._shut_out, self._shut_out, self._leap, self._worst, self._worst, self._back_at_the_last)
-        return (*often, self._be_slow, self._lose, self._hold)
+        return (*often, self._be_slow, self._lose, self._hold, self._forget, self._go_back)
 
     def _stop(self, _robot: str, for_ns: int) -> None:
         self._world.note(f"etcd is down for {for_ns / MS:.0f} ms")
@@ -247,6 +247,22 @@ class Coordination:
         self._world.note(f"half of the requests to etcd arrive late for {for_ns / MS:.0f} ms")
         self.held = 0.5
         self._world.after(for_ns, lambda: setattr(self, "held", 0.0))
+
+    def _forget(self, _robot: str, _for_ns: int) -> None:
+        self._world.note("all keys of etcd are deleted")
+        self.etcd.kept.clear()
+        self.etcd.revision += 1
+
+    def _go_back(self, _robot: str, for_ns: int) -> None:
+        """What is there now is restored later, with a revision that is as it was, or above all."""
+        kept, revision = dict(self.etcd.kept), self.etcd.revision
+
+        def restore() -> None:
+            self._world.note(f"etcd is restored from a backup of {for_ns / MS:.0f} ms ago")
+            self.etcd.kept = dict(kept)
+            self.etcd.revision = revision if self._random.random() < 0.5 else self.etcd.revision + 1_000
+
+        self._world.after(for_ns, restore)
 
     def _leap(self, _robot: str, for_ns: int) -> None:
         by_ns = for_ns if for_ns == LEAP_NS else self._random.choice((1, 1, 1, -1)) * for_ns
