@@ -319,7 +319,7 @@ def test_keys_are_asked_for_unless_the_operator_says_insecure(directory: Path) -
     ("secret", "said"),
     [
         (new_keys()[1], "does not belong to the public key of robot1 in "),
-        ("#" * 40, "is not a CURVE key"),
+        ("#" * 40, "is no key: it is not Z85"),
     ],
     ids=["another robot's", "no key"],
 )

@@ -18,6 +18,8 @@ from tests.e2e.growing import GrowingStage, machines, together
 
 ROOT = Path(__file__).parents[2]
 MORE = 20
+FOUND_S = 240.0
+"""Some scans for names, 20 s apart, on a busy machine."""
 
 DRIVER = """
 import failover
@@ -71,7 +73,7 @@ def lines(output: Path) -> int:
 
 def goes_on(caller: Path, what: str) -> None:
     before = lines(caller)
-    robots.until(lambda: lines(caller) > before + MORE, what)
+    robots.until(lambda: lines(caller) > before + MORE, what, FOUND_S)
 
 
 def test_both_run_on_with_other_keys_and_who_has_a_copy_of_the_old_ones_is_refused(tmp_path: Path) -> None:
@@ -86,7 +88,7 @@ def test_both_run_on_with_other_keys_and_who_has_a_copy_of_the_old_ones_is_refus
                 running(stage, "robot2", CALLER, stage.place("robot2"), tmp_path / "caller") as caller,
                 running(stage, "robot2", CALLER, copied, tmp_path / "thief") as thief,
             ):
-                robots.until(lambda: min(lines(caller), lines(thief)) > MORE, "both to be answered")
+                robots.until(lambda: min(lines(caller), lines(thief)) > MORE, "both to be answered", FOUND_S)
                 for robot in ("robot2", "robot1"):  # first the one whose keys were copied: the driver proves what the thief knows
                     ran = stage.typed(robot, "rotate")
                     assert ran.returncode == 0, ran.stderr

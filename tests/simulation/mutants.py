@@ -619,8 +619,8 @@ def trusts_etcds_clock() -> Any:
 
 
 ETCD_MUTANTS: tuple[tuple[Mutant, int], ...] = (
-    (lease_from_the_answer, 10),
-    (no_fence_at_the_end, 8),
+    (lease_from_the_answer, 40),
+    (no_fence_at_the_end, 37),
     (trusts_etcds_clock, 94),
 )
 """Mistakes that lives with etcd catch, and the seed that caught each last."""
