@@ -39,6 +39,7 @@ COMMANDS_MAX: Final = 4
 
 HOME: Final = "root"
 ENDED: Final = "--ended--"
+PROMPT: Final = "# "
 
 
 class Line(NamedTuple):
@@ -70,7 +71,7 @@ class Terminal:
         self._shell = subprocess.Popen(inside, stdin=near, stdout=near, stderr=near, start_new_session=True)
         os.close(near)
         self._said = ""
-        self.until("# ")
+        self.until(PROMPT)
 
     def type(self, text: str) -> None:
         """One line, and the key Enter."""
@@ -94,6 +95,7 @@ class Terminal:
         """What a command has said; it ended well."""
         said = self.until(ENDED)
         status = self.until("\n").strip()
+        self.until(PROMPT)  # what is typed before it stands in front of the next command's first line
         assert status == "0", f"status {status} at {self.machine.name}: {said}"
         return said
 
