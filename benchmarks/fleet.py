@@ -157,12 +157,11 @@ def _configs(size: int) -> list[Config]:
 
 def _settled(size: int, seed: int) -> CountedWorld:
     """Each component computes at a robot, and has a standby."""
-    world = CountedWorld(seed, _configs(size))
+    configs = _configs(size)
+    world = CountedWorld(seed, configs)
     for name in world.robots:
         world.power_on(name)
-    _run_until(
-        world, lambda: all(world.acting(spec.name) and _standby(world, spec.name) for spec in _configs(size)[0].components)
-    )
+    _run_until(world, lambda: all(world.acting(spec.name) and _standby(world, spec.name) for spec in configs[0].components))
     world.run(world.now_ns + SNAPSHOTS_MS * MS)
     return world
 
