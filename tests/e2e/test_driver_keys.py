@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,18 +54,17 @@ pytestmark = [
 @contextmanager
 def running(stage: GrowingStage, robot: str, script: str, team: Path, output: Path) -> Iterator[Path]:
     """A process in a robot's network, with these files of the team; the file into which it writes."""
-    meeting = output.with_suffix(".meeting")
-    meeting.mkdir(mode=0o700)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), ROBOT: robot, TEAM: str(team), DIRECTORY: str(meeting)}
-    inside = ["nsenter", "--net", f"--target={stage.machine(robot).process.pid}"]
-    with output.open("wb") as written:
-        process = subprocess.Popen([*inside, sys.executable, "-c", script], env=environment, stdout=written)
-    try:
-        yield output
-        assert process.poll() is None, output.read_text()
-    finally:
-        process.kill()
-        process.wait()
+    with tempfile.TemporaryDirectory(prefix="fo-", dir="/tmp") as meeting:  # short: the address of a unix socket has 107 bytes
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), ROBOT: robot, TEAM: str(team), DIRECTORY: meeting}
+        inside = ["nsenter", "--net", f"--target={stage.machine(robot).process.pid}"]
+        with output.open("wb") as written:
+            process = subprocess.Popen([*inside, sys.executable, "-c", script], env=environment, stdout=written)
+        try:
+            yield output
+            assert process.poll() is None, output.read_text()
+        finally:
+            process.kill()
+            process.wait()
 
 
 def lines(output: Path) -> int:
@@ -76,7 +76,7 @@ def goes_on(caller: Path, what: str) -> None:
     robots.until(lambda: lines(caller) > before + MORE, what, FOUND_S)
 
 
-def test_both_run_on_with_other_keys_and_who_has_a_copy_of_the_old_ones_is_refused(tmp_path: Path) -> None:
+def test_both_run_on_with_other_keys_and_a_copy_of_the_old_ones_is_refused(tmp_path: Path) -> None:
     with machines(tmp_path, 2, own_network=True) as stage:
         stage.create("robot1")
         stage.brought("robot1", "robot2")

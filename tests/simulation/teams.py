@@ -45,14 +45,11 @@ def elective(
 
 def coordinated(robots: int, components: tuple[ComponentSpec, ...] = (), lease_ms: int = 150) -> list[Config]:
     """Configurations of robots that vote together with etcd."""
-    configs = elective(robots, components, witnesses=1, lease_ms=lease_ms)
-    return [
-        replace(
-            config,
-            rule=Rule.ETCD,
-            peers=(*(peer for peer in config.peers if peer != "witness1"), COORDINATOR),
-            witnesses=(COORDINATOR,),
-        )
-        for config in configs
-        if config.robot != "witness1"
-    ]
+    return ruled(Rule.ETCD, elective(robots, components, lease_ms=lease_ms))
+
+
+def ruled(rule: Rule, configs: list[Config]) -> list[Config]:
+    """The same robots, deciding by that rule; by the rule ``etcd`` with etcd among them."""
+    if rule is not Rule.ETCD:
+        return [replace(config, rule=rule) for config in configs]
+    return [replace(config, rule=rule, peers=(*config.peers, COORDINATOR), witnesses=(COORDINATOR,)) for config in configs]

@@ -10,7 +10,7 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State
 from tests.simulation.invariants import seen_at, state_at
-from tests.simulation.teams import elective, pair
+from tests.simulation.teams import coordinated, elective, pair
 from tests.simulation.world import World
 
 PART = "/team/part"
@@ -50,7 +50,8 @@ def team(rule: Rule, rules: Rules) -> Fate:
         if isinstance(what, acts.Restore):
             resumed.append((robot, what.position))
 
-    world = World(1, elective(2, specs, witnesses=1) if rule is Rule.MAJORITY else pair(specs), (watch,))
+    configs = {Rule.PAIR: pair(specs), Rule.MAJORITY: elective(2, specs, witnesses=1), Rule.ETCD: coordinated(2, specs)}
+    world = World(1, configs[rule], (watch,))
     for name in world.robots:
         world.power_on(name)
     world.run(2_000 * MS)

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, State
 from failover.core.wire.names import weight
 from tests.simulation.invariants import Invariants, seen_at, state_at
-from tests.simulation.teams import elective, pair
+from tests.simulation.teams import elective, pair, ruled
 from tests.simulation.world import World
 
 SPEC = ComponentSpec("/team/part", launch=Launch(("part",)))
@@ -65,7 +65,7 @@ def test_of_simultaneous_claims_the_lesser_name_wins(first: int) -> None:
 @pytest.mark.parametrize("rule", list(Rule))
 def test_robot2_runs_it_and_not_robot10(rule: Rule) -> None:
     names = ("robot10", "robot2") if rule is Rule.PAIR else ("robot10", "robot2", "robot33")
-    configs = [replace(config, rule=rule) for config in pair((SPEC,), names)]
+    configs = ruled(rule, pair((SPEC,), names))
     assert started(1, configs).acting(SPEC.name) == ["robot2"]
 
 
@@ -74,7 +74,7 @@ def test_robot2_runs_it_and_not_robot10(rule: Rule) -> None:
 def test_in_any_order_of_arrival_the_first_that_may_act_stays_and_the_late_comers_protect_it(
     rule: Rule, order: tuple[str, ...]
 ) -> None:
-    world = World(1, [replace(config, rule=rule) for config in pair((SPEC,), tuple(sorted(order)))])
+    world = World(1, ruled(rule, pair((SPEC,), tuple(sorted(order)))))
     first = order[0] if rule is Rule.PAIR else min(order[:2])
     for name in order:
         world.power_on(name)
@@ -124,7 +124,7 @@ def test_a_robot_with_a_new_disk_begins_nothing_afresh_of_which_another_member_k
 @pytest.mark.parametrize("rule", list(Rule))
 def test_the_late_comer_is_the_standby_whatever_its_name(rule: Rule) -> None:
     names = ("robot1", "robot2") if rule is Rule.PAIR else ("robot1", "robot2", "robot3")
-    world = World(1, [replace(config, rule=rule) for config in pair((SPEC,), names)])
+    world = World(1, ruled(rule, pair((SPEC,), names)))
     for name in names[1:]:
         world.power_on(name)
     world.run(3_000 * MS)
