@@ -1,4 +1,4 @@
-"""Writes a small file anew, so that its name stands for the old content or for the new one, and never for a part.
+"""Writes a small file so that its name stands for the whole of a content, old or new, and never for a part.
 
 Also the loop that writes all of a content, for every writer.
 """
@@ -58,6 +58,27 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600, lasts: Lasting
     """
     with written_aside(path, mode=mode, lasts=lasts) as descriptor:
         write_all(descriptor, content)
+
+
+def write_new(path: Path, content: bytes, *, mode: int = 0o600) -> None:
+    """Write a file that must not be there yet; when this returns, a power cut does not take it away.
+
+    Raises:
+        FileExistsError: it is there, and stands.
+        OSError: it cannot be written; nothing is left of it.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    try:
+        try:
+            write_all(descriptor, content)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        sync_directory(path.parent)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise
 
 
 def write_all(descriptor: int, content: bytes | memoryview) -> None:

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from checkpoint.store.whole_file import sync_directory
+from checkpoint.store.whole_file import write_new
 from failover.archive.objects import Readable
 from failover.errors import ArchiveError
 
@@ -52,14 +52,7 @@ def new_key(team: Path) -> Path:
     path = key_path(team)
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb", buffering=0) as file:
-            try:
-                file.write(secrets.token_hex(KEY_SIZE).encode() + b"\n")
-                os.fsync(file.fileno())
-            except OSError:
-                path.unlink()  # a key that is not whole is none
-                raise
-        sync_directory(path.parent)
+        write_new(path, secrets.token_hex(KEY_SIZE).encode() + b"\n")
     except FileExistsError as error:
         raise ArchiveError(
             f"{path} exists, and what was sealed with it can be opened by it alone: move it away first if you want another"

@@ -9,13 +9,12 @@ Source: RFC 8032 (Ed25519).
 from __future__ import annotations
 
 import contextlib
-import os
 from pathlib import Path
 from typing import Any, Final
 
 from blake3 import blake3
 
-from checkpoint.store.whole_file import sync_directory
+from checkpoint.store.whole_file import write_new
 from failover.errors import ArchiveError
 
 PUBLIC_FILE: Final = "archive.public"
@@ -52,11 +51,7 @@ def write_public(team: Path, key: bytes) -> None:
             if path.read_bytes() != text.encode():
                 raise ArchiveError(f"{path} belongs to another archive key: remove it, and give the command again")
             return
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, PUBLIC_MODE), "w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        sync_directory(path.parent)
+        write_new(path, text.encode(), mode=PUBLIC_MODE)
     except OSError as error:
         raise ArchiveError(f"cannot write {path}: {error.strerror}") from error
 

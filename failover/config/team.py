@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from checkpoint.store.whole_file import sync_directory, write_whole
+from checkpoint.store.whole_file import sync_directory, write_new, write_whole
 from failover.config import strict_toml
 from failover.config.board import BoardConfig, as_toml, board_of, text_of_board
 from failover.core.frames.roster import Roster, roster
@@ -270,19 +270,15 @@ def write_secret_key(directory: Path, robot: str, secret: str) -> Path:
         TeamFileError: there is one already, or it cannot be written.
     """
     path = secret_key_path(directory, robot)
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_new(path, f"{secret}\n".encode())
     except FileExistsError as error:
         raise TeamFileError(
             f"{path} exists, and a robot keeps its key: move the file away first if {robot} shall have a new one"
         ) from error
     except OSError as error:
         raise TeamFileError(f"cannot write {path}: {error.strerror}") from error
-    with open(descriptor, "w") as file:
-        file.write(secret + "\n")
-        file.flush()
-        os.fsync(descriptor)
     return path
 
 

@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from checkpoint.store.whole_file import write_new
 from failover.errors import ProgramError
 
 if TYPE_CHECKING:
@@ -33,8 +34,7 @@ def new_pair(path: Path) -> str:
     secret = _ed25519().Ed25519PrivateKey.generate()
     content = secret.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     try:
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb") as file:
-            file.write(content)
+        write_new(path, content)
     except FileExistsError as error:
         raise ProgramError(f"{path} exists, and a key is never overwritten: name another file, or move that one away") from error
     except OSError as error:

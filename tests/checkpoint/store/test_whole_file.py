@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from checkpoint.store import whole_file
-from checkpoint.store.whole_file import Lasting, write_whole, written_aside
+from checkpoint.store.whole_file import Lasting, write_new, write_whole, written_aside
 
 
 @pytest.fixture
@@ -80,3 +81,31 @@ def test_what_lies_aside_is_written_over_but_neither_followed_nor_where_others_w
     with pytest.raises(OSError, match="Too many levels"):
         write_whole(path, b"newer")
     assert not other.exists() and path.read_bytes() == b"new"
+
+
+def test_a_new_file_and_its_name_are_on_the_disk_before_the_writer_returns(tmp_path: Path, calls: list[str]) -> None:
+    path = tmp_path / "key"
+    write_new(path, b"secret", mode=0o640)
+    assert calls == ["write", "fsync", "fsync"] and path.read_bytes() == b"secret"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
+def test_a_new_file_replaces_none(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(b"old")
+    with pytest.raises(FileExistsError):
+        write_new(path, b"new")
+    assert path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("call", ["write", "fsync"])
+def test_of_a_new_file_that_the_disk_does_not_take_nothing_is_left(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(whole_file.os, call, full)
+    with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
+        write_new(tmp_path / "key", b"secret")
+    assert os.listdir(tmp_path) == []
