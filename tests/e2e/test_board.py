@@ -107,7 +107,7 @@ def test_a_program_that_wakes_the_main_loop_all_the_time_costs_it_two_turns_in_e
         while time.monotonic() < begin_s + FLOOD_S:
             file.touch()
         sleeps, passed_s = sleeps_of(pid) - before, time.monotonic() - begin_s
-        usual = 500 * passed_s  # heartbeats and frames of both, and the worker process
+        usual = 1_000 * passed_s  # heartbeats and frames of both, and the worker process, which speaks more on a busy machine
         assert sleeps < 2 * passed_s * 1e9 / URGENT_GAP_NS + usual
         alarm.put(1)
         robots.until(lambda: has(here, "alarm", 1), "an urgent value after the flood")
