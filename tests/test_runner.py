@@ -82,6 +82,7 @@ def test_a_run_ends_as_usual_whatever_its_tests_do(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "2", "-q", "-rf"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    environment["PYTEST_DEBUG_TEMPROOT"] = str(tmp_path)  # ours is open to other users in some tests; pytest closes it
     ran = subprocess.run(
         command, cwd=tmp_path, env=environment | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
     )
