@@ -19,6 +19,7 @@ import msgspec
 
 from agent.coordinator_config import CoordinatorConfig
 from agent.errors import CoordinatorError
+from checkpoint.errors import UNDECODABLE
 from failover.core.election.coordinator import Answer, Grant, KeepAlive, Leased, Put, Request, Swap, Swapped
 
 MS_A_SECOND: Final = 1_000
@@ -58,7 +59,7 @@ class Etcd:
         """
         try:
             return self._answer(request)
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError, AttributeError, OverflowError, *UNDECODABLE) as error:
             raise CoordinatorError(
                 f"{self._endpoints[0]} does not answer as etcd does ({error!r}); check [coordinator]"
             ) from error
@@ -114,7 +115,7 @@ class Etcd:
                 if not error.is_of_the_endpoint:
                     raise CoordinatorError(f"etcd at {self._endpoints[0]} refuses {method}: {error}") from error
                 troubles.append(f"{self._endpoints[0]}: {error}")
-            except (OSError, http.client.HTTPException, msgspec.MsgspecError, ValueError, KeyError) as error:
+            except (OSError, http.client.HTTPException, KeyError, *UNDECODABLE) as error:
                 troubles.append(f"{self._endpoints[0]}: {_words(error)}")
             self.close()
             self._endpoints.append(self._endpoints.pop(0))
@@ -190,7 +191,7 @@ class _RefusedError(Exception):
 
     def __init__(self, status: int, content: bytes) -> None:
         said = content.decode(errors="replace")
-        with contextlib.suppress(msgspec.DecodeError, AttributeError):
+        with contextlib.suppress(AttributeError, *UNDECODABLE):
             said = str(msgspec.json.decode(content).get("error", said))
         super().__init__(f"{said[:BODY_SHOWN].strip()} (status {status})")
         self.is_token = status == UNAUTHORIZED or any(words in said for words in STALE_TOKEN)

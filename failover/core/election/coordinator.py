@@ -23,9 +23,11 @@ from typing import Final
 
 import msgspec
 
+from checkpoint.errors import UNDECODABLE
 from checkpoint.model import Position
 from failover.core.election.consent import STATES, state_of
 from failover.core.types import COORDINATOR, ENDED, HOLDING, MS, Config, State
+from failover.core.wire.codec import is_sound_entry
 from failover.core.wire.messages import FREE, OPEN, ORDERED, RULES, Beat, Echo, Entry
 from failover.errors import RulesError
 
@@ -225,10 +227,10 @@ class Arbiter:
             kind, _, name = key.removeprefix(self._prefix).partition("/")
             try:
                 if kind == "component":
-                    seats[f"/{name}"] = _seat(value), revision
+                    seats[f"/{name}"] = _seat(f"/{name}", value), revision
                 elif kind == "word":
-                    words[name] = msgspec.msgpack.decode(value, type=Word), revision
-            except msgspec.MsgspecError as error:
+                    words[name] = _word(value), revision
+            except UNDECODABLE as error:
                 raise RulesError(f"etcd has something else than failover's in {key} ({error}); delete that key") from error
         self._seats, self._words = seats, words
         alive = self._key("alive", "")
@@ -351,15 +353,28 @@ class Arbiter:
             is_free = self._is_rested and self._freed(component, seat) is not None
             sure = [robot for robot in (seat.primary, seat.standby) if robot]
             flags = FREE * is_free | OPEN * (is_free and self._all_lost(component, sure))
-            yield Entry(component, seat.state, seat.epoch, seat.primary, standby=seat.standby, flags=flags, status=seat.status)
+            yield _told(component, seat, flags)
 
 
-def _seat(value: bytes) -> Seat:
-    """Raises msgspec.MsgspecError: it is none."""
+def _told(component: str, seat: Seat, flags: int = 0) -> Entry:
+    """A seat, as a witness would tell of it."""
+    return Entry(component, seat.state, seat.epoch, seat.primary, standby=seat.standby, flags=flags, status=seat.status)
+
+
+def _seat(component: str, value: bytes) -> Seat:
+    """Raises ValueError or RecursionError: it is none."""
     seat = msgspec.msgpack.decode(value, type=Seat)
-    if not 0 <= seat.state < len(STATES):
-        raise msgspec.ValidationError(f"no state has the number {seat.state}")
+    if not 0 <= seat.state < len(STATES) or not is_sound_entry(_told(component, seat)):
+        raise ValueError("a number or a name in it is none that failover writes")
     return seat
+
+
+def _word(value: bytes) -> Word:
+    """Raises ValueError or RecursionError: it is none."""
+    word = msgspec.msgpack.decode(value, type=Word)
+    if not (word.boot > 0 and word.counter > 0 and all(map(is_sound_entry, word.entries))):
+        raise ValueError("a number or a name in it is none that failover writes")
+    return word
 
 
 def _leased(answer: Answer) -> int:

@@ -61,7 +61,7 @@ def is_sound(beat: Beat) -> bool:
         and beat.counter < NUMBER_MAX
         and 0 <= beat.settled <= beat.counter > 0
         and beat.total >= 0
-        and (not beat.entries or all(_sound_entry(entry) for entry in beat.entries))
+        and (not beat.entries or all(is_sound_entry(entry) for entry in beat.entries))
         and RETURNED <= beat.grace_ms <= GRACE_MS_MAX
         and (not beat.promises or all(_sound_promise(promise) for promise in beat.promises))
     )
@@ -72,7 +72,8 @@ def _sound_promise(promise: Promise) -> bool:
     return is_counted and text_size(promise.robot) <= ROBOT_SIZE_MAX and 0 < promise.ms <= GRACE_MS_MAX
 
 
-def _sound_entry(entry: Entry) -> bool:
+def is_sound_entry(entry: Entry) -> bool:
+    """The same of what a beat says of a component."""
     robots = (entry.primary, entry.standby, entry.yields_to)
     return (
         0 < text_size(entry.name) <= COMPONENT_SIZE_MAX

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import http.client
+import io
 import itertools
 import random
 from typing import TYPE_CHECKING, Any
+from unittest import mock
 
 import msgspec
 
-from tests.fuzz.target import SENTENCES, Decoder, target
+from failover.errors import RulesError
+from tests.fuzz.target import SENTENCES, Decoder, scratch, target
 
 if TYPE_CHECKING:
     from failover.core.types import Rule
@@ -85,15 +90,90 @@ def _after_a_beat(beat: Beat, rule: Rule) -> object:
     from failover.core.node import Node
     from failover.core.types import ComponentSpec, Config, Launch, VoteRecord
     from failover.core.wire.codec import beat_size
+    from tests.simulation.teams import ruled
 
     spec = ComponentSpec("/lab/x", launch=Launch(("x",)))
-    node = Node(Config("robot2", ("robot1", "robot3"), rule=rule), 1, VoteRecord(), 0)
+    (config,) = ruled(rule, [Config("robot2", ("robot1", "robot3"))])
+    node = Node(config, 1, VoteRecord(), 0)
     readies = [node.step(Run(1, spec), 1), node.step(Started(spec.name, 1), 2), node.step(Received(beat), 3)]
     for _ in range(4):
         at_ns = max(node.next_deadline_ns(), 4)
         readies.append(node.step(Tick(), at_ns))
     assert all(beat_size(said) < 64 << 10 for ready in readies for said in ready.send)
     return node.status(at_ns)
+
+
+@target("whatever listens at an endpoint of [coordinator]: its answer", "json")
+def etcd_answer() -> Decoder:
+    from agent.coordinator.etcd import Etcd
+    from agent.coordinator_config import CoordinatorConfig
+    from failover.core.election.coordinator import Grant, KeepAlive, Put, Request, Swap
+
+    def call(content: bytes) -> object:
+        etcd = Etcd(CoordinatorConfig(("http://etcd:2379",)), 1.0)
+        with mock.patch.object(etcd, "_connected") as connected:
+            connected().getresponse().configure_mock(status=http.client.OK, read=io.BytesIO(content).read)
+            return etcd.answer(request_for[b"ID" in content, b"TTL" in content])
+
+    lease, read = {"ID": "7", "TTL": "3"}, {"key": "YQ==", "mod_revision": "5", "value": "YQ=="}
+    done = [{"response_txn": {"succeeded": True}}, {"response_range": {"kvs": [read, {"key": "YQ==", "mod_revision": "5"}]}}]
+    swapped = {"header": {"cluster_id": "1", "revision": "7"}, "succeeded": True, "responses": done}
+    swap = Swap("failover/lab/", (Put("failover/lab/word/r", b"", ()),))
+    request_for: dict[tuple[bool, bool], Request] = {(False, False): swap, (True, False): swap}
+    request_for |= {(False, True): KeepAlive(7), (True, True): Grant(7)}
+    return Decoder([msgspec.json.encode(one) for one in (swapped, lease, {"result": {"TTL": "3"}})], call)
+
+
+@target("who may write below failover/TEAM/ in etcd: a vote, and the word of a robot", "msgpack")
+def etcd_values() -> Decoder:
+    from failover.core.election.consent import STATES
+    from failover.core.election.coordinator import Arbiter, Dialogue, Leased, Seat, Swap, Swapped, Word
+    from failover.core.events import Received, Run, Started, Tick
+    from failover.core.node import Node
+    from failover.core.types import COORDINATOR, MS, ComponentSpec, Config, Launch, Rule, State, VoteRecord
+    from failover.core.wire.codec import beat_size
+    from failover.core.wire.messages import Entry
+    from tests.simulation.teams import ruled
+
+    (config,) = ruled(Rule.ETCD, [Config("robot2", ("robot1",))])
+    spec = ComponentSpec("/lab/x", launch=Launch(("x",)))
+    entries = (
+        Entry(spec.name, STATES.index(State.PRIMARY), 3, "robot1"),
+        Entry("/lab/y", STATES.index(State.FINISHED), 2, "robot1"),
+    )
+    seat, word = msgspec.msgpack.encode(Seat(3, "robot1", "robot2")), msgspec.msgpack.encode(Word(1, 5, entries))
+
+    def call(content: bytes) -> object:
+        whole = {"component/lab/x": seat, "component/lab/y": seat, "word/robot1": word}
+        told = []
+        for key in whole:
+            with contextlib.suppress(*SENTENCES):
+                told.append(heard({**whole, key: content}))
+        if not told:
+            raise RulesError("it is neither a vote nor a word")
+        return told
+
+    def heard(values: dict[str, bytes]) -> object:
+        """What a robot does and says that finds this at etcd, for a second, while robot1 is silent."""
+        arbiter, dialogue = Arbiter(config, "lab"), Dialogue(config)
+        node = Node(config, 1, VoteRecord(), 0)
+        readies = [node.step(Run(1, spec), 1), node.step(Started(spec.name, 1), 2)]
+        for turn in range(1, 9):
+            now_ns = turn * 200 * MS
+            found = {f"failover/lab/{key}": (value, 3) for key, value in values.items()}
+            steps = arbiter.round(node.word())
+            try:
+                request = next(steps)
+                while True:
+                    request = steps.send((Swapped(True, 9, found, 1) if isinstance(request, Swap) else Leased(7), now_ns))
+            except StopIteration as end:
+                if (beat := dialogue.beat(end.value)) is not None:
+                    readies.append(node.step(Received(beat, COORDINATOR, paces=False), now_ns))
+            readies.append(node.step(Tick(), max(now_ns, node.next_deadline_ns())))
+        assert all(beat_size(said) < 64 << 10 for ready in readies for said in ready.send)
+        return node.status(now_ns)
+
+    return Decoder([seat, word], call)
 
 
 @target("a member: a message of the replication link", "msgpack")
@@ -133,6 +213,48 @@ def order_of_a_robot() -> Decoder:
         return found
 
     return Decoder([msgspec.msgpack.encode(one) for one in said], call)
+
+
+@target("a member: what it asks a witness that keeps sealed copies", "msgpack", needs="cryptography")
+def sealed_request() -> Decoder:
+    from agent.worker.network import remote_orders
+    from agent.worker.replication.sealed_copies import SealedCopies
+    from failover.archive import signature
+    from failover.archive.witness import Listed, Put, Read, Remove, Request, Size
+    from failover.core.wire.messages import Errand
+
+    place, key, kept, other = scratch(), bytes(32), "lab/@x/2.base.sealed", "lab/@x/3.base.sealed"
+    (place / kept).parent.mkdir(parents=True)
+    copies = SealedCopies(place, 1 << 20, "gate", lambda: signature.public_of(key))
+
+    def call(content: bytes) -> object:
+        (place / kept).write_bytes(b"sealed")  # a seed has it removed
+        copies.load()
+        return asyncio.run(copies.answer("robot1", remote_orders._arguments(Errand(1, "sealed", content))))
+
+    removes, puts = signature.sign(key, signature.REMOVE, kept), signature.sign(key, signature.PUT, other, 7, bytes(32))
+    requests: list[Request] = [Size(kept), Listed("lab"), Read(kept, 1), Remove(kept, removes), Put(other, 7, bytes(32), puts)]
+    return Decoder([msgspec.msgpack.encode(msgspec.to_builtins(one, builtin_types=(bytes,))) for one in requests], call)
+
+
+@target("a witness that keeps sealed copies: its answer", "msgpack", needs="cryptography")
+def sealed_answer() -> Decoder:
+    from agent.worker.network import remote_orders
+    from failover.archive.witness import Answer, WitnessObjects
+    from failover.core.wire.messages import Errand
+
+    def call(content: bytes) -> object:
+        witness = mock.Mock()
+        witness.ask.return_value = remote_orders._arguments(Errand(1, "sealed", content))
+        objects, name = WitnessObjects(witness, bytes(32)), "lab/@x/1.base.sealed"
+        found: list[object] = [objects.size(name), objects.open(name).read(1 << 20), objects.put(name, empty)]
+        if not witness.ask.return_value.get("more"):
+            found += objects.listed("lab")
+        return found
+
+    empty = (scratch() / "empty").open("w+b")
+    answers = Answer(7), Answer(content=b"sealed"), Answer(found="kept"), Answer(objects=(("lab/@x/1.base.sealed", 7, 1.5),))
+    return Decoder([msgspec.msgpack.encode(msgspec.to_builtins(one, builtin_types=(bytes,))) for one in answers], call)
 
 
 @target("a process of the team, or of this network: tables of names", "msgpack")
