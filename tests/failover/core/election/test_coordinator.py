@@ -333,7 +333,12 @@ def test_a_word_of_a_former_member_is_no_vote() -> None:
     [
         ("component/lab/other", b"\x93\x01"),
         ("component/lab/other", msgspec.msgpack.encode(Seat(1, "robot1", state=99))),
+        ("component/lab/other", msgspec.msgpack.encode(Seat(1 << 40, "robot1"))),
+        ("component/lab/other", msgspec.msgpack.encode(Seat(1, "r" * 64))),
+        ("component/lab/other", b"\x92\x01\xa1\xff"),
         ("word/robot3", b"made by hand"),
+        ("word/robot3", msgspec.msgpack.encode(Word(0, 1))),
+        ("word/robot3", b"\x91" * 5_000),
     ],
 )
 def test_a_key_that_is_not_of_this_program_is_named(key: str, value: bytes) -> None:
