@@ -50,10 +50,16 @@ def team_config(settings: Settings) -> types.Config:
         servers=_members(settings, "server"),
         witnesses=(*_members(settings, "witness"), *etcd),
         patience_ms=config.patience_s * 1_000,
+        copies_ms=config.store.s3_every_s * 1_000 if fetches(settings) else 0,
         boot_patience_ms=config.boot_patience_s * 1_000,
         seat=settings.me.seat,
         restart_grace_ms=_grace_ms(config),
     )
+
+
+def fetches(settings: Settings) -> bool:
+    """Whether this robot takes checkpoints from the archive, of components whose primary it does not hear."""
+    return _rule(settings) is Rule.ETCD and bool(settings.config.store.s3) and settings.me.role == "robot"
 
 
 def declared(settings: Settings, name: str, task: TaskConfig) -> types.ComponentSpec:

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import msgspec
 
 from agent.config import Settings
-from agent.core_config import retention
+from agent.core_config import fetches, retention
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
 from agent.mend import check_agent_stopped, check_right, check_stopped
@@ -53,7 +53,8 @@ def recover(settings: Settings, name: str) -> int:
     check_right(directory)
     key = sealed.read_key(Path(settings.config.team_directory))
     with _objects(settings, key) as objects:
-        return _recover(settings, name, Archive(objects, key, settings.team.team, directory), directory)
+        archive = Archive(objects, key, settings.team.team, directory, by_epoch=fetches(settings))
+        return _recover(settings, name, archive, directory)
 
 
 @contextlib.contextmanager

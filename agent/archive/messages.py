@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from msgspec import Struct
 
+from checkpoint.snapshot.required_files import Need
+from failover.archive.archive import Copy, Label
+
 
 class Look(Struct, frozen=True, tag=True):
     """Which of these contents does the archive lack, or hold harmed? ``digests``: blake3, 32 bytes each."""
@@ -23,6 +26,22 @@ class KeepCheckpoint(Struct, frozen=True, tag=True):
     component: str
 
 
+class ListCopies(Struct, frozen=True, tag=True):
+    """Which copies has the archive?"""
+
+
+class Fetch(Struct, frozen=True, tag=True):
+    """Write a copy to an empty file, whose descriptor comes with this message."""
+
+    copy: Copy
+
+
+class FetchContent(Struct, frozen=True, tag=True):
+    """The same with a file that a program needs."""
+
+    need: Need
+
+
 class Done(Struct, frozen=True, tag=True):
     """The answer to each of them.
 
@@ -30,15 +49,19 @@ class Done(Struct, frozen=True, tag=True):
         refusal: why it could not be done; "" where it is.
         lacking: of the digests that were asked for.
         name, size: of the object.
+        copies: the newest of each component first.
+        label: of the copy.
     """
 
     refusal: str = ""
     lacking: tuple[bytes, ...] = ()
     name: str = ""
     size: int = 0
+    copies: tuple[Copy, ...] = ()
+    label: Label | None = None
 
 
-Request = Look | KeepContent | KeepCheckpoint
+Request = Look | KeepContent | KeepCheckpoint | ListCopies | Fetch | FetchContent
 
 
 class Carry(Struct, frozen=True, tag=True):

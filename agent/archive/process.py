@@ -18,8 +18,20 @@ from typing import Any, BinaryIO, Final
 import msgspec
 
 from agent import config as configuration
-from agent.archive.messages import Carried, Carry, Done, KeepCheckpoint, KeepContent, Look, Request
+from agent.archive.messages import (
+    Carried,
+    Carry,
+    Done,
+    Fetch,
+    FetchContent,
+    KeepCheckpoint,
+    KeepContent,
+    ListCopies,
+    Look,
+    Request,
+)
 from agent.config import Settings
+from agent.core_config import fetches
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.errors import CheckpointError
@@ -95,12 +107,23 @@ class Archivist:
                     name, size = archive.put(checkpoint, self._settings.config.robot, self._spec(request.component))
                 archive.thin(request.component, self._settings.config.store.s3_keep, but=name)
                 return Done(name=name, size=size)
+            case ListCopies():
+                return Done(copies=tuple(archive.copies()))
+            case Fetch(copy):
+                require_room(self._aside, copy.size)
+                with open(descriptors[0], "wb", buffering=0, closefd=False) as file:
+                    return Done(label=archive.fetch(copy, file))
+            case FetchContent(need):
+                require_room(self._aside, need.size)
+                with open(descriptors[0], "wb", buffering=0, closefd=False) as file:
+                    archive.fetch_content(need, file)
+                return Done()
 
     def _opened(self) -> Archive:
         store, team = self._settings.config.store, self._settings.team.team
         key = sealed.read_key(Path(self._settings.config.team_directory))
         objects = WitnessObjects(self._witness, key) if self._witness is not None else object_store(store.s3, store.s3_endpoint)
-        return Archive(objects, key, team, self._aside)
+        return Archive(objects, key, team, self._aside, by_epoch=fetches(self._settings))
 
     @contextlib.contextmanager
     def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:

@@ -42,6 +42,7 @@ ACTS: Final[dict[str, Any]] = {
         acts.Warm,
         acts.Cool,
         acts.Inquire,
+        acts.Look,
         acts.Prune,
         acts.Drop,
         acts.ReportExit,

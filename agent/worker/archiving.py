@@ -12,32 +12,29 @@ import asyncio
 import contextlib
 import logging
 import os
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
-import msgspec
 from msgspec import Struct, field
 
-from agent.archive.messages import Carried, Carry, Done, KeepCheckpoint, KeepContent, Look, Request
+from agent.archive.messages import KeepCheckpoint, KeepContent, Look
 from agent.config import Settings
-from agent.errors import TROUBLE, AgentError
-from agent.worker.components.connection import Dialogue
+from agent.core_config import fetches
+from agent.errors import TROUBLE
+from agent.system import clock
+from agent.worker.archive_process import ArchiveProcess
 from agent.worker.components.snapshots import newest_of
 from agent.worker.replication.send_files import Reader
 from agent.worker.replication.send_sealed import Courier
-from checkpoint.keeper.messages import close_all, pair
+from checkpoint.keeper.messages import close_all
 from checkpoint.model import Position
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
 from failover.archive.sealed import key_path
-from failover.core.events import Event, Noticed
-from failover.core.wire.messages import Content
+from failover.core.events import Archived, Event, Noticed
 
 BEHIND_ROUNDS: Final = 3
 """A copy that is older than so many rounds is told of, also while one is under way."""
@@ -48,19 +45,7 @@ SAID_MAX: Final = 3
 REFUSED_MAX: Final = 3
 """Files of one component that the archive may refuse in one round; then its checkpoint has its turn."""
 
-PATIENCE_S: Final = 600.0
-LEAST_RATE: Final = 100_000
-DIGEST_S: Final = 10.0
-"""How long the process may take for an answer: some time, what it reads and sends at so many bytes each second, each digest."""
-
-END_S: Final = 10.0
-"""How long it may take to end once it is killed."""
-
 log = logging.getLogger("failover.archive")
-
-
-class NotArchivedError(AgentError):
-    """A copy could not be made; says why."""
 
 
 class _Shelf(Struct):
@@ -100,8 +85,7 @@ class Archiving:
         self._settings, self._config = settings, settings.config.store
         self._store, self._running, self._open_need, self._tell = store, running, open_need, tell
         self._shelves: dict[str, _Shelf] = {}
-        self._child: subprocess.Popen[bytes] | None = None
-        self._dialogue: Dialogue | None = None
+        self._process = ArchiveProcess(settings.path, courier)
         self._busy_with = ""
         self._key_file: tuple[int, int] | None = None
 
@@ -116,9 +100,7 @@ class Archiving:
                 self._busy_with = ""
                 await asyncio.sleep(self._config.s3_every_s)
         finally:
-            self._hang_up()
-            if self._child is not None:
-                threading.Thread(target=self._child.wait, daemon=True).start()  # the kernel may hold it: nobody waits for it
+            self._process.close()
 
     async def _look_at_key(self) -> None:
         """With another key all copies are made again: what was sealed before cannot be opened with it."""
@@ -141,9 +123,9 @@ class Archiving:
             since = f"its newest copy is {age_s:.0f} s old" if shelf.position else f"it has had no copy for {age_s:.0f} s"
             is_waiting = self._busy_with not in ("", name)
             why = shelf.trouble or (f"it waits behind {self._busy_with}" if is_waiting else "a copy is on its way")
-            behind.append(
-                f"ARCHIVE BEHIND: {name}: {since}: {why}; it is protected by its standby as before; next try within {every_s} s"
-            )
+            alone = "a robot that does not hear this one would resume from that copy" if fetches(self._settings) else ""
+            stays = alone or "it is protected by its standby as before"
+            behind.append(f"ARCHIVE BEHIND: {name}: {since}: {why}; {stays}; next try within {every_s} s")
         more = len(behind) - SAID_MAX
         return behind[:SAID_MAX] + ([f"ARCHIVE BEHIND: {more} more components"] if more > 0 else [])
 
@@ -172,6 +154,8 @@ class Archiving:
         try:
             if self._courier is not None:
                 self._courier.check_way()
+            if fetches(self._settings) and not self._is_current(name, shelf):  # robots that have the files wait for it
+                await self._copy_checkpoint(name, shelf)
             lacking = await self._copy_files(name, shelf) if self._settings.config.bring else []
             if not self._is_current(name, shelf):
                 await self._copy_checkpoint(name, shelf)
@@ -190,14 +174,16 @@ class Archiving:
 
     async def _copy_checkpoint(self, name: str, shelf: _Shelf) -> None:
         """Raises CheckpointError, AgentError, OSError."""
-        begun_s = time.monotonic()
+        begun_s, begun_ns = time.monotonic(), clock.now_ns()
         chain = tuple(await asyncio.to_thread(self._store.open_chain, name))
         try:
-            position = format.read_header(chain[-1]).position
-            done = await self._ask(KeepCheckpoint(name), chain)
+            header = format.read_header(chain[-1])
+            done = await self._process.ask(KeepCheckpoint(name), chain)
         finally:
             close_all(chain)
-        shelf.position, shelf.since_s = position, begun_s
+        shelf.position, shelf.since_s = header.position, begun_s
+        if fetches(self._settings):
+            self._tell(Archived(name, header.epoch, header.position, begun_ns))
         log.debug("%s is in the archive: %s, %d bytes", name, done.name, done.size)
 
     async def _copy_files(self, name: str, shelf: _Shelf) -> list[str]:
@@ -212,7 +198,7 @@ class Archiving:
         unknown = tuple(digest for digest in wanted if digest and digest not in shelf.has)
         if not unknown:
             return []
-        lacking = (await self._ask(Look(unknown))).lacking
+        lacking = (await self._process.ask(Look(unknown))).lacking
         shelf.has.update(set(unknown) - set(lacking))
         troubles: list[str] = []
         refused = 0
@@ -223,7 +209,7 @@ class Archiving:
                 troubles.append(str(error))
                 continue
             try:
-                await self._ask(KeepContent(digest), (descriptor,))
+                await self._process.ask(KeepContent(digest), (descriptor,))
                 shelf.has.add(digest)
             except TROUBLE as error:
                 troubles.append(f"{wanted[digest].path}: {error}")
@@ -239,74 +225,6 @@ class Archiving:
             log.warning("%s: %s: %s", name, what, trouble)
             self._tell(Noticed(name, f"{what}: {trouble}"))
         shelf.trouble = trouble
-
-    async def _ask(self, request: Request, descriptors: tuple[int, ...] = ()) -> Done:
-        """Have the process do something.
-
-        Raises:
-            AgentError: it cannot be done, or the process ended, or it took too long and was ended.
-        """
-        size = sum(os.fstat(one).st_size for one in descriptors)
-        limit_s = PATIENCE_S + size / LEAST_RATE + (DIGEST_S * len(request.digests) if isinstance(request, Look) else 0.0)
-        dialogue = await self._opened()
-        try:
-            async with asyncio.timeout(limit_s):
-                answer, more = await dialogue.ask(request, descriptors)
-                while isinstance(answer, Carry):
-                    answer, more = await dialogue.ask(await self._carry(answer, more))
-        except TimeoutError as error:
-            self._hang_up()
-            raise NotArchivedError(
-                f"the archive's process did not answer for {limit_s:.0f} s and was ended; see that its place answers"
-            ) from error
-        close_all(more)
-        if not isinstance(answer, Done) or answer.refusal:
-            raise NotArchivedError(answer.refusal)
-        return answer
-
-    async def _carry(self, carry: Carry, descriptors: tuple[int, ...]) -> Carried:
-        """Have the witness do something for the process."""
-        assert self._courier is not None, "the process knows the same settings"
-        try:
-            if carry.arguments:
-                return Carried(answer=msgspec.msgpack.encode(await self._courier.ask(msgspec.msgpack.decode(carry.arguments))))
-            await self._courier.ship(Content(0, carry.size, carry.digest), descriptors[0])
-        except TROUBLE as error:
-            return Carried(str(error))
-        finally:
-            close_all(descriptors)
-        return Carried()
-
-    async def _opened(self) -> Dialogue:
-        """The conversation with the process, which is started if there is none.
-
-        Raises:
-            AgentError: the last one does not end.
-        """
-        if self._dialogue is not None and self._dialogue.open:
-            return self._dialogue
-        self._hang_up()
-        if self._child is not None:
-            try:
-                await asyncio.to_thread(self._child.wait, END_S)
-            except subprocess.TimeoutExpired as error:
-                raise NotArchivedError(
-                    f"the archive's process {self._child.pid} was killed and does not end: the kernel waits for its place; "
-                    "see that the disk or the server of the folder answers"
-                ) from error
-        ours, theirs = pair()
-        with theirs:
-            command = [sys.executable, "-P", "-m", "agent.archive.process", str(self._settings.path), str(theirs.fileno())]
-            self._child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, process_group=0)
-        self._dialogue = Dialogue(ours, Done | Carry, NotArchivedError, "the archive's process")
-        return self._dialogue
-
-    def _hang_up(self) -> None:
-        if self._dialogue is not None:
-            self._dialogue.close()
-            self._dialogue = None
-        if self._child is not None:
-            self._child.kill()
 
 
 def _sign_of(path: Path) -> tuple[int, int] | None:

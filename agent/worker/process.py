@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from agent.config import Settings
-from agent.core_config import retention
+from agent.core_config import fetches, retention
 from agent.errors import TROUBLE, AgentError, GuardLostError, LaneError
 from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.system.crash import end_worker_on_mistake
@@ -57,13 +57,14 @@ from checkpoint.store.xor_cache_budget import PageBudget
 from failover.boards import LINK_NAME
 from failover.config.quantities import size_bytes
 from failover.core import acts, events
-from failover.core.types import HISTORY_MAX, Found, Held
+from failover.core.types import HISTORY_MAX, ComponentSpec, Found, Held
 from failover.core.wire.messages import Belongings, Bulk, Cancel, Chunk, Content, Credit, Lacking, Offer, Refuse, Taken
 from failover.errors import FailoverError
 
 if TYPE_CHECKING:
     from agent.worker.alerts import Alerts
     from agent.worker.archiving import Archiving
+    from agent.worker.fetching import Arrived, Fetching
 
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
@@ -109,6 +110,7 @@ class Worker(Switchboard):
         self.connect(verbs)
         self._alerts: Alerts | None = None
         self._archiving: Archiving | None = None
+        self._fetching: Fetching | None = None
 
     async def prepare(self) -> Inventory:
         """Open the store, find what outlived the last agent."""
@@ -161,6 +163,11 @@ class Worker(Switchboard):
             courier = Courier(self.errands, self._shipper, witness, lambda: self._way_is_shut(witness)) if witness else None
             self._archiving = Archiving(self.settings, store, self._running_here, self._sources.open, self.tell, courier)
             self._task(self._archiving.run())
+        if fetches(self.settings):
+            from agent.worker.fetching import Fetching  # here: with rule = "etcd" and an archive alone
+
+            self._fetching = Fetching(self.settings, store, lambda: self.ask("status"), self.tell, self._arrived)
+            self._task(self._fetching.run())
         found = await self._find_guards(records)
         await self._mend_logs(found)
         if found:
@@ -264,7 +271,11 @@ class Worker(Switchboard):
             case acts.Admit():
                 self._deposit.admit(act)
             case acts.Accept():
-                self._deposit.accept(act)
+                if self._fetching is None or not self._fetching.accepted(act):
+                    self._deposit.accept(act)
+            case acts.Look():
+                if self._fetching is not None:
+                    self._fetching.look()
             case acts.Discard():
                 self._task(self._deposit.discard(act))
             case acts.Show():
@@ -438,11 +449,18 @@ class Worker(Switchboard):
             self._alerts.heard(event)
 
     def _accepted(self, offer: Offer, snapshot: Snapshot) -> None:
-        figures = self.supervisor(offer.component).figures
-        if figures.spec is None:
+        self._stands_by(offer.spec, snapshot, offer.size)
+
+    def _arrived(self, arrived: Arrived) -> None:
+        self._stands_by(arrived.spec, arrived.snapshot, arrived.size)
+
+    def _stands_by(self, spec: ComponentSpec, snapshot: Snapshot, size: int) -> None:
+        """A checkpoint counts as held here."""
+        supervisor = self.supervisor(spec.name)
+        if supervisor.figures.spec is None:
             self._new_here.set()  # the first one of it: look at once whether it could go on here
-        figures.stored(snapshot, offer.size, offer.spec)
-        self.supervisor(offer.component).copy.accepted(snapshot)
+        supervisor.figures.stored(snapshot, size, spec)
+        supervisor.copy.accepted(snapshot)
 
     async def _look_what_is_lacking(self) -> None:
         """Now and then, and when a component is new here: what this robot lacks of what it stands by for, and which files of what
@@ -496,7 +514,8 @@ class Worker(Switchboard):
         """What ``status`` shows."""
         complaints = self._alerts.complaints.values() if self._alerts is not None else ()
         behind = self._archiving.complaints() if self._archiving is not None else ()
-        notices = [*self.notices(), *complaints, *behind, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        absent = self._fetching.complaints() if self._fetching is not None else ()
+        notices = [*self.notices(), *complaints, *behind, *absent, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
         ours = WorkerView(
             links,

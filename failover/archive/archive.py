@@ -98,6 +98,11 @@ class Copy(Struct, frozen=True):
         return self.stamp_ms, self.epoch, self.generation, self.sequence
 
     @property
+    def line(self) -> tuple[int, int, int, int]:
+        """The same where epochs only grow (``rule = "etcd"``): a clock, or a late put, makes no copy newer."""
+        return self.epoch, self.generation, self.sequence, self.stamp_ms
+
+    @property
     def at_s(self) -> float:
         """When it was sealed, seconds since 1970."""
         return self.stamp_ms / 1000
@@ -109,9 +114,11 @@ class Archive:
     Args:
         key: the archive key.
         aside: a folder for files without a name that are sealed, or that arrive.
+        by_epoch: the newest copy is that of the latest epoch, and none of an earlier epoch is put any more.
     """
 
-    def __init__(self, objects: ObjectStore, key: bytes, team: str, aside: Path) -> None:
+    def __init__(self, objects: ObjectStore, key: bytes, team: str, aside: Path, *, by_epoch: bool = False) -> None:
+        self._by_epoch = by_epoch
         self._objects = objects
         self._key = key
         self._team = quote(team, safe="")
@@ -130,13 +137,18 @@ class Archive:
 
         Raises:
             FormatError: it is no whole, unaltered base.
-            ArchiveError: the place does not take it, or gives back something else.
+            ArchiveError: the place does not take it, or gives back something else; another robot has put a later epoch.
             OSError: the disk does not take the sealed copy.
         """
         header = format.verify(checkpoint.fileno())
         if not header.is_base:
             raise FormatError("a delta is not archived: it is no whole checkpoint")
         file, before = file_name(header), self.copies(header.component)
+        if self._by_epoch and before and before[0].epoch > header.epoch:
+            raise ArchiveError(
+                f"the archive has {header.component} in epoch {before[0].epoch}, and this copy has epoch {header.epoch}: another "
+                "robot has run it since; if none has, remove the copies of that epoch"
+            )
         for copy in before:
             if copy.file == file and not self._refusal(copy.name, copy.size):
                 return copy.name, copy.size
@@ -150,7 +162,7 @@ class Archive:
     def _put_now(self, checkpoint: BinaryIO, header: Header, robot: str, spec: bytes, before: list[Copy]) -> tuple[str, int]:
         """Keep a checkpoint as the newest copy, later than those before. Where there is no room, older ones of it go first."""
         now_s = time.time()
-        stamp_ms = min(max([int(1000 * now_s), *(copy.stamp_ms + 1 for copy in before[:1])]), STAMP_MS_MAX)
+        stamp_ms = min(max([int(1000 * now_s), *(copy.stamp_ms + 1 for copy in before)]), STAMP_MS_MAX)
         name = f"{self._team}/{folder_name(header.component)}/{stamp_ms:012x}-{file_name(header)}{SUFFIX}"
         label = msgspec.msgpack.encode(Label(robot, now_s, spec))
         if len(label) > LABEL_SIZE_MAX:
@@ -257,7 +269,7 @@ class Archive:
             is_one = place.startswith(FOLDER_PREFIX) and "/" not in words and words.endswith(BASE_SUFFIX + SUFFIX)
             if is_one and (stamp_ms := _stamp(stamp)) is not None and (order := order_of_name(file)) is not None:
                 found.append(Copy(stored.name, place, file, stamp_ms, *order, stored.size))
-        found.sort(key=lambda copy: copy.order, reverse=True)
+        found.sort(key=lambda copy: copy.line if self._by_epoch else copy.order, reverse=True)
         return sorted(found, key=lambda copy: copy.folder)
 
     def named(self, name: str) -> list[Copy]:

@@ -240,6 +240,13 @@ class Inquire(Struct, frozen=True):
     to: str
 
 
+class Look(Struct, frozen=True):
+    """Look into the archive now, not only when a period is over. → Looked, Fetched, unless the archive does not answer."""
+
+    component: str
+    epoch: int
+
+
 class Prune(Struct, frozen=True):
     """Snapshots that are not needed to restore ``oldest`` or a later position may go."""
 
@@ -307,6 +314,7 @@ Act = (
     | Warm
     | Cool
     | Inquire
+    | Look
     | Prune
     | Drop
     | ReportExit

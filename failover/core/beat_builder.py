@@ -12,6 +12,7 @@ from failover.core.wire.codec import beat_size, entry_size
 from failover.core.wire.messages import (
     BEGUN,
     FREE,
+    FRESH,
     HOLDS,
     NEEDS_BASE,
     OPEN,
@@ -47,7 +48,7 @@ def entry_of(component: Component) -> Entry:
     flags |= WANTS * (component.wanted is not None)
     flags |= STOOD * (component.holding and component.stood)
     flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
-    flags |= BEGUN * component.has_begun
+    flags |= BEGUN * component.has_begun | FRESH * component.fresh
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,

@@ -9,6 +9,7 @@ from failover.core.component import Cause, Component, Turn
 from failover.core.election import majority
 from failover.core.election.pair import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
+from failover.core.replication import archived
 from failover.core.transitions import exits, handover, promotion, restarts
 from failover.core.types import ENDED, MS, State
 
@@ -64,6 +65,7 @@ def _run(component: Component, turn: Turn, command: Run) -> None:
     if refusal:
         turn.order(acts.Answer(command.request, False, refusal))
         return
+    archived.void(component)
     drop(component, turn, "an operator runs it anew")
     component.former = component.spec
     component.spec = replace(command.spec, home=command.spec.home or turn.me)

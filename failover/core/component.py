@@ -171,6 +171,12 @@ class Component(Struct):
         behind_ns: since when this robot would claim it, and a server says that it keeps a newer checkpoint; 0: it does not wait.
         trail: the last acknowledged positions and their parents, for servers (`failover.core.replication.servers`).
             archives: on their way there.
+        fetched_ns: when the checkpoint that came from the archive was put there, by the other clock; -1: none came.
+            looked_ns: all that the archive had at this instant is in this robot's store. freed_ns: since when this
+            robot could take it over, 0: it could not; asked_ns: when it last ordered a look into the archive for that. fresh: it
+            has looked since then, and holds a checkpoint.
+        void: epoch of an end after which it began anew: the archive's copies up to that one are of another life of it.
+        sealed: on a primary, the position of the newest copy in the archive; sealed_ns: when that was taken, -1 if there is none.
         promise: the sentence that the journal has of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
@@ -277,6 +283,14 @@ class Component(Struct):
     trail: deque[tuple[Position, Position | None]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     archives: dict[str, Flight] = field(default_factory=dict)
     archived_ns: int = 0
+    fetched_ns: int = -1
+    looked_ns: int = 0
+    freed_ns: int = 0
+    asked_ns: int = 0
+    fresh: bool = False
+    void: int = 0
+    sealed: Position | None = None
+    sealed_ns: int = -1
     promise: str = ""
 
     @property

@@ -194,6 +194,43 @@ class StoreFailed(Struct, frozen=True):
     needs_base: bool
 
 
+class Looked(Struct, frozen=True):
+    """The archive was asked which copies it has, from ``begun_ns`` on: of each component this robot's store has the newest one.
+
+    Attributes:
+        behind: components of which it has not: one is on its way, or was refused.
+    """
+
+    begun_ns: int
+    behind: tuple[str, ...] = ()
+
+
+class Fetched(Struct, frozen=True):
+    """A checkpoint from the archive, the newest copy that it had at ``begun_ns``, is verified and durable in this robot's store.
+
+    Attributes:
+        epoch: under which it was taken.
+        age_ns: how old the copy is, by the clock of the robot that made it.
+    """
+
+    component: str
+    epoch: int
+    position: Position
+    spec: ComponentSpec
+    begun_ns: int
+    age_ns: int = 0
+    keeps_state: bool = False
+
+
+class Archived(Struct, frozen=True):
+    """The archive has a copy of the component that runs here, as it was at ``begun_ns`` or a moment before."""
+
+    component: str
+    epoch: int
+    position: Position
+    begun_ns: int
+
+
 class Restored(Struct, frozen=True):
     """The act Restore is done: the program runs from ``position``, which was captured ``age_ns`` ago (-1: not known).
 
@@ -382,6 +419,9 @@ Event = (
     | ShipEnded
     | Stored
     | StoreFailed
+    | Looked
+    | Fetched
+    | Archived
     | Restored
     | ActFailed
     | Stopped

@@ -18,6 +18,7 @@ from failover.core.election import lease, majority, pair, votes
 from failover.core.election.coordinator import Word
 from failover.core.events import (
     ActFailed,
+    Archived,
     Captured,
     CaptureFailed,
     Command,
@@ -26,10 +27,12 @@ from failover.core.events import (
     Event,
     Exited,
     Failback,
+    Fetched,
     Handover,
     Inquired,
     Leased,
     Leave,
+    Looked,
     NothingToCapture,
     Noticed,
     Prefer,
@@ -53,7 +56,7 @@ from failover.core.events import (
 )
 from failover.core.membership import Membership
 from failover.core.peer_claims import Testimony
-from failover.core.replication import servers, standby, warm_standby
+from failover.core.replication import archived, servers, standby, warm_standby
 from failover.core.status import guarantee, view
 from failover.core.status.observations import Watch
 from failover.core.transitions import drain, exits, failback, handover, promotion, restarts
@@ -322,8 +325,12 @@ class Node:
         if isinstance(event, Unread):
             self._fail_to_read(event, turn)
             return []
+        if isinstance(event, Looked):
+            for one in self._components.values():
+                archived.looked(one, event)
+            return list(self._components.values())
         name = event.spec.name if isinstance(event, Run) else event.component
-        component = self._known(name) if isinstance(event, Run | Stored) else self._components.get(name)
+        component = self._known(name) if isinstance(event, Run | Stored | Fetched) else self._components.get(name)
         if component is None:
             if isinstance(event, Command):
                 turn.order(
@@ -541,6 +548,10 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             standby.stored(component, turn, event)
         case StoreFailed():
             standby.store_failed(component, turn, event)
+        case Fetched():
+            archived.fetched(component, turn, event)
+        case Archived():
+            archived.archived(component, event)
         case ActFailed():
             exits.failed(component, turn, event)
         case Exited():
@@ -591,6 +602,8 @@ def _review(component: Component, turn: Turn) -> None:
         promotion.advance(component, turn)
     if turn.config.by_majority:
         majority.look(component, turn)
+    if turn.config.copies_ms:
+        archived.review(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
         _review_idle(component, turn)
     standby.show(component, turn)

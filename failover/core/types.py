@@ -293,6 +293,8 @@ class Config(Struct, frozen=True, dict=True):
         witnesses: members, perhaps this one, that only vote.
         patience_ms: under majority, how long the robots that hold all that was acknowledged are waited for before another goes
             on from an older checkpoint.
+        copies_ms: between two copies of a component to the archive, from which robots go on that do not hear its primary; 0: no
+            robot does.
         archive_ms: between two whole checkpoints for a server that does not keep up with the deltas.
         boot_patience_ms: under pair, how long after its own start a robot waits for the robots that ran a component last, or that
             may have taken it over since, before it claims the component without having heard them.
@@ -319,6 +321,7 @@ class Config(Struct, frozen=True, dict=True):
     servers: tuple[str, ...] = ()
     witnesses: tuple[str, ...] = ()
     patience_ms: int = 30_000
+    copies_ms: int = 0
     archive_ms: int = 10_000
     boot_patience_ms: int = 0
     seat: int = -1

@@ -28,7 +28,7 @@ from checkpoint.model import Position
 from failover.core.election.consent import STATES, state_of
 from failover.core.types import COORDINATOR, ENDED, HOLDING, MS, Config, State
 from failover.core.wire.codec import is_sound_entry
-from failover.core.wire.messages import FREE, OPEN, ORDERED, RULES, Beat, Echo, Entry
+from failover.core.wire.messages import FREE, FRESH, OPEN, ORDERED, RULES, Beat, Echo, Entry
 from failover.errors import RulesError
 
 ROUNDS_IN_LEASE: Final = 8
@@ -327,6 +327,8 @@ class Arbiter:
         """Whether nothing that was acknowledged is lost if this robot goes on from its newest checkpoint."""
         sure = [robot for robot in (seat.primary, seat.standby) if robot]
         if STATES[seat.state] in ENDED or self._me in sure or self._all_lost(entry.name, sure):
+            return True
+        if entry.flags & FRESH and seat.standby in ("", self._me):
             return True
         theirs = (self._position_at(entry.name, robot) for robot in sure)
         mine = entry.position

@@ -23,7 +23,7 @@ from failover.core.component import Component, Turn
 from failover.core.election.consent import grants, state_of
 from failover.core.membership import Peer
 from failover.core.types import ENDED, HOLDING, MS, State
-from failover.core.wire.messages import FREE, OPEN, ORDERED, STARTS, Entry
+from failover.core.wire.messages import FREE, FRESH, OPEN, ORDERED, STARTS, Entry
 
 _BOUND = HOLDING | {State.STOPPING}
 """States in which the robot's copy may still be there."""
@@ -64,7 +64,12 @@ def may_follow(component: Component, turn: Turn, sender: str, entry: Entry) -> b
     bound = not (is_free(component, turn) or sender == component.primary or _gives_way(component, turn, sender))
     if bound:
         return elected(component, turn, sender, entry.epoch)
-    return bool(entry.flags & ORDERED) or eligible(component, turn, sender, entry.position)
+    return bool(entry.flags & ORDERED) or _is_fresh(component, sender, entry) or eligible(component, turn, sender, entry.position)
+
+
+def _is_fresh(component: Component, sender: str, entry: Entry) -> bool:
+    """Whether the sender has all that the archive had, and no robot but the old primary may hold more."""
+    return bool(entry.flags & FRESH) and not set(component.entrusted) - {sender}
 
 
 def may_record_end(component: Component, turn: Turn, entry: Entry) -> bool:
@@ -99,7 +104,7 @@ def won(component: Component, turn: Turn) -> bool:
 
 def may_claim(component: Component, turn: Turn, position: Position | None) -> bool:
     """The pre-vote: a majority is free, and would have this robot go on from ``position``."""
-    if not component.free or not (component.open or holds_all(component, turn, turn.me, position)):
+    if not component.free or not (component.open or component.fresh or holds_all(component, turn, turn.me, position)):
         return False
     willing = 1 + sum(_would(component, turn, peer, position) for peer in turn.team.living(turn.now_ns))
     return willing >= turn.config.quorum
@@ -191,7 +196,8 @@ def _would(component: Component, turn: Turn, peer: Peer, position: Position | No
     if entry is None:
         return peer.complete
     sure = tuple(robot for robot in (entry.primary, entry.standby) if robot)
-    return bool(entry.flags & OPEN) or (bool(entry.flags & FREE) and _covers(component, turn, sure, turn.me, position))
+    is_sure = component.fresh or _covers(component, turn, sure, turn.me, position)
+    return bool(entry.flags & OPEN) or (bool(entry.flags & FREE) and is_sure)
 
 
 def _gives_way(component: Component, turn: Turn, robot: str) -> bool:

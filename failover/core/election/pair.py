@@ -175,7 +175,8 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.degraded = component.awaited = ""
     component.undelivered = component.unstored = ""
     component.acked, component.acked_ns, component.resumed_ns, component.lost_ns = None, -1, -1, -1
-    component.safe = component.vouched = component.shown = None
+    component.safe = component.vouched = component.shown = component.sealed = None
+    component.sealed_ns = -1
     component.handing, component.reported = None, False
     component.ending, component.end_signal = False, 0
     component.ordered = False

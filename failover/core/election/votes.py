@@ -26,6 +26,7 @@ from failover.core.election.pair import (
     stronger,
     vacant,
 )
+from failover.core.replication import archived
 from failover.core.types import ENDED, HOLDING, MS, State
 from failover.core.wire.messages import ORDERED, Entry
 from failover.core.wire.names import weight
@@ -41,6 +42,8 @@ def consider(component: Component, turn: Turn) -> None:
     if component.is_exhausted or not turn.config.runs(turn.me) or not vacant(component, turn):
         return
     mine = component.newest
+    if archived.waits(component, turn):
+        return
     if _chosen(component, turn, mine) and majority.may_claim(component, turn, mine):
         claim(component, turn, mine, "no robot runs it, and a majority is free to vote")
 
@@ -200,18 +203,28 @@ def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, thei
     elif entry.epoch > component.epoch and majority.leased(component, turn):
         if component.is_settled and turn.config.runs(sender):
             renew(component, turn, entry.epoch)
-    elif _is_decided(component, turn, entry) or (sender == entry.primary and _prevails(component, turn, sender, entry)):
+    elif _is_decided(component, turn, sender, entry) or (sender == entry.primary and _prevails(component, turn, sender, entry)):
         lose(component, turn, entry.primary, entry)
 
 
-def _is_decided(component: Component, turn: Turn, entry: Entry) -> bool:
+def _is_decided(component: Component, turn: Turn, sender: str, entry: Entry) -> bool:
     elsewhere = entry.primary not in ("", turn.me)
-    return elsewhere and entry.epoch > component.epoch and majority.elected(component, turn, entry.primary, entry.epoch)
+    implied = sender == turn.config.coordinator and _has_an_untold_vote(component, turn, entry)
+    return elsewhere and entry.epoch > component.epoch and majority.elected(component, turn, entry.primary, entry.epoch, implied)
+
+
+def _has_an_untold_vote(component: Component, turn: Turn, seat: Entry) -> bool:
+    """Whether etcd's word tells of one vote more: the robot that has its seat asked for it, and is not heard here."""
+    peer = turn.team.peers.get(seat.primary)
+    if state_of(seat) in ENDED or peer is None or turn.alive(seat.primary):
+        return False
+    told = peer.entry(component.name)  # its last word counts among those that are told
+    return told is None or (told.epoch, told.primary) != (seat.epoch, seat.primary)
 
 
 def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     """A member that does not hold it knows a later epoch than ours."""
-    decided = _is_decided(component, turn, entry)
+    decided = _is_decided(component, turn, sender, entry)
     if component.state is State.CLAIMING:
         if turn.config.runs(sender):
             withdraw(component, turn, f"epoch {entry.epoch} is known already")
@@ -233,6 +246,7 @@ def _needs_the_vote(component: Component, turn: Turn) -> bool:
 
 
 def _adopt(component: Component, turn: Turn, entry: Entry) -> None:
+    archived.void(component)
     accept(component, turn, entry.primary, entry.epoch)
     component.entrusted = (entry.standby,) if entry.standby else ()
     if component.state is State.ABSENT or component.state in ENDED:

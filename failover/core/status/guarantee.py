@@ -88,6 +88,11 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
         return f"If {turn.me} is lost now, so is its state: no robot keeps a checkpoint of it."
     if protection is not Protection.PROTECTED:
         return "If this robot is lost now, the component resumes from its last checkpoint, if there is one."
+    if turn.config.copies_ms and not turn.alive(component.standby):
+        return (
+            f"If {turn.me} is silent and etcd votes for another robot, that one resumes it from its newest copy in the archive; "
+            "the work since then is lost; it stands still here first."
+        )
     if component.waits:
         return f"If {turn.me} is lost, {component.standby} keeps its newest checkpoint until {turn.me} is back."
     if not turn.config.runs(component.standby):

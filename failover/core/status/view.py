@@ -8,7 +8,7 @@ from failover.core.component import Component, Turn
 from failover.core.election import pair
 from failover.core.election.consent import state_of
 from failover.core.peer_claims import Testimony
-from failover.core.replication import standby
+from failover.core.replication import archived, standby
 from failover.core.replication.warm_standby import is_warm
 from failover.core.status import guarantee
 from failover.core.transitions import drain, failback, restarts
@@ -22,6 +22,10 @@ SLOW_FACTOR = 2
 
 STALE_NS = 2 * NS_PER_S
 """An older checkpoint breaks the promise: the protection is degraded while the next one does not arrive."""
+
+
+COPIES_LATE = 3
+"""Periods of the archive: where its copy alone protects a component, an older one degrades the protection."""
 
 
 def status(components: dict[str, Component], turn: Turn, boot: int, testimony: Testimony) -> StatusView:
@@ -47,7 +51,8 @@ def _is_nothing(component: Component) -> bool:
 
 def _component(component: Component, turn: Turn) -> ComponentView:
     protection = _protection(component, turn)
-    lag_ns = turn.now_ns - component.acked_ns if component.acked_ns >= 0 and component.holding else -1
+    acked_ns = archived.sealed_ns(component) if _is_archived_alone(component, turn) else component.acked_ns
+    lag_ns = turn.now_ns - acked_ns if acked_ns >= 0 and component.holding else -1
     return ComponentView(
         component.name,
         component.state,
@@ -88,8 +93,36 @@ def _protection(component: Component, turn: Turn) -> Protection:
         return Protection.NONE
     if component.degraded or _overdue(component, turn):
         return Protection.DEGRADED
+    if component.sealed is not None and not turn.alive(component.standby):
+        is_old = turn.now_ns - archived.sealed_ns(component) > COPIES_LATE * turn.config.copies_ms * MS + STALE_NS
+        return Protection.DEGRADED if is_old else Protection.PROTECTED
     protected = component.acked is not None and component.standby in component.entrusted and turn.alive(component.standby)
     return Protection.PROTECTED if protected else Protection.NONE
+
+
+def _is_archived_alone(component: Component, turn: Turn) -> bool:
+    """Whether the archive alone can protect it: no standby of it is heard, and a robot that etcd votes for would look there."""
+    return turn.config.copies_ms > 0 and component.holding and not turn.alive(component.standby)
+
+
+def _archive_notes(component: Component, turn: Turn) -> list[str]:
+    """How old what the archive has of it is, at its primary; at a robot that took it from there the same."""
+    if _is_archived_alone(component, turn):
+        if component.sealed is None:
+            return ["NOT PROTECTED: no standby of it is heard, and no copy of it is in the archive yet"]
+        age_s = (turn.now_ns - archived.sealed_ns(component)) / NS_PER_S
+        return [f"no standby of it is heard; its newest copy in the archive is {age_s:.0f} s old"]
+    if not turn.config.copies_ms or component.state is not State.STANDBY or turn.alive(component.primary):
+        return []
+    if not component.held:
+        return [f"NOT PROTECTED: {turn.me} does not hear {component.primary}, and no copy of it came from the archive yet"]
+    if component.fetched_ns < 0:
+        return []
+    age_s = (turn.now_ns - component.fetched_ns) / NS_PER_S
+    notes = [f"its checkpoint here came from the archive and is {age_s:.0f} s old"]
+    if component.freed_ns and archived.waits(component, turn):
+        notes.append(f"{turn.me} looks into the archive before it takes it over")
+    return notes
 
 
 def _overdue(component: Component, turn: Turn) -> bool:
@@ -171,6 +204,7 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"nothing to protect yet: {component.awaited}; {_age(component, turn)}")
     elif component.holding and _overdue(component, turn):
         notes.append(f"snapshots do not arrive: {component.undelivered}; {_age(component, turn)}")
+    notes += _archive_notes(component, turn)
     if component.holding and (slow := _slow(component, turn)):
         notes.append(slow)
     if _protection(component, turn) is Protection.NONE and component.holding and (ending := _ending(component, turn)):

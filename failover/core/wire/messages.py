@@ -54,7 +54,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True, gc=False):
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
             ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
             ``SAFE`` (primary: its newest position is acknowledged); ``STOOD`` (primary of a pair); ``FREE``, ``OPEN``,
-            ``STARTS``, ``ORDERED`` (majority); ``BEGUN``.
+            ``STARTS``, ``ORDERED`` (majority); ``BEGUN``; ``FRESH`` (etcd).
         status: of a finished component, waitpid's.
         born: epoch under which the sender's copy was started or restored; 0 does not tell.
     """
@@ -107,6 +107,10 @@ STOOD = 1024
 
 BEGUN = 2048
 """A checkpoint of it was given away in this epoch or an earlier one: a robot that has none does not start it afresh."""
+
+
+FRESH = 4096
+"""The sender holds all that the archive had when the old primary's lease was over: `failover.core.replication.archived`."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):

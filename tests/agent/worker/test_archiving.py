@@ -148,7 +148,7 @@ def test_nothing_is_folded_or_sealed_while_no_copy_can_leave_for_its_witness(tmp
             await until(lambda: "sealed copies wait: wlan0 is the only link" in "".join(archiving.complaints()))
 
         run(one, work)
-        assert archiving._child is None, "the archive's process was not even started"
+        assert archiving._process._child is None, "the archive's process was not even started"
 
 
 def test_a_robot_archives_what_runs_here_and_a_server_all_that_it_keeps(tmp_path: Path) -> None:
@@ -271,15 +271,15 @@ def test_a_process_that_hangs_is_told_and_replaced(tmp_path: Path, monkeypatch: 
 
         async def work() -> None:
             await until(lambda: (shelf := one.archiving._shelves.get(COMPONENT)) is not None and shelf.position is not None)
-            child = one.archiving._child
+            child = one.archiving._process._child
             assert child is not None
             os.kill(child.pid, signal.SIGSTOP)
-            monkeypatch.setattr("agent.worker.archiving.PATIENCE_S", 0.5)
+            monkeypatch.setattr("agent.worker.archive_process.PATIENCE_S", 0.5)
             one.put(history(2)[1])
             await until(lambda: any("s and was ended; see that" in said for said in one.archiving.complaints()))
-            monkeypatch.setattr("agent.worker.archiving.PATIENCE_S", 600.0)
+            monkeypatch.setattr("agent.worker.archive_process.PATIENCE_S", 600.0)
             await until(lambda: one.archived() == [2, 1] and not one.archiving.complaints())
-            assert child.returncode == -signal.SIGKILL and one.archiving._child is not child
+            assert child.returncode == -signal.SIGKILL and one.archiving._process._child is not child
 
         run(one, work)
 
@@ -297,8 +297,8 @@ def test_a_process_that_does_not_end_when_it_is_killed_is_told_and_no_second_one
         started.append(Stuck(["sleep", "1000"]))
         return started[-1]
 
-    monkeypatch.setattr("agent.worker.archiving.subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start}))
-    monkeypatch.setattr("agent.worker.archiving.END_S", 0.1)
+    monkeypatch.setattr("agent.worker.archive_process.subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": start}))
+    monkeypatch.setattr("agent.worker.archive_process.END_S", 0.1)
     with member(tmp_path) as one:
         one.put(history(1)[0])
         one.running.add(COMPONENT)

@@ -1,0 +1,238 @@
+"""Takes checkpoints from the archive (``rule = "etcd"``, ``[store] s3``), of components whose primary this robot does not hear.
+
+Each ``s3_every_s``, and when the core orders a look, the archive's process lists the copies. What is newer than this robot's own
+goes into its store, verified; the core hears of it, and decides (`failover.core.replication.archived`). Nothing waits for it.
+
+Loaded when it is wanted: an agent that takes nothing does not carry it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import logging
+import os
+import time
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from agent.archive.messages import Fetch, FetchContent, ListCopies
+from agent.config import Settings
+from agent.errors import TROUBLE
+from agent.main_loop.messages import Told
+from agent.system import clock
+from agent.worker.archive_process import LEAST_RATE, ArchiveProcess, NotArchivedError
+from agent.worker.replication.receive_files import is_in_place
+from checkpoint.engine import COOPERATIVE
+from checkpoint.errors import UNDECODABLE
+from checkpoint.model import Position, Snapshot
+from checkpoint.snapshot import format
+from checkpoint.snapshot.required_files import needs
+from checkpoint.store.contract import SnapshotStore
+from failover.archive.archive import Copy, Label
+from failover.core.acts import Accept
+from failover.core.events import Event, Fetched, Looked, Noticed
+from failover.core.types import ComponentSpec, State, StatusView
+
+ANSWER_S: Final = 30.0
+"""For a list, and for a copy besides its bytes; the start of the process on a busy machine is in it."""
+
+PAUSE_ROUNDS: Final = 10
+"""Before a copy that was refused is tried again."""
+
+TRIES_MAX: Final = 3
+"""Copies of one component in one round: where the newest is harmed, the one before it may be newer than ours."""
+
+_IDLE: Final = (State.ABSENT, State.STANDBY)
+
+log = logging.getLogger("failover.archive")
+
+Line = tuple[int, int]
+
+
+class Arrived(Struct, frozen=True):
+    """A checkpoint that the core has not accepted yet."""
+
+    spec: ComponentSpec
+    snapshot: Snapshot
+    size: int
+
+
+class Fetching:
+    """What one robot takes from the archive. Lives in the worker's loop."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: SnapshotStore,
+        told: Callable[[], Awaitable[Told]],
+        tell: Callable[[Event], None],
+        kept: Callable[[Arrived], None],
+    ) -> None:
+        """
+        Args:
+            told: the core's view of the team.
+            kept: called with a checkpoint once the core has accepted it.
+        """
+        self._settings, self._store = settings, store
+        self._told, self._tell, self._kept = told, tell, kept
+        self._process = ArchiveProcess(settings.path)
+        self._rounds = itertools.count()
+        self._ordered = asyncio.Event()
+        self._fetched: dict[str, Position] = {}
+        self._seen: dict[str, tuple[int, Line]] = {}
+        self._refused: dict[str, int] = {}
+        self._troubles: dict[str, str] = {}
+        self._silent = ""
+        self._answered_s = time.monotonic()
+        self._arrived: dict[tuple[str, Position], Arrived] = {}
+
+    async def run(self) -> None:
+        """Take copies until cancelled."""
+        try:
+            while True:
+                await self._round(next(self._rounds))
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._ordered.wait(), self._settings.config.store.s3_every_s)
+                self._ordered.clear()
+        finally:
+            self._process.close()
+
+    def look(self) -> None:
+        """The core orders a look: it does not wait for the next period."""
+        self._ordered.set()
+
+    def accepted(self, act: Accept) -> bool:
+        """The core counts a checkpoint as held here; False if it did not come from the archive."""
+        arrived = self._arrived.pop((act.component, act.position), None)
+        if arrived is not None:
+            self._kept(arrived)
+        return arrived is not None
+
+    def complaints(self) -> list[str]:
+        """For the status: why this robot does not have what the archive has."""
+        if self._silent:
+            since_s = time.monotonic() - self._answered_s
+            return [f"the archive has not answered for {since_s:.0f} s: no checkpoints come from there: {self._silent}"]
+        return list(self._troubles.values())
+
+    async def _round(self, number: int) -> None:
+        begun_ns = clock.now_ns()
+        try:
+            copies = (await self._process.ask(ListCopies(), limit_s=ANSWER_S)).copies
+            view = (await self._told()).status
+        except TROUBLE as error:
+            if not self._silent:
+                self._tell(Noticed("", f"the archive does not answer: {error}"))
+            self._silent = str(error)
+            return
+        if self._silent:
+            self._tell(Noticed("", "the archive answers again"))
+        self._silent, self._answered_s = "", time.monotonic()
+        wanted: dict[str, list[Copy]] = {}
+        for folder, group in itertools.groupby(copies, key=lambda copy: copy.folder):
+            found = list(group)
+            self._look_for_a_rollback(found[0])
+            if not _takes(found[0].component, view):
+                self._fetched.pop(folder, None)
+            elif newer := [copy for copy in found if self._is_newer(copy)]:
+                wanted[found[0].component] = newer[:TRIES_MAX]
+        self._tell(Looked(begun_ns, tuple(wanted)))
+        for name, newer in wanted.items():
+            await self._fetch(name, newer, begun_ns, number)
+
+    def _look_for_a_rollback(self, newest: Copy) -> None:
+        """An archive that has only older copies than it had is told of; what this robot holds is newer, and stays."""
+        name, line = newest.component, (newest.epoch, (newest.generation, newest.sequence))
+        had = self._seen.get(newest.folder, line)
+        self._seen[newest.folder] = max(had, line)
+        if line < had:
+            self._troubles[name] = (
+                f"{name}: the archive has lost copies, or was rolled back: its newest is number {newest.sequence} of epoch "
+                f"{newest.epoch}, and it had number {had[1][1]} of epoch {had[0]}; nothing older is taken from it"
+            )
+        elif "rolled back" in self._troubles.get(name, ""):
+            del self._troubles[name]
+
+    def _is_newer(self, copy: Copy) -> bool:
+        known = (self._store.newest(copy.component), self._fetched.get(copy.folder))
+        ours = max(((one.generation, one.sequence) for one in known if one is not None), default=(0, 0))
+        return (copy.generation, copy.sequence) > ours
+
+    async def _fetch(self, name: str, newer: list[Copy], begun_ns: int, number: int) -> None:
+        """Take the newest copy that is whole; never raises."""
+        for copy in newer:
+            if self._refused.get(copy.name, 0) > number:
+                continue
+            try:
+                await self._take(copy, begun_ns)
+            except TROUBLE as error:
+                self._refused[copy.name] = number + PAUSE_ROUNDS
+                if name not in self._troubles:
+                    self._tell(Noticed(name, f"a copy in the archive was not taken: {error}"))
+                self._troubles[name] = f"{name}: a copy in the archive was not taken, the checkpoint before it stays: {error}"
+            else:
+                if copy is newer[0]:
+                    self._troubles.pop(name, None)
+                    self._refused.clear()
+                return
+
+    async def _take(self, copy: Copy, begun_ns: int) -> None:
+        """Raises CheckpointError, AgentError, FailoverError, OSError."""
+        await asyncio.to_thread(self._store.make_room, copy.size)
+        descriptor = await asyncio.to_thread(self._store.unnamed)
+        try:
+            label = (await self._process.ask(Fetch(copy), (descriptor,), limit_s=ANSWER_S + copy.size / LEAST_RATE)).label
+            spec = _spec(copy, label)
+            header = format.read_header(descriptor)
+            await self._bring(descriptor)
+            snapshot = await asyncio.to_thread(self._store.put, descriptor)
+        finally:
+            os.close(descriptor)
+        self._fetched[copy.folder] = header.position
+        self._arrived = {key: one for key, one in self._arrived.items() if key[0] != header.component}
+        self._arrived[header.component, header.position] = Arrived(spec, snapshot, copy.size)
+        age_ns = max(time.time_ns() - copy.stamp_ms * 1_000_000, 0)
+        keeps_state = snapshot.engine == COOPERATIVE
+        self._tell(Fetched(header.component, header.epoch, header.position, spec, begun_ns, age_ns, keeps_state))
+
+    async def _bring(self, descriptor: int) -> None:
+        """The files that the program needs and this robot lacks, as far as the archive has them; the status tells the rest."""
+        if not self._settings.config.bring:
+            return
+        outline = await asyncio.to_thread(format.read_outline, descriptor)
+        contents = self._store.contents
+        for need in needs(outline):
+            if not need.digest or await asyncio.to_thread(is_in_place, need) or contents.hold(need.digest, need.size):
+                continue
+            file = await asyncio.to_thread(self._store.unnamed)
+            try:
+                await self._process.ask(FetchContent(need), (file,), limit_s=ANSWER_S + need.size / LEAST_RATE)
+                await asyncio.to_thread(contents.put, file, need.digest)
+            except TROUBLE as error:
+                log.warning("a file that a program needs did not come from the archive: %s", error)
+            finally:
+                os.close(file)
+
+
+def _takes(name: str, view: StatusView | None) -> bool:
+    """Whether this robot may have to run a component whose primary it does not hear."""
+    known = next((one for one in view.components if one.name == name), None) if view is not None else None
+    if known is None or view is None:
+        return view is not None
+    is_heard = any(peer.robot == known.primary and peer.state in ("alive", "suspect", "restarting") for peer in view.peers)
+    return known.state in _IDLE and not is_heard
+
+
+def _spec(copy: Copy, label: Label | None) -> ComponentSpec:
+    """Raises NotArchivedError."""
+    try:
+        if label is not None and label.spec:
+            return msgspec.msgpack.decode(label.spec, type=ComponentSpec)
+    except UNDECODABLE as error:
+        raise NotArchivedError(f"{copy.name} has a specification that this version of failover cannot read: {error}") from error
+    raise NotArchivedError(f"{copy.name} does not say how the program is started: it was archived before that was on record")

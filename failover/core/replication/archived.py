@@ -1,0 +1,119 @@
+"""Checkpoints from the archive, for robots that do not hear the primary: with ``rule = "etcd"`` and ``[store] s3``.
+
+The worker of such a robot copies the newest checkpoint from the archive into this robot's store, in advance; here is when that
+counts. Invariants:
+
+* A robot takes nothing from the archive of a component that it runs, whose primary it hears, or that has ended.
+* A checkpoint from there never takes the place of a later one.
+* Once etcd would vote for another robot, this robot looks into the archive again before it claims the component. What was put
+  there before is in its store then, and it claims without the wait for the old primary (``fresh``). Where the archive does not
+  answer, that wait (``patience_ms``) is the limit.
+* A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
+"""
+
+from __future__ import annotations
+
+from checkpoint.model import Position
+from failover.core import acts
+from failover.core.component import Component, Turn
+from failover.core.events import Archived, Fetched, Looked
+from failover.core.types import MS, PEERS_MAX, State
+from failover.core.wire.messages import FREE
+
+KEPT = 2
+"""Checkpoints from the archive, each a whole one."""
+
+_IDLE = frozenset({State.ABSENT, State.STANDBY})
+
+HEARD_LATELY = 4
+"""Loyalties: a standby that heard its primary until then waits for the archive no longer than for one try."""
+
+
+def fetched(component: Component, turn: Turn, event: Fetched) -> None:
+    """A checkpoint of the archive is durable in our store: stand by with it, or forget it again."""
+    component.seen, component.looked_ns = max(component.seen, event.epoch), max(component.looked_ns, event.begun_ns)
+    if event.position in component.held:
+        return
+    if not _takes(component, turn, event.position):
+        turn.order(acts.Discard(component.name, component.epoch, event.position))
+        return
+    component.held = [*component.held, event.position][-KEPT:]
+    component.spec, component.keeps_state = event.spec, event.keeps_state
+    component.stored_ns = turn.now_ns
+    component.fetched_ns = max(turn.now_ns - event.age_ns, 0)
+    component.unable, component.tries, component.unstored = "", 0, ""
+    turn.order(acts.Accept(component.name, component.epoch, event.position))
+    turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
+    turn.say(component, f"{turn.me} has its checkpoint {event.position.sequence} from the archive")
+
+
+def _takes(component: Component, turn: Turn, position: Position) -> bool:
+    newest = component.held[-1] if component.held else None
+    is_late = position.generation in component.lost or position.generation // (PEERS_MAX + 1) <= component.void
+    is_ours_alone = component.state in _IDLE and not turn.alive(component.primary)
+    return is_ours_alone and not is_late and (newest is None or newest < position)
+
+
+def looked(component: Component, event: Looked) -> None:
+    """All that the archive had of this component when that look began is in our store."""
+    if component.name not in event.behind:
+        component.looked_ns = max(component.looked_ns, event.begun_ns)
+
+
+def archived(component: Component, event: Archived) -> None:
+    """A copy of what runs here is in the archive, as it was at that instant or a moment before."""
+    if event.epoch == component.epoch and component.holding:
+        component.sealed, component.sealed_ns = event.position, event.begun_ns
+
+
+def sealed_ns(component: Component) -> int:
+    """When the state was taken of which the archive has a copy; -1: it has none of this primacy."""
+    is_as_it_was = component.sealed is not None and component.sealed == component.acked
+    return max(component.sealed_ns, component.acked_ns) if is_as_it_was else component.sealed_ns
+
+
+def void(component: Component) -> None:
+    """It begins anew after an end: what the archive has of it up to that end is another life of it."""
+    if component.state in (State.FINISHED, State.RELEASED):
+        component.void = max(component.void, component.epoch)
+
+
+def review(component: Component, turn: Turn) -> None:
+    """Note since when a takeover is possible, and have the archive looked into since then."""
+    if component.state is State.CLAIMING:
+        return
+    if component.state not in _IDLE or not component.free or not _would_coordinator(component, turn):
+        component.freed_ns, component.fresh = 0, False
+        return
+    component.freed_ns = component.freed_ns or turn.now_ns
+    has_looked = component.looked_ns >= component.freed_ns
+    component.fresh = has_looked and bool(component.held) and not (set(component.entrusted) - {turn.me})
+    if not has_looked and turn.now_ns >= component.asked_ns + turn.config.retry_ms * MS:
+        component.asked_ns = turn.now_ns
+        turn.order(acts.Look(component.name, component.epoch))
+
+
+def _would_coordinator(component: Component, turn: Turn) -> bool:
+    """Whether etcd, if it is heard, is bound to no primary of the component."""
+    if not turn.alive(turn.config.coordinator):
+        return True
+    entry = turn.team.peers[turn.config.coordinator].entry(component.name)
+    return entry is None or bool(entry.flags & FREE)
+
+
+def waits(component: Component, turn: Turn) -> bool:
+    """Whether this robot looks into the archive before it claims the component."""
+    if not turn.config.copies_ms or 0 < component.freed_ns <= component.looked_ns:
+        return False
+    if component.newest is None:
+        return component.epoch > 0
+    if component.primary == turn.me:
+        return False
+    return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
+
+
+def _limit_ns(component: Component, turn: Turn) -> int:
+    peer = turn.team.peers.get(component.primary)
+    lately_ns = component.freed_ns - HEARD_LATELY * turn.config.loyalty_ns
+    is_standby = turn.me in component.entrusted and peer is not None and peer.boot > 0 and peer.heard_ns >= lately_ns
+    return (turn.config.retry_ms if is_standby else turn.config.patience_ms) * MS
