@@ -11,7 +11,7 @@ from failover.core import beat_builder
 from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Restart, Rule, Rules, WhenAlone
 from tests.simulation import planned
-from tests.simulation.coordinator import Coordination, Fault
+from tests.simulation.coordinator import Fault
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
@@ -65,6 +65,9 @@ COORDINATED = (2, 2, 2, 4, 3)
 DEAF_LIVES = 0.3
 """Of their lives: those in which they hear each other no more from some instant on, until all is healed."""
 
+COPIES_MS = 200
+"""Between two copies to the archive, in every second of these lives."""
+
 LIE_NS = 300 * MS
 """After so long, on the average, a liar says something else."""
 
@@ -103,6 +106,8 @@ def life(
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
     if etcd:
         configs = coordinated(COORDINATED[seed // HARSH % len(COORDINATED)], specs, 150 if seed % HARSH else LONG_LEASE_MS)
+        if seed % 2:
+            configs = [replace(config, copies_ms=COPIES_MS) for config in configs]
     narrow = NARROW_BEAT_SIZE + ECHO_SIZE * (len(configs) - 2)
     size_max = beat_size_max if seed % NARROW else lambda _: narrow
     if restarts:
@@ -129,7 +134,8 @@ def _live(
         world.at(random.randrange(trouble_ns), Trouble(world, invariants, random, specs, endless=faults > 0))
     planned.beside_faults(world, Random(seed ^ 0x9E57A27), restarts, trouble_ns)
     if world.coordination is not None:
-        _trouble_etcd(world, world.coordination, Random(seed ^ 0xE7CD), trouble_ns, faults)
+        faulty = world.coordination.faults() + (2 * world.archive.faults() if world.archive is not None else ())
+        _trouble_etcd(world, faulty, Random(seed ^ 0xE7CD), trouble_ns, faults)
     if liars:
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3:
@@ -172,15 +178,15 @@ def _make_harsh(world: World) -> None:
         robot.slow, robot.clock.rate = 1, 1 + DRIFT_MAX * (1 if place else -1)
 
 
-def _trouble_etcd(world: World, etcd: Coordination, random: Random, until_ns: int, faults: int) -> None:
-    """Faults of etcd, half of them where something acts; some while the robots do not hear each other, or never do."""
+def _trouble_etcd(world: World, faulty: tuple[Fault, ...], random: Random, until_ns: int, faults: int) -> None:
+    """Faults of etcd and of the archive, half where something acts; some while robots do not hear each other, or never do."""
     names, specs = list(world.robots), [spec.name for spec in next(iter(world.robots.values())).config.components]
     ways = {(one, other) for one in names for other in names if one != other}
     if random.random() < DEAF_LIVES:
         world.at(random.choice((0, random.randrange(until_ns // 2))), lambda: world.network.cuts.update(ways))
     for _ in range(faults or random.randrange(2, 12)):
         fault, name, for_ns = (
-            random.choice(etcd.faults()),
+            random.choice(faulty),
             random.choice(names),
             random.choice(PAUSES_MS) * MS + random.randrange(2),
         )
@@ -229,6 +235,8 @@ def _heal(world: World) -> None:
     world.network.heal()
     if world.coordination is not None:
         world.coordination.heal()
+    if world.archive is not None:
+        world.archive.heal()
     for name, robot in world.robots.items():
         robot.slow, robot.broken_store, robot.lie = 1, False, None
         world.power_on(name)

@@ -80,6 +80,9 @@ class Deeds:
                 self._warm(robot, act)
             case acts.Inquire():
                 self._inquire(robot, act)
+            case acts.Look():
+                if self._world.archive is not None:
+                    self._world.archive.look(robot)
             case acts.Answer():
                 self._world.note(f"{robot.name} answers: {'; '.join((act.sentence, *act.risks))}")
 

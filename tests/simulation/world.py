@@ -23,6 +23,7 @@ from failover.core.node import Node
 from failover.core.types import MS, Config, Found, Held
 from failover.core.vote_record import decode, encode
 from failover.core.wire.messages import Beat
+from tests.simulation.archive import SimulatedArchive
 from tests.simulation.coordinator import Coordination
 from tests.simulation.deeds import Deeds
 from tests.simulation.liars import fitting
@@ -73,8 +74,12 @@ class World:
                 1 + self.random.choice((-1, 1, -1, 1, self.random.uniform(-1, 1))) * drift, self.random.randrange(10**15)
             )
             self.robots[config.robot] = Robot(config.robot, config, clock)
+        self.archive: SimulatedArchive | None = None
         if configs[0].coordinator:
             self.coordination = Coordination(self, self.random)
+        if configs[0].copies_ms:
+            self.archive = SimulatedArchive(self, Random(seed ^ 0xA5C4))
+            self.archive.begin()
 
     # Time
 
