@@ -107,9 +107,14 @@ def waits(component: Component, turn: Turn) -> bool:
         return False
     if component.newest is None:
         return component.epoch > 0
-    if component.primary == turn.me:
+    if component.primary == turn.me and is_own(component, turn):
         return False
     return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
+
+
+def is_own(component: Component, turn: Turn) -> bool:
+    """Whether the newest checkpoint here was taken here: of this robot's own primacy."""
+    return component.newest is not None and component.newest.generation % (PEERS_MAX + 1) == turn.config.place
 
 
 def _limit_ns(component: Component, turn: Turn) -> int:

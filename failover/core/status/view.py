@@ -116,7 +116,7 @@ def _archive_notes(component: Component, turn: Turn) -> list[str]:
         return []
     if not component.held:
         return [f"NOT PROTECTED: {turn.me} does not hear {component.primary}, and no copy of it came from the archive yet"]
-    if component.fetched_ns < 0:
+    if component.fetched_ns < 0 or archived.is_own(component, turn):
         return []
     age_s = (turn.now_ns - component.fetched_ns) / NS_PER_S
     notes = [f"its checkpoint here came from the archive and is {age_s:.0f} s old"]

@@ -9,7 +9,7 @@ from failover.core.election.consent import STATES
 from failover.core.events import Event, Fetched, Looked, Received, Tick
 from failover.core.node import Node
 from failover.core.types import COORDINATOR, MS, PEERS_MAX, ComponentSpec, Config, Launch, Rule, State, VoteRecord
-from failover.core.wire.messages import FREE, FRESH, RULES, Beat, Echo, Entry
+from failover.core.wire.messages import FREE, FRESH, OPEN, RULES, Beat, Echo, Entry
 
 NAME = "/lab/robot1/mapper"
 SPEC = ComponentSpec(NAME, "robot1", Launch(("mapper",)))
@@ -23,12 +23,12 @@ def position(epoch: int, sequence: int) -> Position:
 
 
 class Lonely:
-    """robot2, and etcd's word about the component: robot1 runs it in this epoch, or is silent (``is_free``)."""
+    """robot2, and etcd's word about the component: robot1 runs it in this epoch, or is silent (``flags``)."""
 
     def __init__(self, config: Config = CONFIG) -> None:
         self.now_ns = 0
-        self.epoch, self.is_free, self.state = 1, False, State.STANDBY
-        self.counter = 0
+        self.epoch, self.flags, self.state = 1, 0, State.STANDBY
+        self.counter, self.standby = 0, ""
         self.node = Node(config, 1, VoteRecord(), 0)
         self.acts: list[acts.Act] = []
         self.live(5_000)
@@ -43,7 +43,7 @@ class Lonely:
             self.now_ns += 20 * MS
             self.step(Tick())
             self.counter += 1
-            seat = Entry(NAME, STATES.index(self.state), self.epoch, "robot1", flags=FREE * self.is_free)
+            seat = Entry(NAME, STATES.index(self.state), self.epoch, "robot1", standby=self.standby, flags=self.flags)
             echo = Echo("robot2", 1, self.node.word().counter)
             rule = RULES.index(Rule.ETCD)
             self.step(
@@ -58,8 +58,9 @@ class Lonely:
         return next((one.positions for one in self.node.status(self.now_ns).components), ())
 
     def claims(self) -> bool:
+        """Whether it claims it, or has done so in vain."""
         entry = self.node.word().entry(NAME)
-        return entry is not None and STATES[entry.state] is State.CLAIMING
+        return entry is not None and entry.primary == "robot2"
 
     def looks(self) -> bool:
         return any(isinstance(act, acts.Look) for act in self.acts)
@@ -91,7 +92,7 @@ def test_it_looks_into_the_archive_once_more_and_then_claims_without_waiting_for
     robot.fetched(1, 5)
     robot.live(100)
     robot.step(Looked(robot.now_ns))
-    robot.is_free = True
+    robot.flags = FREE
     robot.live(500)
     assert robot.looks() and not robot.claims(), "what it had looked at before may be old"
     robot.step(Looked(robot.now_ns, (NAME,)))
@@ -108,16 +109,36 @@ def test_where_the_archive_does_not_answer_it_waits_for_the_patience_and_no_long
     robot = Lonely()
     robot.fetched(1, 5)
     robot.live(100)
-    robot.is_free = True
+    robot.flags = FREE
     robot.live(50_000)
     assert not robot.claims()
+    robot.flags = FREE | OPEN
+    robot.live(12_000)
+    assert robot.claims()
+
+
+def test_a_standby_that_heard_its_primary_waits_for_no_patience_once_it_has_looked() -> None:
+    """etcd names it as the standby: it has all that was acknowledged, and the archive may still have more."""
+    robot = Lonely()
+    robot.standby = "robot2"
+    robot.fetched(1, 5)
+    robot.live(100)
+    robot.flags = FREE
+    robot.live(5_000)
+    assert not robot.claims(), "it did not hear its primary lately: the archive may have something newer"
+    robot.step(Looked(robot.now_ns))
+    robot.live(100)
+    assert robot.claims()
 
 
 def test_what_ran_elsewhere_does_not_begin_anew_before_the_archive_has_answered() -> None:
     declared = Lonely(Config(**{name: getattr(CONFIG, name) for name in CONFIG.__struct_fields__} | {"components": (SPEC,)}))
-    declared.is_free = True
+    declared.flags = FREE | OPEN
     declared.live(100_000)
     assert not declared.claims()
+    declared.step(Looked(declared.now_ns))
+    declared.live(100)
+    assert declared.claims()
 
 
 def test_copies_of_a_life_that_has_ended_count_no_more_once_it_begins_anew() -> None:
