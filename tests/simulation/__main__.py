@@ -28,7 +28,12 @@ def main() -> int:
     each = FAULTS_A_LIFE if arguments.faults else 0
     began, broken, faults = time.monotonic(), 0, 0
     for seed, (happened, story) in _played(
-        range(arguments.first, arguments.first + lives), each, arguments.jobs, liars=arguments.liars, etcd=arguments.etcd
+        range(arguments.first, arguments.first + lives),
+        each,
+        arguments.jobs,
+        liars=arguments.liars,
+        etcd=arguments.etcd,
+        apart=arguments.apart,
     ):
         faults += happened
         if story:
@@ -40,10 +45,10 @@ def main() -> int:
     return 1 if broken else 0
 
 
-def play(seed: int, faults: int, liars: bool = False, etcd: bool = False) -> tuple[int, str]:
+def play(seed: int, faults: int, liars: bool = False, etcd: bool = False, apart: bool = False) -> tuple[int, str]:
     """One life: how many faults there were, and the story if it broke a promise."""
     try:
-        return life(seed, faults=faults, liars=liars, etcd=etcd).faults, ""
+        return life(seed, faults=faults, liars=liars, etcd=etcd, apart=apart).faults, ""
     except AssertionError as story:
         return 0, str(story) or repr(story)
 
@@ -67,12 +72,14 @@ def _play_restarts(count: int, first: int) -> int:
     return 0
 
 
-def _played(seeds: range, faults: int, jobs: int, *, liars: bool, etcd: bool) -> Iterator[tuple[int, tuple[int, str]]]:
+def _played(
+    seeds: range, faults: int, jobs: int, *, liars: bool, etcd: bool, apart: bool
+) -> Iterator[tuple[int, tuple[int, str]]]:
     if jobs == 1:
-        yield from ((seed, play(seed, faults, liars, etcd)) for seed in seeds)
+        yield from ((seed, play(seed, faults, liars, etcd, apart)) for seed in seeds)
         return
     with ProcessPoolExecutor(jobs) as pool:
-        fixed = (itertools.repeat(value) for value in (faults, liars, etcd))
+        fixed = (itertools.repeat(value) for value in (faults, liars, etcd, apart))
         yield from zip(seeds, pool.map(play, seeds, *fixed, chunksize=8), strict=True)
 
 
@@ -86,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--restarts", type=int, default=0, help="instead: lives with planned restarts, until there were as many")
     parser.add_argument("--liars", action="store_true", help="an attacker lies by the key of a member of a team that votes")
     parser.add_argument("--etcd", action="store_true", help="robots that decide by the rule etcd, and an etcd with faults")
+    parser.add_argument("--apart", action="store_true", help="such robots that never hear each other, and an archive with faults")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first that breaks")
     return parser

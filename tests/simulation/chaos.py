@@ -83,6 +83,7 @@ def life(
     *,
     liars: bool = False,
     etcd: bool = False,
+    apart: bool = False,
     restart: Restart = Restart.UNDECLARED,
     restarts: int = 0,
 ) -> World:
@@ -95,6 +96,7 @@ def life(
         restarts: of agents, planned, at random instants; a life is as long as they take at least.
         liars: an attacker has the key of a member, and lies by it until the world is healed.
         etcd: the robots decide by the rule ``etcd``, and etcd has faults, too.
+        apart: the same, and until all is healed they never hear each other: they have but etcd, and an archive with faults.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
@@ -104,20 +106,28 @@ def life(
     configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
-    if etcd:
+    if etcd or apart:
         configs = coordinated(COORDINATED[seed // HARSH % len(COORDINATED)], specs, 150 if seed % HARSH else LONG_LEASE_MS)
-        if seed % 2:
+        if seed % 2 or apart:
             configs = [replace(config, copies_ms=COPIES_MS) for config in configs]
     narrow = NARROW_BEAT_SIZE + ECHO_SIZE * (len(configs) - 2)
     size_max = beat_size_max if seed % NARROW else lambda _: narrow
     if restarts:
         configs = planned.with_grace(configs)
     with patch.object(beat_builder, "beat_size_max", size_max):
-        return _live(seed, random, configs, specs, faults, restarts, liars=liars)
+        return _live(seed, random, configs, specs, faults, restarts, liars=liars, apart=apart)
 
 
 def _live(
-    seed: int, random: Random, configs: list[Config], specs: tuple[ComponentSpec, ...], faults: int, restarts: int, *, liars: bool
+    seed: int,
+    random: Random,
+    configs: list[Config],
+    specs: tuple[ComponentSpec, ...],
+    faults: int,
+    restarts: int,
+    *,
+    liars: bool,
+    apart: bool,
 ) -> World:
     votes = configs[0].rule is not Rule.PAIR
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
@@ -135,7 +145,7 @@ def _live(
     planned.beside_faults(world, Random(seed ^ 0x9E57A27), restarts, trouble_ns)
     if world.coordination is not None:
         faulty = world.coordination.faults() + (2 * world.archive.faults() if world.archive is not None else ())
-        _trouble_etcd(world, faulty, Random(seed ^ 0xE7CD), trouble_ns, faults)
+        _trouble_etcd(world, faulty, Random(seed ^ 0xE7CD), trouble_ns, faults, apart=apart)
     if liars:
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3:
@@ -178,12 +188,13 @@ def _make_harsh(world: World) -> None:
         robot.slow, robot.clock.rate = 1, 1 + DRIFT_MAX * (1 if place else -1)
 
 
-def _trouble_etcd(world: World, faulty: tuple[Fault, ...], random: Random, until_ns: int, faults: int) -> None:
+def _trouble_etcd(world: World, faulty: tuple[Fault, ...], random: Random, until_ns: int, faults: int, *, apart: bool) -> None:
     """Faults of etcd and of the archive, half where something acts; some while robots do not hear each other, or never do."""
     names, specs = list(world.robots), [spec.name for spec in next(iter(world.robots.values())).config.components]
     ways = {(one, other) for one in names for other in names if one != other}
-    if random.random() < DEAF_LIVES:
-        world.at(random.choice((0, random.randrange(until_ns // 2))), lambda: world.network.cuts.update(ways))
+    if random.random() < DEAF_LIVES or apart:
+        at_ns = random.choice((0, random.randrange(until_ns // 2)))
+        world.at(0 if apart else at_ns, lambda: world.network.cuts.update(ways))
     for _ in range(faults or random.randrange(2, 12)):
         fault, name, for_ns = (
             random.choice(faulty),
