@@ -128,8 +128,8 @@ class Lives:
         apart.acts_more(self._site, PATIENCE_S)
 
         def is_settled() -> bool:
-            ours, theirs = robots.component(self._robot, NAME), robots.component(self._other, NAME)
-            return theirs.get("role") == "standby" and theirs.get("generation") == ours.get("generation")
+            epoch = robots.component(self._robot, NAME).get("epoch")
+            return apart.role(self._other) == "standby" and apart.held_epoch(self._other) == epoch
 
         robots.until(is_settled, f"{self._other.name} to hold a copy of what {self._runs} runs", PATIENCE_S)
 

@@ -46,11 +46,8 @@ def test_a_robot_resumes_from_the_archive_what_one_ran_that_it_never_hears(tmp_p
 
         first = site.boot("robot1")
         robots.until(lambda: apart.role(first) == "standby", "the robot that is back to follow")
-        lines = robots.component(second, NAME)
-        robots.until(
-            lambda: (robots.component(first, NAME).get("generation") or 0) == robots.component(second, NAME)["generation"],
-            f"a copy of the other's epoch {lines['epoch']} at the robot that is back",
-        )
+        epoch = robots.component(second, NAME)["epoch"]
+        robots.until(lambda: apart.held_epoch(first) == epoch, "a copy of the other's epoch at the robot that is back")
         second.cut_power()
         robots.until_taken_over(first, NAME)
         acts = apart.acts_more(site)
