@@ -146,7 +146,7 @@ class _Follower:
 
 
 def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> str:
-    """Return when another robot holds a checkpoint of a component, and which; tell meanwhile how far that is.
+    """Return when another robot, or the archive, holds a checkpoint of a component, and which; tell meanwhile how far that is.
 
     Raises:
         FailoverError: the component has ended, or cannot be protected.
@@ -160,7 +160,7 @@ def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> str
             if one["state"] in ENDED:
                 raise FailoverError(f"{name} is {one['state']}: it will not be protected; see failover why {name}")
             if one["protection"] == "protected":
-                return str(one["standby"])
+                return str(one["standby"]) or "the archive"
             if one["protection"] == "stopped":
                 why = "; ".join(one["reasons"]) or "on_unsupported = stop_protecting"
                 raise FailoverError(f"{name} runs and stays unprotected: {why}")
