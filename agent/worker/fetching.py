@@ -90,6 +90,7 @@ class Fetching:
         self._silent = ""
         self._answered_s = time.monotonic()
         self._arrived: dict[tuple[str, Position], Arrived] = {}
+        self._given: set[str] = set()
 
     async def run(self) -> None:
         """Take copies until cancelled."""
@@ -109,9 +110,15 @@ class Fetching:
     def accepted(self, act: Accept) -> bool:
         """The core counts a checkpoint as held here; False if it did not come from the archive."""
         arrived = self._arrived.pop((act.component, act.position), None)
+        self._given.discard(act.component)
         if arrived is not None:
+            self._given.add(act.component)
             self._kept(arrived)
         return arrived is not None
+
+    def gave(self, component: str) -> bool:
+        """Whether the newest checkpoint of a component came from the archive: no silence of a robot says how old it is."""
+        return component in self._given
 
     def complaints(self) -> list[str]:
         """For the status: why this robot does not have what the archive has."""

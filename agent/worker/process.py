@@ -504,7 +504,7 @@ class Worker(Switchboard):
     async def _silence_ns(self, component: str) -> int:
         """For how long the robot that last sent this component's snapshots has been silent; 0 if there is none."""
         sender = self._deposit.last_sender(component)
-        if not sender:
+        if not sender or (self._fetching is not None and self._fetching.gave(component)):
             return 0
         told = await self.ask("status")
         peers = told.status.peers if told.status else ()
