@@ -355,8 +355,23 @@ class Settings:
         return self.team.robots[self.config.robot]
 
     @property
+    def near(self) -> dict[str, Robot]:
+        """The members of this robot's site, itself among them, by name: no decision knows any other member."""
+        return self.team.at_site(self.me.site)
+
+    @property
     def peers(self) -> Mapping[str, Robot]:
-        """All members but this one, by name."""
+        """The same without this robot."""
+        return {name: robot for name, robot in self.near.items() if name != self.config.robot}
+
+    @property
+    def far(self) -> Mapping[str, Robot]:
+        """The members of other sites, by name: they are connected to, and have no part in any decision here."""
+        return {name: robot for name, robot in self.team.robots.items() if robot.site != self.me.site}
+
+    @property
+    def others(self) -> Mapping[str, Robot]:
+        """All members of the team but this one, by name."""
         return {name: robot for name, robot in self.team.robots.items() if name != self.config.robot}
 
     @property
@@ -399,8 +414,9 @@ def load(path: Path) -> Settings:
     except FailoverError as error:
         raise ConfigError(str(error)) from error
     _check_keys(path, config, members)
-    _check_rule(path, config, members)
-    _check_components(path, config, members)
+    site = members.at_site(members.robots[config.robot].site)
+    _check_rule(path, config, site)
+    _check_components(path, config, site)
     _check_tasks(path, config, members)
     _check_alerts(path, config, members)
     _check_archive(path, config, members)
@@ -417,8 +433,9 @@ def check_team(settings: Settings, team: Team) -> None:
     if config.robot not in team.robots:
         return
     _check_keys(path, config, team)
-    _check_rule(path, config, team)
-    _check_components(path, config, team)
+    site = team.at_site(team.robots[config.robot].site)
+    _check_rule(path, config, site)
+    _check_components(path, config, site)
     _check_archive(path, config, team)
 
 
@@ -432,19 +449,19 @@ def _check_keys(path: Path, config: Config, members: Team) -> None:
         )
 
 
-def _check_rule(path: Path, config: Config, members: Team) -> None:
-    """Servers and witnesses are there to vote."""
-    voters = sorted(name for name, member in members.robots.items() if member.role != "robot")
-    by_pair = config.rule == "pair" or (config.rule == "auto" and len(members.robots) <= 2)
-    if voters and by_pair:
+def _check_rule(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
+    """Servers and witnesses are there to vote; a witness that has a site of its own keeps sealed copies alone."""
+    voters = sorted(name for name, member in site.items() if member.role != "robot")
+    by_pair = config.rule == "pair" or (config.rule == "auto" and len(site) <= 2)
+    if voters and by_pair and not (len(site) == 1 and site[voters[0]].site):
         raise ConfigError(f'{path}: {", ".join(voters)} would have no vote; set rule = "majority" on every member of the team')
     if config.rule == "etcd":
-        _check_etcd(path, config, members)
+        _check_etcd(path, config, site)
     elif config.coordinator.endpoints:
         raise ConfigError(f'{path}: [coordinator] has no effect without rule = "etcd"; set that on every member, or remove it')
 
 
-def _check_etcd(path: Path, config: Config, members: Team) -> None:
+def _check_etcd(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
     """etcd's leases count in seconds, and its place among the members is taken by no other."""
     if not config.coordinator.endpoints:
         raise ConfigError(f'{path}: rule = "etcd" needs to know where etcd is; add [coordinator] {EXAMPLE}')
@@ -453,13 +470,13 @@ def _check_etcd(path: Path, config: Config, members: Team) -> None:
             f'{path}: lease_ms is {config.lease_ms}; leases at etcd last for seconds: with rule = "etcd" give at least '
             f"{ETCD_LEASE_MS_MIN}, such as lease_ms = {ETCD_LEASE_MS}"
         )
-    if COORDINATOR in members.robots:
+    if COORDINATOR in site:
         raise ConfigError(
             f'{path}: a member has the name {COORDINATOR}, which means etcd with rule = "etcd"; give it another one'
         )
 
 
-def _check_components(path: Path, config: Config, members: Team) -> None:
+def _check_components(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
     """Refuse a table for a name that no component can have, or a robot that the team does not know: it would have no effect."""
     for name, component in config.components.items():
         where = f"{path}:{strict_toml.line_of(path.read_text(), ('components', name))}"
@@ -467,8 +484,8 @@ def _check_components(path: Path, config: Config, members: Team) -> None:
             check_component(name)
         except NameFormatError as error:
             raise ConfigError(f"{where}: {error}") from error
-        _check_choice(where, "prefer", component.prefer, members, {"robot"})
-        _check_choice(where, "standby", component.standby, members, {"robot", "server"})
+        _check_choice(where, "prefer", component.prefer, site, {"robot"})
+        _check_choice(where, "standby", component.standby, site, {"robot", "server"})
         if not 0 <= component.snapshot_period_ms <= PERIOD_MS_MAX:
             raise ConfigError(
                 f"{where}: snapshot_period_ms is {component.snapshot_period_ms}; at most {PERIOD_MS_MAX}; 0 means the agent's own"
@@ -563,14 +580,14 @@ def _uid_of(user: str) -> int:
     return account_of(user).pw_uid
 
 
-def _check_choice(where: str, key: str, chosen: str, members: Team, roles: set[str]) -> None:
+def _check_choice(where: str, key: str, chosen: str, site: Mapping[str, Robot], roles: set[str]) -> None:
     """A member that only votes, or only keeps checkpoints, cannot be chosen for a task that it never does."""
-    if chosen and chosen not in members.robots:
-        raise ConfigError(f"{where}: {key} = {chosen!r}: the team knows {', '.join(sorted(members.robots))}")
-    if chosen and members.robots[chosen].role not in roles:
-        able = ", ".join(sorted(name for name, member in members.robots.items() if member.role in roles)) or "members to enrol"
+    if chosen and chosen not in site:
+        raise ConfigError(f"{where}: {key} = {chosen!r}: the team knows {', '.join(sorted(site))} at this site")
+    if chosen and site[chosen].role not in roles:
+        able = ", ".join(sorted(name for name, member in site.items() if member.role in roles)) or "members to enrol"
         what = "runs nothing" if key == "prefer" else "keeps no checkpoints"
-        raise ConfigError(f"{where}: {key} = {chosen!r}: it is a {members.robots[chosen].role} and {what}; choose among {able}")
+        raise ConfigError(f"{where}: {key} = {chosen!r}: it is a {site[chosen].role} and {what}; choose among {able}")
 
 
 def _check_devices(where: str, component: ComponentConfig) -> None:

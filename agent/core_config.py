@@ -116,12 +116,12 @@ def _grace_ms(config: Config) -> int:
 
 def _rule(settings: Settings) -> Rule:
     if settings.config.rule == "auto":
-        return Rule.MAJORITY if len(settings.team.robots) > 2 else Rule.PAIR
+        return Rule.MAJORITY if len(settings.near) > 2 else Rule.PAIR
     return Rule(settings.config.rule)
 
 
 def _members(settings: Settings, role: str) -> tuple[str, ...]:
-    return tuple(sorted(name for name, member in settings.team.robots.items() if member.role == role))
+    return tuple(sorted(name for name, member in settings.near.items() if member.role == role))
 
 
 def rules_for(config: Config, component: ComponentConfig) -> Rules:

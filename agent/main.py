@@ -61,8 +61,9 @@ def main(arguments: list[str] | None = None) -> int:
         if command == "check":
             _check_pair(settings)
             _check_rights(Path(settings.config.team_directory))
-            peers = ", ".join(settings.peers) or "none"
-            print(f"{config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}")
+            peers, far = ", ".join(settings.peers) or "none", ", ".join(settings.far)
+            other_sites = f"; at other sites: {far}" if far else ""
+            print(f"{config}: robot {settings.config.robot} of team {settings.team.team}; peers: {peers}{other_sites}")
             return 0
         return _run(settings)
     except (AgentError, FailoverError) as error:
@@ -131,7 +132,9 @@ def _check_rights(directory: Path) -> None:
 
 def _run(settings: configuration.Settings) -> int:
     from agent.main_loop.loop import beat
+    from agent.worker import known_sites
 
+    known_sites.check(settings)
     set_up_log(settings.config.log_level, settings.config.robot)
     syscalls.small_stacks()
     if settings.config.insecure:

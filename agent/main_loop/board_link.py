@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -97,8 +97,11 @@ class BoardLink:
         self._primaries = primaries
 
     @classmethod
-    def open(cls, place: Path, round_ns: int) -> BoardLink:
+    def open(cls, place: Path, round_ns: int, far: Container[str] = ()) -> BoardLink:
         """The board that the worker process has made.
+
+        Args:
+            far: robots of other sites: the worker writes their files.
 
         Raises:
             BoardError, OSError: there is none.
@@ -110,7 +113,8 @@ class BoardLink:
             except OSError as error:
                 log.warning("items of uid %d are not sent: %s", uid, error)
         prefix = directory.PEER_PREFIX
-        peers = {path.name.removeprefix(prefix): ReceivedItems.open(path) for path in sorted(place.glob(f"{prefix}*"))}
+        named = {path.name.removeprefix(prefix): path for path in sorted(place.glob(f"{prefix}*"))}
+        peers = {name: ReceivedItems.open(path) for name, path in named.items() if name not in far}
         agents = Primaries.open(place) if (place / directory.AGENT_NAME).exists() else None
         return cls(own, peers, round_ns, agents, owners)
 

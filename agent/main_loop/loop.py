@@ -139,7 +139,7 @@ class MainLoop:
         self._record_file = record_file
         self._notifier = notifier
         self._beats = BeatLane(settings.me, settings.peers, settings.team.team)
-        has_board, members = bool(settings.team.board.items), settings.team.roster()
+        has_board, members = bool(settings.team.board.items), settings.team.roster_of_site(settings.me.site)
         self._frames = FrameLanes(self._lanes_for(members))
         self._media = Media(settings, self._beats, self._frames, members)
         self._links: tuple[LinkNow, ...] = ()
@@ -271,7 +271,9 @@ class MainLoop:
         from failover.boards.directory import agents_place
 
         try:
-            self._board = BoardLink.open(agents_place(self._settings.team.team, self._me), self._media.round_ns)
+            self._board = BoardLink.open(
+                agents_place(self._settings.team.team, self._me), self._media.round_ns, self._settings.far
+            )
         except (FailoverError, OSError) as error:
             log.warning("frames carry no items: %s", error)  # the worker says in status why there is no board
             return
@@ -567,7 +569,7 @@ class MainLoop:
             if self._board is not None:
                 self._open_board()  # the worker has looked at each file, and made anew what a user had damaged
             return  # other keys of the connections, which are the worker's
-        members = settings.team.roster()
+        members = settings.team.roster_of_site(settings.me.site)
         self._beats.know(settings.peers)
         self._frames.change(members, self._lanes_for(members))
         self._media = Media(settings, self._beats, self._frames, members)

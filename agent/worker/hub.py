@@ -44,24 +44,25 @@ from agent.system import syscalls
 from agent.system.crash import end_worker_on_mistake
 from agent.system.log_setup import set_up_log
 from agent.system.systemd_units import is_restarted, starter
+from agent.worker import known_sites
 from agent.worker.control.queries import QUESTIONS, Questions
 from agent.worker.control.rights_gate import RightsGate
 from agent.worker.control.server import ControlServer
 from agent.worker.network.connections import BULK, AllConnections, keys_of
 from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Link, Links, Medium
-from agent.worker.network.remote_orders import Errands, OrderOfPeer
+from agent.worker.network.remote_orders import ITEMS, SEALED, Errands, OrderOfPeer
 from agent.worker.network.replication_link import LinkState
 from agent.worker.team_changes import TEAM_IS, TEAM_TOLD, TeamChanges, digest
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError
 from checkpoint.runtime import allocator
 from failover.client.control import SOCKET_NAME
-from failover.config.team import Team
+from failover.config.team import Team, sites_digest
 from failover.core import acts, events
 from failover.core.events import Event
 from failover.core.frames.frame import KEY_SIZE_MIN
-from failover.core.wire.messages import VERSION, Bulk, Errand, ErrandDone, Goodbye, Hello
+from failover.core.wire.messages import VERSION, Belongings, Bulk, Content, Errand, ErrandDone, Goodbye, Hello, Offer, Refuse
 
 ALIVE_S: Final = 0.5
 """Between two signs of life to the main loop."""
@@ -80,6 +81,10 @@ SIGN_S: Final = 1.0
 UNFIT_KEY: Final = (
     "this robot's secret key does not belong to its public key in team.toml: no other robot accepts it; failover team enrol "
     "makes a fresh pair"
+)
+
+OTHER_SITE: Final = (
+    "{} is a member of another site: orders and snapshots do not leave a site; give the order at a robot of this one"
 )
 
 log = logging.getLogger("failover.lanes")
@@ -132,6 +137,10 @@ class Switchboard:
     async def take_team(self, team: Team) -> None:
         """Go on with these members: the main loop's frames and rules, and every connection."""
         self.settings = self.settings.with_team(team)
+        try:
+            await asyncio.to_thread(known_sites.note, self.settings)
+        except AgentError as error:
+            log.warning("%s", error)
         await self.prepare_team()
         self._say(TeamIs(dict(team.robots)))
         await self._connect_anew()
@@ -365,9 +374,10 @@ class Switchboard:
         return self._connections.hindrance(peer)
 
     def _hear(self, way: int, peer: str, message: Bulk) -> None:
-        if peer not in self.settings.peers:
+        if peer not in self.settings.others:
             self._hear_former(peer, message)
             return
+        is_far = peer in self.settings.far
         match message:
             case Hello():
                 self._greeted(way, peer, message)
@@ -379,6 +389,12 @@ class Switchboard:
                 self._connections.say(
                     peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders")
                 )
+            case Errand(verb=verb) if is_far and verb not in (*QUESTIONS, *self.team_changes.orders(), SEALED, ITEMS):
+                self._connections.say(peer, ErrandDone(message.number, b"", OTHER_SITE.format(peer)))
+            case Offer() if is_far:
+                self._connections.say(peer, Refuse(message.transfer, OTHER_SITE.format(peer)))
+            case Belongings() | Content() if is_far and self.settings.me.role != "witness":
+                return  # a witness keeps sealed copies of other sites, too
             case Errand():
                 self.errands.received(peer, message)
             case ErrandDone():
@@ -404,6 +420,12 @@ class Switchboard:
             reason = f"{peer} speaks version {hello.version}, this robot {VERSION}; install the same release on both"
         elif hello.team != self.settings.team.team:
             reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
+        elif self._knows_other_sites(hello):
+            reason = (
+                f"{peer} has another team.toml than this robot, both of change {hello.change}, and the team has sites: copy the "
+                "one that is right to every member, and restart their agents; until then these two count no heartbeat of each "
+                "other"
+            )
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
         if way == BULK and not hello.again:
@@ -416,10 +438,16 @@ class Switchboard:
             return
         self._incompatible.pop(peer, None)
         self.team_changes.heard(peer, hello.change, hello.members)
-        self._say(HearKey(peer, hello.beat_key))
+        if peer in self.settings.peers:
+            self._say(HearKey(peer, hello.beat_key))
         if self._connections.is_new_key(way, peer, hello.beat_key) and self._connections.present_key(peer):
             # A robot that lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
             self._greet(way, peer, self._connections.present_key(peer), again=True)
+
+    def _knows_other_sites(self, hello: Hello) -> bool:
+        """Robots that disagree about sites would count different majorities."""
+        team = self.settings.team
+        return hello.change == team.change and hello.members != digest(team.robots) and bool(sites_digest(team))
 
     def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
         config, team = self.settings.config, self.settings.team

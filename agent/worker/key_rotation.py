@@ -114,7 +114,7 @@ class KeyRotation:
         Raises:
             RefusedError: the file cannot be written, or a member is not reached with the new key.
         """
-        reached = [peer for peer in self._lines.settings.peers if not self._lines.hindrance(peer)]
+        reached = [peer for peer in self._lines.settings.others if not self._lines.hindrance(peer)]
         await asyncio.to_thread(_kept, team_file.use_next_key, self._directory, self._me)
         await self._lines.take_secret(secret)
         for peer in reached:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from agent.config import Settings
 from agent.core_config import fetches, retention
-from agent.errors import TROUBLE, AgentError, GuardLostError, LaneError
+from agent.errors import TROUBLE, AgentError, GuardLostError, LaneError, RefusedError
 from agent.main_loop.messages import Inventory, Told, ToWorker
 from agent.system.crash import end_worker_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
@@ -36,6 +36,7 @@ from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.control.verbs import Verbs
 from agent.worker.hub import Switchboard, live, make_directory
+from agent.worker.network.remote_orders import ITEMS
 from agent.worker.replication.receive_files import Limits, Stock
 from agent.worker.replication.receive_snapshots import Deposit
 from agent.worker.replication.send_files import Bringing, Sources
@@ -64,6 +65,7 @@ from failover.errors import FailoverError
 if TYPE_CHECKING:
     from agent.worker.alerts import Alerts
     from agent.worker.archiving import Archiving
+    from agent.worker.far_items import FarItems
     from agent.worker.fetching import Arrived, Fetching
 
 BYTES_A_MEGABIT: Final = 125_000
@@ -107,7 +109,8 @@ class Worker(Switchboard):
         self._shipper = Shipper(self._replication_link, config.link_mbit_s * BYTES_A_MEGABIT)
         verbs = Verbs(self, self.gate)
         self._reservations = verbs.reservations
-        self.connect(verbs)
+        self._far_items: FarItems | None = None
+        self.connect(verbs, {ITEMS: self._asked_for_items})
         self._alerts: Alerts | None = None
         self._archiving: Archiving | None = None
         self._fetching: Fetching | None = None
@@ -146,6 +149,7 @@ class Worker(Switchboard):
             from agent.worker.kept_items import Keeper  # here: a team without a board does not load it
 
             self._task(Keeper(self._board_place, Path(self.settings.config.state_directory)).watch())
+        self._exchange_far_items()
         if self.settings.me.role == "robot":
             self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
@@ -178,6 +182,30 @@ class Worker(Switchboard):
         """See `agent.worker.hub.Switchboard.prepare_team`: a file of the board for each member."""
         if self._board_place is not None:
             await self._provide_board()
+        self._exchange_far_items()
+
+    def _exchange_far_items(self) -> None:
+        """Have the items of other sites, and let them have ours; a robot that knows no other site loads nothing for that."""
+        place = self._board_place
+        if place is None or (self._far_items is None and not self.settings.far):
+            return
+        try:
+            if self._far_items is not None:
+                self._far_items.open(place)
+                return
+            from agent.worker.far_items import FarItems
+
+            self._far_items = FarItems(self, place, self._life.boot)
+        except (FailoverError, OSError) as error:
+            log.warning("no items of other sites: %s", error)
+            self._board_troubles.append(f"items of other sites cannot be had: {error}")
+        else:
+            self._task(self._far_items.run())
+
+    async def _asked_for_items(self, peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        if self._far_items is None:
+            raise RefusedError(f"{self.settings.config.robot} has no board, or knows no other site")
+        return await self._far_items.told(peer, arguments)
 
     def notices(self) -> list[str]:
         """See `agent.worker.hub.Switchboard.notices`; besides which users have damaged their files of the board."""
@@ -248,6 +276,8 @@ class Worker(Switchboard):
     async def close(self) -> None:
         """Let another life have the store."""
         await self._process_pool.close()
+        if self._far_items is not None:
+            self._far_items.close()
         self._store.close()
 
     async def _open_store(self) -> SnapshotStore:
@@ -515,7 +545,9 @@ class Worker(Switchboard):
         complaints = self._alerts.complaints.values() if self._alerts is not None else ()
         behind = self._archiving.complaints() if self._archiving is not None else ()
         absent = self._fetching.complaints() if self._fetching is not None else ()
-        notices = [*self.notices(), *complaints, *behind, *absent, *self._lost(), *self._around.store.notices[-NOTICES_SHOWN:]]
+        far = self._far_items.notes() if self._far_items is not None else ()
+        told = (*far, *complaints, *behind, *absent, *self._lost())
+        notices = [*self.notices(), *told, *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
         ours = WorkerView(
             links,
@@ -526,6 +558,7 @@ class Worker(Switchboard):
             self._memory(),
             self._arriving,
             self._archiving.sealed if self._archiving is not None else lambda _: None,
+            self._far_items.heard_ms if self._far_items is not None else lambda _: None,
         )
         return team_view(self.settings, self._life, told, ours)
 

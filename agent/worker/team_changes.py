@@ -151,7 +151,7 @@ class TeamChanges:
 
     async def _tell_who_is_behind(self) -> None:
         settings = self._lines.settings
-        known = {*settings.peers, *settings.former}
+        known = {*settings.others, *settings.former}
         self._behind = {peer: change for peer, change in self._behind.items() if peer in known}
         there = [peer for peer in self._behind if not self._lines.hindrance(peer)]
         await asyncio.gather(*(self._told(peer, settings.team) for peer in there))
@@ -216,7 +216,7 @@ class TeamChanges:
             RefusedError: nothing has changed.
         """
         settings = self._lines.settings
-        peers = list(settings.peers)
+        peers = list(settings.others)
         is_written = False
         try:
             granted_ns = await self._be_granted(before, after, removed)
@@ -258,7 +258,7 @@ class TeamChanges:
         if refusal := self._grants.ask(before.change, before.change, me, asked_ns, digest(after.robots)):
             raise RefusedError(f"cannot change the team at {me}: {refusal}")
         lives = bool(removed) and await self._may_live(removed)
-        others = [peer for peer in self._lines.settings.peers if peer != removed or lives]
+        others = [peer for peer in self._lines.settings.others if peer != removed or lives]
         answers = dict(zip(others, await asyncio.gather(*(self._asked(peer, before, after) for peer in others)), strict=True))
         if refusals := [f"{peer}: {answer.refusal}" for peer, answer in answers.items() if answer.refusal]:
             raise RefusedError(f"cannot change the team: {'; '.join(refusals)}")
@@ -363,7 +363,7 @@ class TeamChanges:
             not lives
             and self._lines.settings.config.rule == "etcd"
             and before[robot].role == "robot"
-            and acts_unheard(len(before))
+            and acts_unheard(sum(one.site == before[robot].site for one in before.values()))
         ):
             return (
                 f"nobody hears {robot}, which may act by etcd's vote all the same. Bring it back, then take it out. If it is "
@@ -375,7 +375,7 @@ class TeamChanges:
             return f"{robot} runs {', '.join(runs)}: move them first, failover handover NAME"
         if lives and (hindrance := self._lines.hindrance(robot)):
             return f"{robot} lives and cannot be told that it is taken out: {hindrance}; stop its agent first"
-        others = {name for name, one in after.robots.items() if one.role != "witness"}
+        others = {name for name, one in after.at_site(self._lines.settings.me.site).items() if one.role != "witness"}
         protects = [one.name for one in open_ones if one.standby == robot and others - {one.primary}]
         if lives and protects:
             return (
@@ -485,7 +485,7 @@ class TeamChanges:
             RefusedError: another member that is reached does not have it (yet), or too few are reached.
         """
         settings = self._lines.settings
-        reached = [one for one in settings.peers if one != peer and not self._lines.hindrance(one)]
+        reached = [one for one in settings.others if one != peer and not self._lines.hindrance(one)]
         for one in reached:
             answer = await self._lines.errands.send(one, TEAM_IS, {}, patience_s=GRANT_PATIENCE_S)
             if (answer.get("change"), answer.get("members")) != (change, members):
@@ -595,7 +595,7 @@ def team_of(told: TakenTeam, before: Team) -> Team:
 
 def _who(team: Team) -> dict[str, tuple[object, ...]]:
     """What tells members apart: all but their seats, which all get with the first change."""
-    return {name: (one.beats, one.bulk, one.role, one.public_key, one.next_key) for name, one in team.robots.items()}
+    return {name: (one.beats, one.bulk, one.role, one.public_key, one.next_key, one.site) for name, one in team.robots.items()}
 
 
 def told_of(team: Team) -> dict[str, Any]:
@@ -612,5 +612,7 @@ def digest(robots: Mapping[str, Robot]) -> int:
     for one in told.values():
         if not one["next_key"]:
             del one["next_key"]  # a release that knows none has the same digest
+        if not one["site"]:
+            del one["site"]  # the same
     content = msgspec.json.encode(told)
     return int.from_bytes(blake2b(content, digest_size=4).digest(), "big")

@@ -104,6 +104,8 @@ peers: [{name, role, state, last_heard_ms, hears_us, load, beats_lost, links, la
     lane: connected | connecting | refused | down
     drained: it is to run nothing, as an operator ordered; of this robot itself: drained above
     doubted: it said lately what it may not say (its notes tell what): its key may be stolen
+far: [{name, site, role, lane, items_heard_ms, notes}]: members of other sites, which have no part in any decision here
+    lane: as above; items_heard_ms: since it told its items last; null: not in this life, or it has none
 doubted_elsewhere: {robot: [peer, …]}: with ``team``, of whom each of the others heard lately what it may not say
 peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,

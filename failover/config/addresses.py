@@ -31,7 +31,13 @@ def check_addresses(name: str, member: Robot, others: Mapping[str, Robot]) -> No
     Raises:
         TeamFileError: names the address and the reason.
     """
-    theirs = {place: other for other, robot in others.items() if other != name for place in _places(robot)}
+    theirs = {
+        place: other
+        for other, robot in others.items()
+        if other != name
+        for place in _places(robot)
+        if place[0] == "bulk" or robot.site == member.site  # no heartbeat leaves a site
+    }
     ours = [split_address(address, f"robot {name}") for address in member.beats]
     bulk = split_address(member.bulk, f"robot {name}")
     if len(set(ours)) < len(ours):

@@ -17,6 +17,7 @@ import os
 import re
 import tomllib
 from dataclasses import dataclass, field, replace
+from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -62,6 +63,7 @@ class Robot:
         bulk: "host:port" on the wired link, for snapshots.
         public_key: Z85, or "" in a team without keys; ``next_key``: the one that takes its place, while both count.
         seat: its number in the team, which stays while members come and go; -1: by the order of names.
+        site: where it is. Only members of one site beat to each other, vote together and replace each other.
     """
 
     beats: tuple[str, ...]
@@ -70,6 +72,7 @@ class Robot:
     public_key: str = ""
     seat: int = -1
     next_key: str = ""
+    site: str = ""
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -80,6 +83,10 @@ class Robot:
     def keyless(self) -> Robot:
         """All but its keys: what a member needs to know to be heard."""
         return replace(self, public_key="", next_key="")
+
+    def at(self, site: str) -> Robot:
+        """The same member at another site."""
+        return replace(self, site=site)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +114,19 @@ class Team:
         return board_of(self.board, lambda keys: f"{TEAM_FILE}: {'.'.join(keys)}")
 
     def roster(self) -> Roster:
-        """All members by rank: what frames, the files of the board and the C header mean by a member's number."""
-        return roster(self.robots, self.items().terms if self.board.items else b"")  # no board: its modules are not loaded
+        """All members by rank: what the files of the board and the C header mean by a member's number."""
+        return roster(self.robots, self._terms())
+
+    def roster_of_site(self, site: str) -> Roster:
+        """The members of a site by rank, as frames mean it. Robots that know other sites do not read each other's frames."""
+        return roster(self.at_site(site), self._terms() + sites_digest(self))
+
+    def at_site(self, site: str) -> dict[str, Robot]:
+        """The members there, by name: with these and no others a member of that site decides."""
+        return {name: robot for name, robot in self.robots.items() if robot.site == site}
+
+    def _terms(self) -> bytes:
+        return self.items().terms if self.board.items else b""  # no board: its modules are not loaded
 
 
 def read(directory: Path) -> Team:
@@ -155,6 +173,14 @@ def check_team(where: str, team: Team) -> None:
         )
 
 
+def sites_digest(team: Team) -> bytes:
+    """By which two robots find out that they know other sites; b"" in a team that has only one, without a name."""
+    told = sorted((name, robot.site) for name, robot in team.robots.items())
+    if not any(site for _, site in told):
+        return b""
+    return blake2b("".join(f"{name}:{site}\n" for name, site in told).encode(), digest_size=16).digest()
+
+
 def _check_keys_differ(where: str, team: Team) -> None:
     owners: dict[str, str] = {}
     for name, key in ((name, key) for name, robot in team.robots.items() for key in robot.keys):
@@ -177,6 +203,8 @@ def check_robot(where: str, name: str, robot: Robot) -> None:
         raise TeamFileError(f"{where}: {error}") from error
     if _ODD.search(name):
         raise TeamFileError(f'{where}: {name!r} cannot name a robot: it holds one of : . " and \\')
+    if robot.site and (_ODD.search(robot.site) or not is_name_of_site(robot.site)):
+        raise TeamFileError(f"{where}: {robot.site!r} of {name} cannot name a site: a site has a name as a robot has one")
     if not robot.beats:
         raise TeamFileError(f"{where}: robot {name} has no beat address; give at least one host:port")
     for address in (*robot.beats, robot.bulk):
@@ -188,6 +216,15 @@ def check_robot(where: str, name: str, robot: Robot) -> None:
             raise TeamFileError(f"{where}: the public key of {name} is not Z85: copy it again, every character of it")
     if robot.next_key and robot.public_key in ("", robot.next_key):
         raise TeamFileError(f"{where}: next_key of {name} is for a second key, beside another public_key; take it out")
+
+
+def is_name_of_site(site: str) -> bool:
+    """Whether a site may be called so: as a robot."""
+    try:
+        names.check_robot(site)
+    except NameFormatError:
+        return False
+    return True
 
 
 def _is_z85(text: str) -> bool:
@@ -368,4 +405,5 @@ def _table_of(kind: str, name: str, robot: Robot) -> list[str]:
     lines += [f'public_key = "{robot.public_key}"'] if robot.public_key else []
     lines += [f'next_key = "{robot.next_key}"'] if robot.next_key else []
     lines += [f"seat = {robot.seat}"] if robot.seat >= 0 else []
+    lines += [f'site = "{robot.site}"'] if robot.site else []
     return lines

@@ -85,6 +85,7 @@ class WorkerView(Struct, frozen=True):
     memory: Memory | None = None
     arriving: Callable[[str], list[dict[str, Any]]] = lambda _: []
     sealed: Callable[[str], dict[str, Any] | None] = lambda _: None
+    items_heard: Callable[[str], int | None] = lambda _: None
 
 
 def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> dict[str, Any]:
@@ -114,6 +115,7 @@ def team_view(settings: Settings, life: Life, told: Told, ours: WorkerView) -> d
         "media": [_medium(one) for one in told.media],
         "coordinator": _coordinator(view),
         "peers": [_peer(peer, ours.links.get(peer.robot), told, settings) for peer in _members(view, settings)],
+        "far": [_far(name, robot.site, robot.role, ours) for name, robot in settings.far.items()],
         "components": [
             _component(one, ours.supervisors.get(one.name), settings, ours.store)
             | {"arriving": ours.arriving(one.name), "sealed": ours.sealed(one.name)}
@@ -197,6 +199,19 @@ def _peer(peer: PeerView, link: PeerConnection | None, told: Told, settings: Set
         "doubted": peer.doubted,
         "drained": peer.drained,
         "notes": reason,
+    }
+
+
+def _far(name: str, site: str, role: str, ours: WorkerView) -> dict[str, Any]:
+    """A member of another site."""
+    link = ours.links.get(name)
+    return {
+        "name": name,
+        "site": site,
+        "role": role,
+        "lane": str(link.state if link is not None else LinkState.DOWN),
+        "items_heard_ms": ours.items_heard(name),
+        "notes": [link.reason] if link is not None and link.reason else [],
     }
 
 

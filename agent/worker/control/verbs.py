@@ -333,8 +333,8 @@ class Verbs(Questions):
         wanted = arguments_of(PromoteArguments, "promote", arguments)
         name, me = await self._known(wanted.name), self._worker.settings.config.robot
         robot = wanted.robot or await self._newest_at(name)
-        if robot not in self._worker.settings.team.robots:
-            known = ", ".join(sorted(self._worker.settings.team.robots))
+        if robot not in self._worker.settings.near:
+            known = ", ".join(sorted(self._worker.settings.near))
             raise RefusedError(f"cannot promote {robot!r} for {name}: the team knows {known}")
         order = {"name": name, "robot": robot, "sure": wanted.sure, "epoch": wanted.epoch}
         if robot == me:
@@ -353,7 +353,7 @@ class Verbs(Questions):
 
     async def drain(self, say: Conversation, arguments: dict[str, Any]) -> dict[str, Any]:
         """Have a robot give away all that it runs, and take nothing new; or let it run components again."""
-        wanted, members = arguments_of(DrainArguments, "drain", arguments), self._worker.settings.team.robots
+        wanted, members = arguments_of(DrainArguments, "drain", arguments), self._worker.settings.near
         if wanted.robot not in members:
             raise RefusedError(f"cannot drain {wanted.robot!r}: the team knows {', '.join(sorted(members))}")
         order, uid = {"robot": wanted.robot, "on": wanted.on}, say.caller.uid
@@ -426,7 +426,7 @@ class Verbs(Questions):
 
     async def _reachable_robots(self) -> list[str]:
         """Those that take orders: a witness takes none."""
-        team = self._worker.settings.team.robots
+        team = self._worker.settings.near
         return [peer for peer in await self._reachable() if peer in team and team[peer].role != "witness"]
 
     async def _reserved_path(self, name: str) -> str:
@@ -435,7 +435,7 @@ class Verbs(Questions):
 
     async def _newest_at(self, name: str) -> str:
         """The living robot with the newest checkpoint; this one, or the lesser name, of several."""
-        me, team = self._worker.settings.config.robot, self._worker.settings.team.robots
+        me, team = self._worker.settings.config.robot, self._worker.settings.near
         seen = [(me, await self._view(name))]
         others = await self._reachable()
         asked = (self._asked(peer, "standing", {"name": name}) for peer in others)

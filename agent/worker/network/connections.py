@@ -10,11 +10,12 @@ from __future__ import annotations
 import functools
 import logging
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from agent.config import Settings
 from agent.errors import LaneError
+from agent.worker.network.links import Device
 from agent.worker.network.replication_link import (
     Callbacks,
     Devices,
@@ -42,6 +43,27 @@ Changed = Callable[[int, str, LinkState, str], None]
 log = logging.getLogger("failover.lane")
 
 
+class _DevicesOfSite:
+    """Connections to members of other sites take whichever interface leads there: a router's, or a tunnel's."""
+
+    def __init__(self, devices: Devices) -> None:
+        self._devices = devices
+        self._far: frozenset[str] = frozenset()
+
+    def know(self, settings: Settings) -> None:
+        """These are the sites now."""
+        self._far = frozenset(split_address(robot.bulk, "bulk address")[0] for robot in settings.far.values())
+
+    def device(self, host: str) -> Device | None:
+        """See `agent.worker.network.replication_link.Devices`."""
+        return None if host in self._far else self._devices.device(host)
+
+    def listening(self, peers: Iterable[str]) -> Device | None:
+        """See `agent.worker.network.replication_link.Devices`."""
+        hosts = list(peers)
+        return None if self._far.intersection(hosts) else self._devices.listening(hosts)
+
+
 class AllConnections:
     """The connections of one robot. Lives in one asyncio loop.
 
@@ -62,7 +84,9 @@ class AllConnections:
         self._further: dict[str, ReplicationLink] = {}
         self._owners = KeyOwners(keys)
         callbacks = self._callbacks(BULK)
-        self.bulk = ReplicationLink(self._name, settings.me.bulk, _bulks(settings), keys, callbacks, links, self._owners)
+        self._devices = _DevicesOfSite(links)
+        self._devices.know(settings)
+        self.bulk = ReplicationLink(self._name, settings.me.bulk, _bulks(settings), keys, callbacks, self._devices, self._owners)
         self._all.append(self.bulk)
         for bind, peers in further_links(settings):
             self._add(bind, peers, keys)
@@ -101,7 +125,8 @@ class AllConnections:
             LaneError: the replication link's address cannot be had any more.
         """
         self._owners.know(keys)
-        former = set(self._beat_keys) - set(settings.peers)
+        self._devices.know(settings)
+        former = set(self._beat_keys) - set(settings.others)
         self._beat_keys = {peer: key for peer, key in self._beat_keys.items() if peer not in former}
         self._their_keys = {ways: key for ways, key in self._their_keys.items() if ways[1] not in former}
         await self.bulk.change(_bulks(settings), keys)
@@ -183,7 +208,7 @@ def keys_of(settings: Settings) -> Keys:
 
 def _bulks(settings: Settings) -> dict[str, str]:
     """A robot that was taken out is connected to as well: it may not have heard of it."""
-    return {peer: robot.bulk for peer, robot in (*settings.former.items(), *settings.peers.items())}
+    return {peer: robot.bulk for peer, robot in (*settings.former.items(), *settings.others.items())}
 
 
 def further_links(settings: Settings) -> list[tuple[str, dict[str, str]]]:

@@ -31,6 +31,9 @@ UNDER_WAY_MAX: Final = 64
 SEALED: Final = "sealed"
 """The verb by which a robot asks a witness about sealed copies (`failover.archive.witness`)."""
 
+ITEMS: Final = "items"
+"""The verb by which a robot asks one of another site for the items of its board (`agent.worker.far_items`)."""
+
 CONTENT_MAX: Final = CHUNK_SIZE_MAX
 """Bytes of an answer: the replication link takes no larger message than a chunk of a snapshot."""
 

@@ -41,6 +41,7 @@ def team(room: argparse.ArgumentParser) -> None:
     )
     invite.add_argument("--address", metavar="HOST", help="of this robot, where the other one reaches it (default: of snapshots)")
     invite.add_argument("--port", metavar="PORT", type=port, default=INVITATION_PORT, help="TCP (default: %(default)s)")
+    invite.add_argument("--site", metavar="SITE", help="where it is, if not at this robot's site: see docs/far-sites.md")
     _add_socket(invite)
     invite.set_defaults(function="failover.cli.verbs.team_invitations:invite")
     join = add_act(acts, "join", shared, "make this machine a member, by a line of failover team invite", JOIN_DESCRIPTION)
@@ -76,6 +77,7 @@ def team(room: argparse.ArgumentParser) -> None:
         choices=ROLES,
         help="robot: runs components; server: keeps checkpoints of all and votes; witness: votes only (default: robot)",
     )
+    enrol.add_argument("--site", metavar="SITE", default="", help="where it is (default: the site without a name)")
     enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
     enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
     enrol.set_defaults(function="failover.cli.verbs.team:enrol")
@@ -114,6 +116,7 @@ INVITE_DESCRIPTION: Final = """
 
       failover team invite r2
       failover team invite hall --role server --for 1h
+      failover team invite r9 --site harbour
     """
 
 JOIN_DESCRIPTION: Final = """

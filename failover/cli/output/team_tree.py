@@ -74,7 +74,17 @@ def rows(status: Mapping[str, Any]) -> tuple[Row, ...]:
     if orphans:
         found.append(Row(("no robot", *[""] * (len(COLUMNS) - 1)), "bad"))
         found += _branch(orphans, "")
+    found += [_far_row(one) for one in status.get("far") or ()]
     return tuple(found)
+
+
+def _far_row(one: Mapping[str, Any]) -> Row:
+    """A member of another site: it counts neither as live nor as dead here."""
+    heard = one.get("items_heard_ms")
+    items = f", items heard {milliseconds(heard)} ago" if heard is not None else ""
+    state = f"at {one.get('site') or 'the site without a name'}"
+    mood: Mood = "good" if one.get("lane") == "connected" else "warning"
+    return Row((str(one["name"]), str(one.get("role") or ""), state, "", "", "", "", "", f"{one.get('lane')}{items}"), mood)
 
 
 def _robot_row(status: Mapping[str, Any], name: str, peer: Mapping[str, Any] | None) -> Row:

@@ -111,10 +111,10 @@ def enrol(arguments: argparse.Namespace) -> int:
         )
     beats = tuple(_with_port(address, DEFAULT_BEAT_PORT) for address in arguments.address)
     bulk = _with_port(arguments.bulk or beats[0].rpartition(":")[0], DEFAULT_BULK_PORT)
-    addresses.check_addresses(arguments.name, Robot(beats, bulk), members.robots)
+    addresses.check_addresses(arguments.name, Robot(beats, bulk, site=arguments.site), members.robots)
     public, secret = (arguments.public_key, "") if arguments.public_key else key_pairs.new_pair()
     role = arguments.role or (members.robots[arguments.name].role if arguments.name in members.robots else "robot")
-    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public))
+    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public, site=arguments.site))
     answer = {"robot": arguments.name, "role": role, "beats": beats, "bulk": bulk, "public_key": public}
     sentence = f"{arguments.name} is enrolled as a {role}; copy {directory / team.TEAM_FILE} to every member"
     if secret:
@@ -149,6 +149,7 @@ def members_now(arguments: argparse.Namespace) -> int:
     with contextlib.suppress(NoAgentError), connect(arguments) as control:
         status = control.ask("status")
     states = {peer["name"]: peer["state"] for peer in status.get("peers", ())} | ({status["robot"]: "here"} if status else {})
+    states |= {one["name"]: one["lane"] for one in status.get("far", ())}
     order = members.roster().names
     seen = {name: states.get(name, "not known" if status else "no agent here") for name in order}
     if arguments.json:
@@ -156,9 +157,14 @@ def members_now(arguments: argparse.Namespace) -> int:
         render.as_json({"team": members.team, "change": members.change, "robot": me, "robots": robots})
         return 0
     print(_counted(members.team, len(order)))
-    lines = [(name, members.robots[name].role, seen[name], " ".join(members.robots[name].beats)) for name in order]
+    has_sites = any(member.site for member in members.robots.values())
+    heads = ("robot", "role", "state", "addresses", *(["site"] if has_sites else []))
+    lines = [
+        (name, one.role, seen[name], " ".join(one.beats), *([one.site] if has_sites else []))
+        for name, one in ((name, members.robots[name]) for name in order)
+    ]
     if lines:
-        render.table(("robot", "role", "state", "addresses"), lines)
+        render.table(heads, lines)
     for name in (name for name in order if members.robots[name].next_key):
         print(f"two keys of {name} count: failover team rotate {name} goes on")
     return 0
@@ -171,6 +177,7 @@ def show(arguments: argparse.Namespace) -> int:
         robots = {
             name: {"role": robot.role, "beats": robot.beats, "bulk": robot.bulk, "public_key": robot.public_key}
             | ({"next_key": robot.next_key} if robot.next_key else {})
+            | ({"site": robot.site} if robot.site else {})
             for name, robot in members.robots.items()
         }
         board = members.items()

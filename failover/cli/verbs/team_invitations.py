@@ -90,7 +90,8 @@ def invite(arguments: argparse.Namespace) -> int:
     if robot in before.robots:
         raise TeamFileError(f"{robot} belongs to team {before.team} already; failover team remove {robot} takes it out")
     host = arguments.address or team.split_address(before.robots[me].bulk, me)[0]
-    team.check_robot("the invitation", robot, Robot((f"{host}:1",), f"{host}:1"))
+    site = before.robots[me].site if arguments.site is None else arguments.site
+    team.check_robot("the invitation", robot, Robot((f"{host}:1",), f"{host}:1", site=site))
     with _listening(Invitation(robot, host, arguments.port, secrets.token_bytes(SECRET_SIZE), arguments.role)) as (
         invitation,
         listener,
@@ -105,7 +106,7 @@ def invite(arguments: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
         sys.stdout.flush()
-        return _await_it(arguments, listener, robot, span)
+        return _await_it(arguments, listener, robot, span, site)
 
 
 @contextmanager
@@ -133,14 +134,14 @@ def _cure(draft: Invitation, error: DriverError) -> str:
     return "--address names another address of this robot, --port another port"
 
 
-def _await_it(arguments: argparse.Namespace, listener: Listener, robot: str, span: int) -> int:
+def _await_it(arguments: argparse.Namespace, listener: Listener, robot: str, span: int, site: str) -> int:
     until = time.monotonic() + span / 1_000
     while (left := until - time.monotonic()) > 0:
         came = listener.next(round(min(left * 1_000, POLL_MS)))
         if came is None:
             continue
         whose, content = came
-        welcome = _welcome(arguments, robot, content)
+        welcome = _welcome(arguments, robot, content, site)
         listener.answer(whose, msgspec.msgpack.encode(welcome))
         if welcome.refusal:
             print(f"failover: {robot} was refused: {welcome.refusal}", file=sys.stderr)
@@ -171,7 +172,7 @@ def _unconfirmed(robot: str) -> str:
     )
 
 
-def _welcome(arguments: argparse.Namespace, robot: str, content: bytes) -> Welcome:
+def _welcome(arguments: argparse.Namespace, robot: str, content: bytes, site: str = "") -> Welcome:
     """Take the robot into the team, if it can be."""
     directory = Path(arguments.directory)
     try:
@@ -183,7 +184,7 @@ def _welcome(arguments: argparse.Namespace, robot: str, content: bytes) -> Welco
         if wish.member.role != arguments.role:
             raise InvitationError(f"the invitation is for a {arguments.role}, and {robot} would be a {wish.member.role}")
         further = _further_files(directory)
-        _admit(arguments, directory, robot, wish.member)
+        _admit(arguments, directory, robot, wish.member.at(site))
     except UNDECODABLE:
         return Welcome("its message is not understood; install the same release of failover on both")
     except (FailoverError, OSError) as error:

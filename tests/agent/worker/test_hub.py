@@ -10,10 +10,10 @@ import pytest
 
 from agent import config as configuration
 from agent.errors import RefusedError
-from agent.main_loop.messages import Happened, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
+from agent.main_loop.messages import Happened, HearKey, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
-from agent.worker.team_changes import TEAM_IS
+from agent.worker.team_changes import TEAM_IS, digest
 from agent.worker.witness import Witness
 from checkpoint.keeper.messages import Channel, pair
 from checkpoint.model import Position
@@ -75,6 +75,47 @@ def test_a_witness_may_ask_how_things_stand(settings: configuration.Settings, ve
 def test_a_snapshot_of_a_witness_is_refused(settings: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     (answer,) = heard(settings, "gate", OFFER, monkeypatch)
     assert isinstance(answer, Refuse) and "gate is a witness" in answer.reason
+
+
+@pytest.fixture
+def far(settings: configuration.Settings) -> configuration.Settings:
+    """The same in a team that has robot2 at another site."""
+    robots = settings.team.robots
+    return settings.with_robots({**robots, "robot2": robots["robot2"].at("hall")})
+
+
+@pytest.mark.parametrize("verb", ["stop", "release", "handover", "prefer", "promoted", "piece", "drained"])
+def test_an_order_of_another_site_is_refused(far: configuration.Settings, verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (answer,) = heard(far, "robot2", Errand(3, verb, b"\x80", 0), monkeypatch)
+    assert isinstance(answer, ErrandDone) and answer.number == 3 and "robot2 is a member of another site" in answer.refusal
+    for allowed in ("team_grant", "items", "sealed", "picture"):
+        order = Errand(3, allowed, b"\x80", 0)
+        assert heard(far, "robot2", order, monkeypatch) == [order]
+
+
+def test_a_snapshot_of_another_site_is_refused(far: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    (answer,) = heard(far, "robot2", OFFER, monkeypatch)
+    assert isinstance(answer, Refuse) and "robot2 is a member of another site" in answer.reason
+
+
+def test_a_robot_of_another_site_gives_no_key_for_heartbeats_and_one_that_knows_other_sites_is_refused(
+    far: configuration.Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(Worker, "_say", lambda _self, message: told.append(message))
+    answered: list[Any] = []
+    monkeypatch.setattr("agent.worker.network.connections.AllConnections.answer", lambda *given: answered.append(given[-1]))
+
+    def greets(peer: str, members: int) -> list[ToMainLoop]:
+        told.clear()
+        heard(far, peer, Hello(VERSION, "lab", peer, 1, b"k" * 32, again=True, members=members), monkeypatch)
+        return [message for message in told if isinstance(message, HearKey)]
+
+    same = digest(far.team.robots)
+    assert greets("robot2", same) == [], "no heartbeat of it is read"
+    assert [message.peer for message in greets("gate", same)] == ["gate"]
+    assert greets("gate", same + 1) == []
+    assert isinstance(answered[-1], Goodbye) and "the team has sites" in answered[-1].reason
 
 
 def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(settings: configuration.Settings) -> None:
