@@ -453,7 +453,8 @@ def _check_rule(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
     """Servers and witnesses are there to vote; a witness that has a site of its own keeps sealed copies alone."""
     voters = sorted(name for name, member in site.items() if member.role != "robot")
     by_pair = config.rule == "pair" or (config.rule == "auto" and len(site) <= 2)
-    if voters and by_pair and not (len(site) == 1 and site[voters[0]].site):
+    keeps_copies_alone = config.rule == "auto" and [(one.role, bool(one.site)) for one in site.values()] == [("witness", True)]
+    if voters and by_pair and not keeps_copies_alone:
         raise ConfigError(f'{path}: {", ".join(voters)} would have no vote; set rule = "majority" on every member of the team')
     if config.rule == "etcd":
         _check_etcd(path, config, site)

@@ -116,7 +116,8 @@ def _grace_ms(config: Config) -> int:
 
 def _rule(settings: Settings) -> Rule:
     if settings.config.rule == "auto":
-        return Rule.MAJORITY if len(settings.near) > 2 else Rule.PAIR
+        alone_with_copies = settings.me.role == "witness" and len(settings.near) == 1
+        return Rule.MAJORITY if len(settings.near) > 2 or alone_with_copies else Rule.PAIR
     return Rule(settings.config.rule)
 
 

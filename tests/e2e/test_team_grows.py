@@ -374,3 +374,33 @@ def test_addresses_are_found_out_on_machines_of_their_own(tmp_path: Path) -> Non
         robots.run(stage.machine("robot1"), "count", *COUNTING)
         robots.until_protected(stage.machine("robot1"))
         robots.counts_on_elsewhere(stage.machine("robot1"), stage.machine("robot2"), 20)
+
+
+def test_robots_of_another_site_join_and_each_site_decides_for_itself(tmp_path: Path) -> None:
+    with machines(tmp_path, 4) as stage:
+        stage.create("robot1")
+        stage.brought("robot1", "robot2")
+        together(stage, "robot1", "robot2")
+        stage.brought("robot1", "robot3", "--site", "hall")
+        stage.brought("robot3", "robot4")  # at the site of the robot that invites it
+        together(stage, "robot3", "robot4")
+        together(stage, "robot1", "robot2")
+        sites = {name: member.site for name, member in stage.members("robot1").robots.items()}
+        assert sites == {"robot1": "", "robot2": "", "robot3": "hall", "robot4": "hall"}
+        for name, others in (("robot1", ["robot3", "robot4"]), ("robot4", ["robot1", "robot2"])):
+            machine = stage.machine(name)
+            robots.until(
+                lambda machine=machine: all(one["lane"] == "connected" for one in machine.status()["far"]),  # type: ignore[misc]
+                "the sites to be connected",
+            )
+            assert sorted(one["name"] for one in machine.status()["far"]) == others
+            assert machine.status()["rule"] == "pair", "two robots at each site, and no majority of four"
+        refused = stage.typed("robot1", "remove", "robot3")
+        assert refused.returncode == 1 and "robot3 lives, as robot4 sees" in refused.stderr
+        stage.machine("robot3").cut_power()
+        robots.until(lambda: state_at(stage, "robot4", "robot3") == "dead", "robot3 to be dead at its own site")
+        assert [peer["name"] for peer in stage.machine("robot1").status()["peers"]] == ["robot2"]
+        assert stage.machine("robot1").status()["healthy"], "a robot that is lost at another site is no trouble here"
+        ran = stage.typed("robot1", "remove", "robot3")
+        assert ran.returncode == 0, ran.stderr
+        robots.until(lambda: "robot3" not in stage.members("robot4").robots, "robot4 to hear of it")

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import Config, Settings
+from agent.config import Config, Settings, check_team
 from agent.core_config import team_config
 from agent.errors import ConfigError
 from agent.worker import known_sites
 from failover.config.team import Robot, Team, sites_digest
-from failover.core.types import Rule
+from failover.core.node import Node
+from failover.core.types import Rule, VoteRecord
 
 
 def settings(directory: Path, sites: dict[str, str], change: int = 1, me: str = "r1") -> Settings:
@@ -20,7 +21,7 @@ def settings(directory: Path, sites: dict[str, str], change: int = 1, me: str = 
         name: Robot((f"10.0.0.{place}:7420",), f"10.0.0.{place}:7421", seat=place, site=site)
         for place, (name, site) in enumerate(sites.items(), start=1)
     }
-    config = Config(robot=me, state_directory=str(directory))
+    config = Config(robot=me, state_directory=str(directory), insecure=True)
     return Settings(directory / "agent.toml", config, Team("lab", robots, change=change), "")
 
 
@@ -61,6 +62,20 @@ def test_the_members_of_a_site_alone_decide(tmp_path: Path) -> None:
     there = replace(here, config=replace(here.config, robot="r9"))
     assert (team_config(there).peers, team_config(there).rule) == (("r10", "r8"), Rule.MAJORITY)
     assert here.team.roster_of_site("").names == ("r1", "r2")
+
+
+def test_a_witness_may_have_a_site_of_its_own_where_it_votes_nowhere(tmp_path: Path) -> None:
+    here = settings(tmp_path, {"r1": "", "r2": "", "vault": "vault"})
+    vault = replace(here.team.robots["vault"], role="witness")
+    here = here.with_robots({**here.team.robots, "vault": vault})
+    here.path.write_text("")
+    assert (team_config(here).peers, team_config(here).witnesses, team_config(here).rule) == (("r2",), (), Rule.PAIR)
+    there = replace(here, config=replace(here.config, robot="vault"))
+    node = Node(team_config(there), 1, VoteRecord(), 0)
+    assert node.status(10**10).healthy, "it is alone, as it is meant to be"
+    check_team(there, there.team)
+    with pytest.raises(ConfigError, match="would have no vote"):
+        check_team(there, replace(there.team, robots={"r1": there.team.robots["r1"], "vault": vault.at("")}))
 
 
 def test_robots_that_know_other_sites_do_not_read_each_others_frames(tmp_path: Path) -> None:
