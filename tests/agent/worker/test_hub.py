@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from failover.config import members, team
 from failover.config.team import Robot, Team
 from failover.core.events import Exited
 from failover.core.types import ComponentSpec, Found
-from failover.core.wire.messages import VERSION, Errand, ErrandDone, Goodbye, Hello, Offer, Refuse
+from failover.core.wire.messages import VERSION, Content, Errand, ErrandDone, Goodbye, Hello, Offer, Refuse
 
 OFFER = Offer(7, "/lab/a", 1, Position(64, 1, b"d"), None, 10, b"x", ComponentSpec("/lab/a"))
 
@@ -96,6 +97,26 @@ def test_an_order_of_another_site_is_refused(far: configuration.Settings, verb: 
 def test_a_snapshot_of_another_site_is_refused(far: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     (answer,) = heard(far, "robot2", OFFER, monkeypatch)
     assert isinstance(answer, Refuse) and "robot2 is a member of another site" in answer.reason
+
+
+def test_a_file_of_another_site_comes_to_no_robot_and_a_sealed_copy_to_a_witness(
+    far: configuration.Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    came: list[Any] = []
+    for kind in (Worker, Witness):
+        monkeypatch.setattr(kind, "hear_of_a_snapshot", lambda _self, peer, message: came.append((peer, message)))
+    content = Content(9, 10, b"d" * 32)
+    heard(far, "robot2", content, monkeypatch)
+    assert came == []
+
+    async def hear() -> None:
+        ours, theirs = pair()
+        with ours, theirs:
+            there = replace(far, config=replace(far.config, robot="gate"))
+            Witness(there, Channel(ours, ToWorker))._hear(BULK, "robot2", content)
+
+    asyncio.run(hear())
+    assert came == [("robot2", content)]
 
 
 def test_a_robot_of_another_site_gives_no_key_for_heartbeats_and_one_that_knows_other_sites_is_refused(
