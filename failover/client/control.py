@@ -109,11 +109,12 @@ far: [{name, site, role, lane, items_heard_ms, notes}]: members of other sites, 
 doubted_elsewhere: {robot: [peer, …]}: with ``team``, of whom each of the others heard lately what it may not say
 peers_elsewhere: {robot: {peer: state}}: with ``team``, the same as the others see it
 components: [{name, role, primary, home, prefer, state, protection, epoch, generation, sequence, engine, pid, inner_pid,
-    isolated, standby, standby_sequence, lag_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
+    isolated, standby, standby_sequence, lag_ms, took_ms, period_ms, commit_age_ms, commit_usual_ms, commit_overdue, freeze_us,
     freeze_us_max, freeze_budget_missed, slack, snapshot_size, dirty_bytes, xor_hit_rate, snapshots, restores, crashes, outage_ms,
     restarts, exit_status, promise, promise_differs, kept, unstored, lacks, contested, prepared_first, owner, reserved, arriving,
     sealed, reasons, output, output_waiting, notes, elsewhere, warm, cold, ready, ready_copy, resumed}]
     freeze_budget_missed: its snapshots that took longer than the freeze_budget_ms of its table in agent.toml; notes say more
+    took_ms: at its primary, from the order of the newest delta until it was a checkpoint: captured, sent, stored, acknowledged
     slack: {task, captures, squeezed, slack_us, freeze_us, waited_us, began_ns, ended_ns}: at the primary of a program that runs
         tasks of the schedule: its captures, and those of them that delayed an activation; of the newest: the longest time between
         two activations that was seen, how long the freeze was expected to take, how long it waited for its moment, and when it

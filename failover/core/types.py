@@ -566,6 +566,7 @@ class ComponentView(Struct, frozen=True):
         differs: its promise is another than the team's.
         unstored: why the last snapshot that came here was not stored.
         restarting: its program has ended, and is started anew after a pause; restarted: so often in this life of the agent.
+        took_ns: from the order of the newest delta until it was a checkpoint; 0: there was none.
     """
 
     name: str
@@ -591,6 +592,7 @@ class ComponentView(Struct, frozen=True):
     unstored: str = ""
     restarting: bool = False
     restarted: int = 0
+    took_ns: int = 0
 
 
 class StatusView(Struct, frozen=True):

@@ -326,6 +326,7 @@ def _component(
         "standby": view.standby,
         "standby_sequence": newest.sequence if newest and view.standby else None,
         "lag_ms": view.lag_ns / NANOSECONDS_A_MILLISECOND if view.lag_ns >= 0 else None,
+        "took_ms": view.took_ns / NANOSECONDS_A_MILLISECOND if view.took_ns else None,
         "period_ms": view.period_ms,
         **_commits(view, figures),
         "freeze_us": figures.freeze_us if figures else view.freeze_us or None,

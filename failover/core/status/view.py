@@ -77,6 +77,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         component.unstored if component.state is State.STANDBY else "",
         restarts.waits(component),
         component.restarted,
+        component.took_ns,
     )
 
 

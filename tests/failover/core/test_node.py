@@ -101,6 +101,19 @@ def test_alone_a_capture_counts_from_this_robots_own_store() -> None:
     assert isinstance(later, acts.Capture) and not later.base
 
 
+def test_the_status_tells_how_long_the_newest_delta_took_to_be_a_checkpoint() -> None:
+    node = Node(ALONE, 1, VoteRecord(), 0)
+    (capture,) = only(running(node), acts.Capture)
+    assert isinstance(capture, acts.Capture)
+    base = Position(capture.generation, capture.sequence, b"d")
+    node.step(Captured("/lab/x", 1, base, None), 5 * MS)
+    assert node.status(6 * MS).components[0].took_ns == 0, "a base says nothing about deltas"
+    (later,) = only(node.step(Tick(), 2_000 * MS), acts.Capture)
+    assert isinstance(later, acts.Capture)
+    node.step(Captured("/lab/x", 1, Position(later.generation, later.sequence, b"e"), base), 2_030 * MS)
+    assert node.status(2_500 * MS).components[0].took_ns == 30 * MS
+
+
 def test_what_this_robot_alone_holds_is_not_called_safe_while_there_could_be_a_standby() -> None:
     node = Node(PAIR, 1, VoteRecord(), 0)
     node.step(Run(1, SPEC), 0)
