@@ -6,6 +6,7 @@ python -m benchmarks --quick restore     one of them
 python -m benchmarks load --load 8       beside eight busy loops, and without; no part of the whole run
 python -m benchmarks soak --for 2h       what grows over hours; no part of the whole run
 python -m benchmarks fleet               how a fleet grows to 1,000 robots, on paper; no part of the whole run
+python -m benchmarks sealed              what sealed copies cost, and beside restic; no part of the whole run
 
 As root more is measured (CRIU, beats on the wire). Nothing else should run meanwhile; a busy machine is warned of.
 """
@@ -48,6 +49,7 @@ from benchmarks import (
     outage,
     overload,
     results,
+    sealed,
     slack,
     soak,
     task,
@@ -131,8 +133,8 @@ BENCHMARKS: Final[dict[str, Callable[[bool, Path], Findings]]] = {
     "messages": driver_call.messages,
 }
 
-BY_ITSELF: Final = ("load", "soak", "fleet")
-"""No parts of the whole run: they take twenty minutes, hours, and ten minutes."""
+BY_ITSELF: Final = ("load", "soak", "fleet", "sealed")
+"""No parts of the whole run: they take twenty minutes, hours, ten minutes, and ten minutes."""
 
 
 def main() -> int:
@@ -152,6 +154,7 @@ def main() -> int:
         "load": partial(load.load, loads=loads),
         "soak": partial(soak.soak, span_s=span_s),
         "fleet": fleet.fleet,
+        "sealed": sealed.sealed,
     }
     findings = [_measure(name, benchmarks[name], arguments.quick) for name in arguments.names or BENCHMARKS]
     facts["it took"] = f"{time.monotonic() - began:.0f} s"
