@@ -546,8 +546,8 @@ class Worker(Switchboard):
         behind = self._archiving.complaints() if self._archiving is not None else ()
         absent = self._fetching.complaints() if self._fetching is not None else ()
         far = self._far_items.notes() if self._far_items is not None else ()
-        told = (*far, *complaints, *behind, *absent, *self._lost())
-        notices = [*self.notices(), *told, *self._around.store.notices[-NOTICES_SHOWN:]]
+        said = (*far, *complaints, *behind, *absent, *self._lost())
+        notices = [*self.notices(), *said, *self._around.store.notices[-NOTICES_SHOWN:]]
         links, interfaces = self._replication_link.links, self._links.shown()
         ours = WorkerView(
             links,
