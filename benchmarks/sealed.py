@@ -21,7 +21,7 @@ from typing import Any, Final
 from msgspec import Struct, field
 
 from agent.archive.messages import Done, KeepCheckpoint, Look, Request
-from agent.archive.process import NICE, is_reversible
+from agent.archive.process import NICE
 from benchmarks.costs import used_s
 from benchmarks.figures import OURS, Absent, Figure, Findings, percentile
 from benchmarks.running import PROGRAMS, BenchmarkError, Running, running
@@ -123,10 +123,11 @@ def _server(directory: Path) -> Iterator[str]:
     if not s3_servers.PROGRAMS.is_dir():
         raise BenchmarkError("there is no server of S3: ./run test installs one (requirements-s3-servers.txt)")
     os.environ.update(s3_servers.environment())
-    if is_reversible():
+    if is_root := os.geteuid() == 0:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # for the server, which has no machine of its own here
     with s3_servers.server(KIND, directory / "server") as url:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        if is_root:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         yield url
 
 
