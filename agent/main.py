@@ -59,6 +59,9 @@ def main(arguments: list[str] | None = None) -> int:
         if command == "recover":
             return _recover(settings, arguments)
         if command == "check":
+            from agent.worker import known_sites
+
+            known_sites.check(settings)
             _check_pair(settings)
             _check_rights(Path(settings.config.team_directory))
             peers, far = ", ".join(settings.peers) or "none", ", ".join(settings.far)
@@ -135,6 +138,7 @@ def _run(settings: configuration.Settings) -> int:
     from agent.worker import known_sites
 
     known_sites.check(settings)
+    known_sites.note(settings)
     set_up_log(settings.config.log_level, settings.config.robot)
     syscalls.small_stacks()
     if settings.config.insecure:

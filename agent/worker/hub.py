@@ -20,7 +20,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
-from agent import config as configuration
 from agent.config import Settings
 from agent.errors import AgentError, LaneError
 from agent.main_loop import messages
@@ -505,7 +504,7 @@ def live(kind: Callable[[Settings, Channel[ToWorker]], Switchboard]) -> int:
     allocator.be_frugal()
     path, descriptor = Path(sys.argv[1]), int(sys.argv[2])
     try:
-        settings = configuration.load(path)
+        settings = known_sites.load(path)
         set_up_log(settings.config.log_level, settings.config.robot)
         with contextlib.suppress(asyncio.CancelledError):
             asyncio.run(_live(kind, settings, descriptor))

@@ -173,9 +173,14 @@ def check_team(where: str, team: Team) -> None:
         )
 
 
+def sites_of(team: Team) -> dict[str, str]:
+    """Where each member is, by name."""
+    return {name: robot.site for name, robot in team.robots.items()}
+
+
 def sites_digest(team: Team) -> bytes:
-    """By which two robots find out that they know other sites; b"" in a team that has only one, without a name."""
-    told = sorted((name, robot.site) for name, robot in team.robots.items())
+    """A part of the roster's digest; b"" in a team that has only one site, without a name."""
+    told = sorted(sites_of(team).items())
     if not any(site for _, site in told):
         return b""
     return blake2b("".join(f"{name}:{site}\n" for name, site in told).encode(), digest_size=16).digest()

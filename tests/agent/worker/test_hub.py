@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +13,9 @@ from typing import Any
 import pytest
 
 from agent import config as configuration
-from agent.errors import RefusedError
+from agent.errors import ConfigError, RefusedError
 from agent.main_loop.messages import Happened, HearKey, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
+from agent.worker import known_sites
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
 from agent.worker.team_changes import TEAM_IS, digest
@@ -137,6 +141,34 @@ def test_a_robot_of_another_site_gives_no_key_for_heartbeats_and_one_that_knows_
     assert [message.peer for message in greets("gate", same)] == ["gate"]
     assert greets("gate", same + 1) == []
     assert isinstance(answered[-1], Goodbye) and "the team has sites" in answered[-1].reason
+
+
+LIVES = """
+import sys
+from agent.worker import hub
+hub.live(lambda settings, main_loop: sys.exit(f"{settings.config.robot} lives"))
+"""
+
+
+def test_a_worker_process_that_starts_anew_does_not_take_sites_that_were_edited_by_hand(settings: configuration.Settings) -> None:
+    """The main loop would decide with them from then on."""
+    known_sites.note(settings)
+
+    def born() -> str:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            words = [sys.executable, "-c", LIVES, str(settings.path), str(theirs.fileno())]
+            return subprocess.run(words, pass_fds=[theirs.fileno()], capture_output=True, text=True, check=False).stderr
+
+    assert "robot1 lives" in born()
+    robots = settings.team.robots
+    team.write(
+        Path(settings.config.team_directory), replace(settings.team, robots={**robots, "robot1": robots["robot1"].at("hall")})
+    )
+    said = born()
+    assert "robot1 lives" not in said and "edited by hand" in said
+    with pytest.raises(ConfigError, match="edited by hand"):
+        known_sites.load(settings.path)
 
 
 def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(settings: configuration.Settings) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from agent.config import Config, Settings, check_team
 from agent.core_config import team_config
 from agent.errors import ConfigError
+from agent.main_loop import vote_record
 from agent.worker import known_sites
 from failover.config.team import Robot, Team, sites_digest
 from failover.core.node import Node
@@ -25,34 +27,62 @@ def settings(directory: Path, sites: dict[str, str], change: int = 1, me: str = 
     return Settings(directory / "agent.toml", config, Team("lab", robots, change=change), "")
 
 
+def begins(one: Settings) -> None:
+    known_sites.check(one)
+    known_sites.note(one)
+
+
 def test_sites_that_were_edited_by_hand_are_refused_and_a_granted_change_is_not(tmp_path: Path) -> None:
     before = {"r1": "", "r2": "", "r3": "", "r9": "hall"}
-    known_sites.check(settings(tmp_path, before))
-    known_sites.check(settings(tmp_path, before))
+    begins(settings(tmp_path, before))
+    begins(settings(tmp_path, before))
     edited = settings(tmp_path, {**before, "r3": "hall"})
-    with pytest.raises(ConfigError, match="edited by hand"):
+    with pytest.raises(ConfigError, match=r"r3 would be at another site .* edited by hand"):
         known_sites.check(edited)
-    with pytest.raises(ConfigError, match="edited by hand"):
+    with pytest.raises(ConfigError, match=r"r9 would be at another site .* edited by hand"):
         known_sites.check(settings(tmp_path, dict.fromkeys(before, "")))
     granted = settings(tmp_path, {**before, "r3": "hall"}, change=2)
     known_sites.note(granted)  # while the agent runs
-    known_sites.check(granted)
+    begins(granted)
     with pytest.raises(ConfigError, match="edited by hand"):
         known_sites.check(settings(tmp_path, before, change=2))
 
 
 def test_the_first_site_is_no_matter_for_an_editor_either(tmp_path: Path) -> None:
-    known_sites.check(settings(tmp_path, {"r1": "", "r2": ""}))
-    with pytest.raises(ConfigError, match="edited by hand"):
+    begins(settings(tmp_path, {"r1": "", "r2": ""}))
+    with pytest.raises(ConfigError, match="raise change to 2"):
         known_sites.check(settings(tmp_path, {"r1": "", "r2": "hall"}))
-    known_sites.check(settings(tmp_path, {"r1": "", "r2": "", "r3": "hall"}, change=2))
+    begins(settings(tmp_path, {"r1": "", "r2": "hall"}, change=2))
 
 
-def test_a_torn_file_is_none(tmp_path: Path) -> None:
-    (tmp_path / known_sites.FILE_NAME).write_text("torn")
-    known_sites.check(settings(tmp_path, {"r1": "", "r2": "hall"}))
-    with pytest.raises(ConfigError, match="edited by hand"):
-        known_sites.check(settings(tmp_path, {"r1": "", "r2": ""}))
+def test_a_robot_that_was_enrolled_by_hand_moves_nobody(tmp_path: Path) -> None:
+    begins(settings(tmp_path, {"r1": "", "r2": ""}))
+    begins(settings(tmp_path, {"r1": "", "r2": "", "r9": "hall"}))
+    begins(settings(tmp_path, {"r1": "", "r2": "", "r3": "", "r9": "hall"}))
+    with pytest.raises(ConfigError, match="r9 would be at another site"):
+        known_sites.check(settings(tmp_path, {"r1": "", "r2": "", "r3": "", "r9": ""}))
+
+
+def test_a_robot_of_another_team_has_that_teams_sites(tmp_path: Path) -> None:
+    begins(settings(tmp_path, {"r1": "", "r2": "hall"}))
+    other = settings(tmp_path, {"r1": "hall", "r2": ""})
+    begins(replace(other, team=replace(other.team, team="dock")))
+
+
+def test_sites_without_a_record_of_them_are_for_a_robot_that_has_not_decided_yet(tmp_path: Path) -> None:
+    """At the first start with this release the file is not there, and the vote record is."""
+    sited, plain = settings(tmp_path, {"r1": "", "r2": "hall"}), settings(tmp_path, {"r1": "", "r2": ""})
+    known_sites.check(sited)
+    (tmp_path / vote_record.FILE_NAME).write_text("")
+    for torn in (None, "torn", "[]", '{"team": "lab", "change": 1, "sites": 3}'):
+        if torn is not None:
+            (tmp_path / known_sites.FILE_NAME).write_text(torn)
+        with pytest.raises(ConfigError, match="this robot has decided before") as refused:
+            known_sites.check(sited)
+        known_sites.check(plain)
+    (cure,) = re.findall(r"write ({.*}) into", str(refused.value))
+    (tmp_path / known_sites.FILE_NAME).write_text(cure)
+    begins(sited)
 
 
 def test_the_members_of_a_site_alone_decide(tmp_path: Path) -> None:
