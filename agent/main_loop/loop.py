@@ -19,6 +19,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from msgspec import structs
+
 from agent.config import Settings
 from agent.core_config import node_config, team_config
 from agent.errors import AgentError
@@ -64,7 +66,7 @@ from failover.core.frames.roster import Roster
 from failover.core.node import Node
 from failover.core.types import COORDINATOR
 from failover.core.types import Config as CoreConfig
-from failover.core.wire.messages import Beat
+from failover.core.wire.messages import OTHER_SITES, Beat
 from failover.errors import FailoverError
 
 if TYPE_CHECKING:
@@ -180,6 +182,7 @@ class MainLoop:
         self._copies = Copies()
         self._newest_part: dict[tuple[str, int], tuple[int, int]] = {}
         self._unlike: set[str] = set()
+        self._other_sites: set[str] = set()
         self._lost: Counter[str] = Counter()
         self._notes: tuple[str, ...] = ()
         self._remembered = 0
@@ -468,6 +471,8 @@ class MainLoop:
         if beat is not None:
             self._count_beat(beat, came_ns or now_ns)
             self._mind_earlier_lives(beat)
+            if beat.sender in self._other_sites:
+                beat = structs.replace(beat, rule=OTHER_SITES)
             paces = not came_ns and link not in self._media.wireless
             self._step(Received(beat, link, self._copies.take(beat.sender), came_ns, paces))
 
@@ -542,8 +547,9 @@ class MainLoop:
                 self._take_inventory(message)
             case SpeakKey(peer, key):
                 self._frames.speak(peer, key)
-            case HearKey(peer, key):
+            case HearKey(peer, key, knows_other_sites):
                 self._frames.hear(peer, key)
+                (self._other_sites.add if knows_other_sites else self._other_sites.discard)(peer)
             case LinksAre(links):
                 self._links = links
                 self._media.take(links, clock.now_ns())
@@ -576,6 +582,7 @@ class MainLoop:
         self._media.take(self._links, clock.now_ns())
         self._unread = UnreadBeats({name: robot.beats for name, robot in settings.peers.items()})
         self._unlike.intersection_update(robots)
+        self._other_sites.intersection_update(robots)
         if self._board is not None:
             self._open_board()  # the worker has made the files of those that came
         changed = team_config(settings)

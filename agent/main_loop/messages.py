@@ -101,10 +101,15 @@ class Alive(msgspec.Struct, frozen=True, tag=True):
 
 
 class HearKey(msgspec.Struct, frozen=True, tag=True):
-    """Worker to main loop: the peer says that it seals its beats to us with this key."""
+    """Worker to main loop: the peer says that it seals its beats to us with this key.
+
+    Attributes:
+        knows_other_sites: than we: its beats prove that it lives, and nothing else that they say counts.
+    """
 
     peer: str
     key: bytes
+    knows_other_sites: bool = False
 
 
 class LinkNow(msgspec.Struct, frozen=True, array_like=True):

@@ -57,7 +57,7 @@ from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError
 from checkpoint.runtime import allocator
 from failover.client.control import SOCKET_NAME
-from failover.config.team import Team, sites_digest
+from failover.config.team import Team, sites_of
 from failover.core import acts, events
 from failover.core.events import Event
 from failover.core.frames.frame import KEY_SIZE_MIN
@@ -84,6 +84,12 @@ UNFIT_KEY: Final = (
 
 OTHER_SITE: Final = (
     "{} is a member of another site: orders and snapshots do not leave a site; give the order at a robot of this one"
+)
+
+OTHER_SITES: Final = (
+    "{} and this robot know other sites of {}, or a release there knows none: bring the same release, and the team.toml that "
+    "is right, to every member, and restart their agents; until then these two start, take over, move and protect nothing between "
+    "them"
 )
 
 log = logging.getLogger("failover.lanes")
@@ -419,14 +425,12 @@ class Switchboard:
             reason = f"{peer} speaks version {hello.version}, this robot {VERSION}; install the same release on both"
         elif hello.team != self.settings.team.team:
             reason = f"{peer} belongs to team {hello.team!r}, this robot to {self.settings.team.team!r}"
-        elif self._knows_other_sites(hello):
-            reason = (
-                f"{peer} has another team.toml than this robot, both of change {hello.change}, and the team has sites: copy the "
-                "one that is right to every member, and restart their agents; until then these two count no heartbeat of each "
-                "other"
-            )
         elif len(hello.beat_key) < KEY_SIZE_MIN:
             reason = f"{peer} sent a beat key of {len(hello.beat_key)} bytes; install the same release on both"
+        elif moved := self._other_sites(hello):
+            reason = OTHER_SITES.format(peer, moved)
+            if peer in self.settings.peers:
+                self._say(HearKey(peer, hello.beat_key, knows_other_sites=True))  # it lives, and is not to be replaced
         if way == BULK and not hello.again:
             self.link_is_new(peer)  # a new connection: what was half here stays half
         if reason:
@@ -443,14 +447,20 @@ class Switchboard:
             # A robot that lost its power ended no connection: ours to it seems to stand, and is refused at the first word.
             self._greet(way, peer, self._connections.present_key(peer), again=True)
 
-    def _knows_other_sites(self, hello: Hello) -> bool:
-        """Robots that disagree about sites would count different majorities."""
-        team = self.settings.team
-        return hello.change == team.change and hello.members != digest(team.robots) and bool(sites_digest(team))
+    def _other_sites(self, hello: Hello) -> str:
+        """The members that are elsewhere by a peer's word: robots that disagree about sites would count different majorities.
+
+        A change that all members grant moves nobody, so two robots may have different changes, and members, all the same.
+        """
+        ours = sites_of(self.settings.team)
+        theirs = dict.fromkeys(ours, "") if hello.sites is None else hello.sites
+        return ", ".join(sorted(name for name, site in theirs.items() if ours.get(name, site) != site))
 
     def _greet(self, way: int, peer: str, key: bytes, *, again: bool = False) -> None:
         config, team = self.settings.config, self.settings.team
-        hello = Hello(VERSION, team.team, config.robot, self._life.boot, key, again, team.change, digest(team.robots))
+        hello = Hello(
+            VERSION, team.team, config.robot, self._life.boot, key, again, team.change, digest(team.robots), sites_of(team)
+        )
         self._connections.answer(way, peer, hello)
 
     def votes_only(self, peer: str) -> bool:

@@ -71,7 +71,8 @@ class Peer(Struct):
         told_ns: when we last let it act on a beat of its own.
         settled: see ``messages.Beat``.
         unsteady_ns: how late its beats come at worst, lately: silence beyond a period.
-        at_odds: number of its rule, where that is not ours: it is known to live, and nothing else it says counts.
+        at_odds: number of its rule, where that is not ours, or `OTHER_SITES`: it is known to live, and nothing else it says
+            counts.
         unread_ns: when something last came from it that could not be authenticated, 0 for never since its last beat;
             ``unread_why``: what is wrong.
         loyal_until_ns: `Membership.loyal_until_ns`, counted when something of it changes: it is asked for several times a step.

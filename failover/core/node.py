@@ -131,7 +131,7 @@ class Node:
         self._load = 0
         self._waiting: Beat | None = None
         self._promise = ""
-        self._grounds: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+        self._grounds: tuple[tuple[str, ...], ...] | None = None
         self._configure(held)
 
     def step(self, event: Event, now_ns: int) -> Ready:

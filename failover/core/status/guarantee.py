@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from failover.core.component import Component, Turn
 from failover.core.types import ENDED, MS, Protection
+from failover.core.wire.messages import OTHER_SITES
 
 
-def grounds(turn: Turn) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The grounds of `team` that time changes: the peers that have another rule, and all that are heard."""
+def grounds(turn: Turn) -> tuple[tuple[str, ...], ...]:
+    """The grounds of `team` that time changes: the peers that have another rule, or know other sites, and all that are heard."""
     living = turn.team.living(turn.now_ns)
-    return tuple(peer.robot for peer in living if peer.at_odds), tuple(peer.robot for peer in living)
+    differ = tuple(peer.robot for peer in living if peer.at_odds not in (0, OTHER_SITES))
+    elsewhere = tuple(peer.robot for peer in living if peer.at_odds == OTHER_SITES)
+    return differ, elsewhere, tuple(peer.robot for peer in living)
 
 
 ETCD_DELAY_S = 2
@@ -22,7 +25,12 @@ ETCD_DELAY_S = 2
 
 def team(turn: Turn) -> str:
     """The promise of the rule in force, given the robots that are heard."""
-    at_odds, living = grounds(turn)
+    at_odds, elsewhere, living = grounds(turn)
+    if elsewhere:
+        return (
+            f"{turn.me} and {' and '.join(elsewhere)} know other sites of the members: between them they start, take over, move "
+            "and protect nothing until all have the same team.toml."
+        )
     if at_odds:
         return (
             f"{turn.me} decides by rule = {turn.config.rule}, {' and '.join(at_odds)} by another: between them they start, "

@@ -150,6 +150,9 @@ RETURNED = -1
 RULES = ("", *Rule)
 """A rule's place in here is its number in a beat."""
 
+OTHER_SITES = -1
+"""In the place of a rule, for a beat that came: its sender knows other sites of the members. No robot sends it."""
+
 
 # The replication link: connection-oriented, authenticated and encrypted by the transport; in order while a connection lives.
 
@@ -174,6 +177,7 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
         beat_key: random bytes of this life; the sender's beats to this receiver are sealed with it from now on.
         again: on a connection that stands, because the receiver has begun anew; what is under way on it goes on.
         change, members: how often failover has changed the sender's team, and a digest of who belongs to it.
+        sites: where each member is, by name, as the sender's team.toml has it; None: its release knows no sites.
     """
 
     version: int
@@ -184,6 +188,7 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
     again: bool = False
     change: int = 0
     members: int = 0
+    sites: dict[str, str] | None = None
 
 
 class Goodbye(msgspec.Struct, frozen=True, tag="goodbye"):

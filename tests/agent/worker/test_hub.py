@@ -6,6 +6,7 @@ import asyncio
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,12 @@ from agent.main_loop.messages import Happened, HearKey, Inventory, TeamIs, ToMai
 from agent.worker import known_sites
 from agent.worker.network.connections import BULK
 from agent.worker.process import Worker
-from agent.worker.team_changes import TEAM_IS, digest
+from agent.worker.team_changes import TEAM_IS
 from agent.worker.witness import Witness
 from checkpoint.keeper.messages import Channel, pair
 from checkpoint.model import Position
 from failover.config import members, team
-from failover.config.team import Robot, Team
+from failover.config.team import Robot, Team, sites_of
 from failover.core.events import Exited
 from failover.core.types import ComponentSpec, Found
 from failover.core.wire.messages import VERSION, Content, Errand, ErrandDone, Goodbye, Hello, Offer, Refuse
@@ -123,24 +124,54 @@ def test_a_file_of_another_site_comes_to_no_robot_and_a_sealed_copy_to_a_witness
     assert came == [("robot2", content)]
 
 
-def test_a_robot_of_another_site_gives_no_key_for_heartbeats_and_one_that_knows_other_sites_is_refused(
-    far: configuration.Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
+Greets = Callable[..., list[HearKey]]
+
+
+@pytest.fixture
+def greets(far: configuration.Settings, monkeypatch: pytest.MonkeyPatch) -> Greets:
+    """What the main loop is told of a member that greets; ``settings``: ours."""
     told: list[Any] = []
     monkeypatch.setattr(Worker, "_say", lambda _self, message: told.append(message))
-    answered: list[Any] = []
-    monkeypatch.setattr("agent.worker.network.connections.AllConnections.answer", lambda *given: answered.append(given[-1]))
+    monkeypatch.setattr("agent.worker.network.connections.AllConnections.answer", lambda *given: told.append(given[-1]))
 
-    def greets(peer: str, members: int) -> list[ToMainLoop]:
+    def said(peer: str, sites: dict[str, str] | None, settings: configuration.Settings = far, change: int = 0) -> list[Any]:
         told.clear()
-        heard(far, peer, Hello(VERSION, "lab", peer, 1, b"k" * 32, again=True, members=members), monkeypatch)
-        return [message for message in told if isinstance(message, HearKey)]
+        hello = Hello(VERSION, "lab", peer, 1, b"k" * 32, again=True, change=change, members=5, sites=sites)
+        heard(settings, peer, hello, monkeypatch)
+        return [message for message in told if isinstance(message, HearKey | Goodbye)]
 
-    same = digest(far.team.robots)
-    assert greets("robot2", same) == [], "no heartbeat of it is read"
-    assert [message.peer for message in greets("gate", same)] == ["gate"]
-    assert greets("gate", same + 1) == []
-    assert isinstance(answered[-1], Goodbye) and "the team has sites" in answered[-1].reason
+    return said
+
+
+def test_a_robot_of_another_site_gives_no_key_for_heartbeats(far: configuration.Settings, greets: Greets) -> None:
+    sites = sites_of(far.team)
+    assert greets("robot2", sites) == [], "no heartbeat of it is read"
+    assert greets("gate", sites) == [HearKey("gate", b"k" * 32)]
+
+
+def test_an_address_or_a_member_that_differs_makes_nobody_deaf(far: configuration.Settings, greets: Greets) -> None:
+    """Files are brought to the robots one after the other."""
+    sites = sites_of(far.team)
+    assert greets("gate", {**sites, "robot9": "dock"}) == [HearKey("gate", b"k" * 32)]
+    assert greets("gate", {name: site for name, site in sites.items() if name != "robot2"}) == [HearKey("gate", b"k" * 32)]
+
+
+@pytest.mark.parametrize("change", [0, 1], ids=["the same change", "another change"])
+@pytest.mark.parametrize("robot2", ["", "dock", None], ids=["no site", "another site", "a release without sites"])
+def test_a_member_that_knows_other_sites_is_known_to_live_and_nothing_else_it_says_counts(
+    far: configuration.Settings, greets: Greets, robot2: str | None, change: int
+) -> None:
+    key, goodbye = greets("gate", None if robot2 is None else {**sites_of(far.team), "robot2": robot2}, change=change)
+    assert key == HearKey("gate", b"k" * 32, knows_other_sites=True)
+    assert isinstance(goodbye, Goodbye) and "know other sites of robot2" in goodbye.reason
+
+
+def test_a_robot_without_sites_does_not_count_one_that_has_them(
+    settings: configuration.Settings, far: configuration.Settings, greets: Greets
+) -> None:
+    key, goodbye = greets("gate", sites_of(far.team), settings)
+    assert key.knows_other_sites and "know other sites of robot2" in goodbye.reason
+    assert greets("gate", None, settings) == [HearKey("gate", b"k" * 32)], "neither has sites"
 
 
 LIVES = """

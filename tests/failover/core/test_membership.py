@@ -9,8 +9,8 @@ from failover.core.election.consent import STATES
 from failover.core.events import Received, Tick
 from failover.core.membership import LATE_BEATS, UNSTEADY_BEATS, Membership
 from failover.core.node import Node
-from failover.core.types import MS, Awaited, Config, State, VoteRecord
-from failover.core.wire.messages import RETURNED, RULES, Beat, Echo, Entry, Promise
+from failover.core.types import MS, Awaited, Config, Rule, State, VoteRecord
+from failover.core.wire.messages import OTHER_SITES, RETURNED, RULES, Beat, Echo, Entry, Promise
 
 PAIR = Config("robot1", ("robot2",), beat_ms=10, lease_ms=100)
 LOYALTY_MS = PAIR.loyalty_ns // MS
@@ -89,11 +89,12 @@ def test_a_copy_of_a_recent_beat_proves_its_link_and_an_old_one_nothing() -> Non
     assert team.peers["robot2"].links == {"eth0": 1_000 * MS, "wlan0": 1_010 * MS}
 
 
-def test_a_peer_by_another_rule_is_told_of_no_beat_of_its_own() -> None:
+@pytest.mark.parametrize("other", [RULES.index(Rule.MAJORITY), RULES.index(Rule.ETCD), OTHER_SITES])
+def test_a_peer_by_another_rule_or_with_other_sites_is_told_of_no_beat_of_its_own(other: int) -> None:
     team = Membership(PAIR, 1, 0)
-    other = next(number for number, rule in enumerate(RULES) if number and rule != PAIR.rule)
-    team.hear(Beat("robot2", 1, 7, rule=other), "eth0", 10 * MS)
-    assert team.at_odds(10 * MS) == ("robot2",)
+    says = (Entry("/lab/x", STATES.index(State.PRIMARY), 1, "robot2"),)
+    assert team.hear(Beat("robot2", 1, 7, 1, 0, 1, (Echo("robot1", 1, 5),), says, rule=other), "eth0", 10 * MS) == ()
+    assert team.at_odds(10 * MS) == ("robot2",) and team.alive("robot2", 10 * MS) and not team.hears_us("robot2", 10 * MS)
     assert team.echoes(10 * MS) == (Echo("robot2", 1, 0),)
 
 
