@@ -88,8 +88,8 @@ OTHER_SITE: Final = (
 
 OTHER_SITES: Final = (
     "{} and this robot know other sites of {}, or a release there knows none: bring the same release, and the team.toml that "
-    "is right, to every member, and restart their agents; until then these two start, take over, move and protect nothing between "
-    "them"
+    "is right, to every member, and restart their agents; until then these two start, take over, move and protect nothing "
+    "between them"
 )
 
 log = logging.getLogger("failover.lanes")

@@ -27,7 +27,7 @@ from agent.worker.control.arguments import TakenTeam, TeamArguments, arguments_o
 from agent.worker.control.server import Conversation
 from agent.worker.network.remote_orders import Errands, OrderOfPeer
 from failover.config import team as team_file
-from failover.config.team import Robot, Team
+from failover.config.team import Robot, Team, sites_of
 from failover.core import acts, events
 from failover.core.team_changes import TWO_KEYS, USE_NS, Grants, acts_unheard, missing, step
 from failover.core.types import ENDED, HOLDING, PeerView
@@ -75,11 +75,17 @@ log = logging.getLogger("failover.lanes")
 
 
 class Answer(NamedTuple):
-    """Of a member that was asked for its grant. ``sees``: it hears the robot that is to leave."""
+    """Of a member that was asked for its grant.
+
+    Attributes:
+        sees: it hears the robot that is to leave.
+        members: digest of the team that it has granted.
+    """
 
     granted: bool = False
     refusal: str = ""
     sees: bool = False
+    members: int = 0
 
 
 class Lines(Protocol):
@@ -263,6 +269,12 @@ class TeamChanges:
         if refusals := [f"{peer}: {answer.refusal}" for peer, answer in answers.items() if answer.refusal]:
             raise RefusedError(f"cannot change the team: {'; '.join(refusals)}")
         granted = {me, *(peer for peer, answer in answers.items() if answer.granted)}
+        blind = [peer for peer, answer in answers.items() if answer.granted and answer.members != digest(after.robots)]
+        if blind and any(sites_of(after).values()):
+            raise RefusedError(
+                f"cannot change the team: it has sites, and the release of {', '.join(blind)} knows none: a majority would be "
+                "another one there; install the same release there first"
+            )
         if sees := [peer for peer, answer in answers.items() if answer.sees and removed not in granted]:
             raise RefusedError(f"cannot change the team: {removed} lives, as {sees[0]} sees; stop its agent first")
         if short := missing(before.robots, granted, removed, lives=lives):
@@ -281,7 +293,8 @@ class TeamChanges:
             log.info("%s does not answer about the team: %s", peer, error)
             return Answer()
         refusal = str(answer.get("refusal", ""))
-        return Answer(not refusal, refusal, bool(answer.get("sees")))
+        members = answer.get("members")
+        return Answer(not refusal, refusal, bool(answer.get("sees")), members if isinstance(members, int) else 0)
 
     async def _free(self, peer: str) -> None:
         if self._lines.hindrance(peer):
@@ -347,7 +360,9 @@ class TeamChanges:
     # --- how things stand ---
 
     async def _may_live(self, robot: str) -> bool:
-        """Whether a member is heard, or may be on its way still."""
+        """Whether a member is heard, or may be on its way still. One of another site is never heard: is it connected?"""
+        if robot in self._lines.settings.far:
+            return not self._lines.hindrance(robot)
         status = (await self._lines.ask("status")).status
         return status is None or any(_may_live(peer) for peer in status.peers if peer.robot == robot)
 
@@ -356,6 +371,8 @@ class TeamChanges:
         status = (await self._lines.ask("status")).status
         if status is None:
             return "its agent is starting; try again"
+        if robot in self._lines.settings.far:
+            return ""  # it objects itself where it can be asked, and the members of its site do
         peer = next((one for one in status.peers if one.robot == robot), None)
         lives = peer is not None and _may_live(peer)
         before = self._lines.settings.team.robots
@@ -418,7 +435,7 @@ class TeamChanges:
             return {"refusal": objection}
         refusal = self._grants.ask(self._lines.settings.team.change, asked.have, peer, clock.now_ns(), digest(after.robots))
         sees = bool(removed) and removed != me and await self._may_live(removed)
-        return {"refusal": refusal, "sees": sees}
+        return {"refusal": refusal, "sees": sees, "members": digest(after.robots)}
 
     async def _objection_to(self, removed: str, after: Team) -> str:
         if removed != self._lines.settings.config.robot:

@@ -110,14 +110,21 @@ async def _nothing(_one: str, _other: str, _verb: str) -> None:
 class Town:
     """The members, and who cannot reach whom."""
 
-    def __init__(self, place: Path, *names: str, roles: dict[str, Role] | None = None, keyed: bool = False) -> None:
+    def __init__(
+        self,
+        place: Path,
+        *names: str,
+        roles: dict[str, Role] | None = None,
+        keyed: bool = False,
+        sites: dict[str, str] | None = None,
+    ) -> None:
         pairs = {name: new_keys() for name in names} if keyed else {}
         self.secrets = {name: secret for name, (_, secret) in pairs.items()}
         self.team = Team("lab", {name: robot(number, (roles or {}).get(name, "robot")) for number, name in enumerate(names, 1)})
         self.team = replace(members.joined(self.team, "z", robot(8)), change=0)
         self.team = replace(self.team, robots={name: one for name, one in self.team.robots.items() if name != "z"})
         known = {name: replace(one, public_key=pairs[name][0] if pairs else "") for name, one in self.team.robots.items()}
-        self.team = replace(self.team, robots=known)
+        self.team = replace(self.team, robots={name: one.at((sites or {}).get(name, "")) for name, one in known.items()})
         self.cuts: set[frozenset[str]] = set()
         self.before: Callable[[str, str, str], Awaitable[None]] = _nothing
         self.after: Callable[[str, str, str], Awaitable[None]] = _nothing
@@ -480,6 +487,65 @@ def test_a_robot_that_was_not_heard_since_the_start_may_be_starting_too(tmp_path
 def test_a_robot_whose_agent_restarts_lives() -> None:
     assert team_changes._may_live(PeerView("r2", "restarting", 1, 3_000_000_000, False, 0, awaited_ns=10_000_000_000))
     assert not team_changes._may_live(PeerView("r2", "dead", 1, 3_000_000_000, False, 0))
+
+
+# --- Robots of other sites --------------------------------------------------------------------------------------------
+
+
+def with_a_far_robot(place: Path, *rules: str) -> Town:
+    """``c`` is alone at the site hall. ``rules``: those of a, b and c."""
+    town = Town(place, "a", "b", "c", sites={"c": "hall"})
+    for member, rule in zip(town.members.values(), rules, strict=False):
+        config = replace(
+            member.settings.config, rule=rule, coordinator=CoordinatorConfig(("http://10.0.0.1:2379",)), lease_ms=1_800
+        )
+        member.settings = replace(member.settings, config=config)
+    return town
+
+
+@pytest.mark.parametrize("rule", ["auto", "etcd"])
+def test_a_robot_that_is_alone_at_its_site_is_asked_before_it_is_taken_out(tmp_path: Path, rule: str, ended: list[str]) -> None:
+    town = with_a_far_robot(tmp_path, *([rule, rule] if rule == "etcd" else []))
+    town["c"].runs = [view("/x", "c")]
+    with pytest.raises(RefusedError, match="c: it runs /x: move them first"):
+        asyncio.run(town["a"].change("remove", "c"))
+    town.cuts = {frozenset("ac")}
+    with pytest.raises(RefusedError, match="c lives, as b sees"):
+        asyncio.run(town["a"].change("remove", "c"))
+    assert not town["c"].stopped and not ended and town["a"].on_disk == ["a", "b", "c"]
+    town.cuts.clear()
+    town["c"].runs = []
+    asyncio.run(town["a"].change("remove", "c"))
+    assert town["a"].on_disk == town["b"].on_disk == ["a", "b"]
+
+
+@pytest.mark.parametrize("rule", ["auto", "etcd"])
+def test_a_robot_of_another_site_that_nobody_reaches_is_taken_out_by_whatever_rule_there_is_here(
+    tmp_path: Path, rule: str
+) -> None:
+    town = with_a_far_robot(tmp_path, *([rule, rule] if rule == "etcd" else []))
+    town.cut_off("c")
+    asyncio.run(town["a"].change("remove", "c"))
+    assert town["a"].on_disk == town["b"].on_disk == ["a", "b"]
+
+
+def test_a_member_whose_release_knows_no_sites_grants_no_change_of_a_team_that_has_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    town = Town(tmp_path, "a", "b")
+    granted = town["b"].changes._granted
+
+    async def by_the_release_before(peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        answer = await granted(peer, arguments)
+        return {"refusal": answer["refusal"], "sees": answer["sees"]}
+
+    orders = {**town["b"].changes.orders(), "team_grant": by_the_release_before}
+    monkeypatch.setattr(town["b"].changes, "orders", lambda: orders)
+    with pytest.raises(RefusedError, match="it has sites, and the release of b knows none"):
+        asyncio.run(town["a"].change("add", "d", JOINING.at("hall")))
+    assert town["a"].on_disk == town["b"].on_disk == ["a", "b"]
+    asyncio.run(town["a"].change("add", "d", JOINING))
+    assert town["b"].on_disk == ["a", "b", "d"], "a team without sites goes on as before"
 
 
 # --- Keys that are replaced -------------------------------------------------------------------------------------------
