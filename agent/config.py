@@ -415,7 +415,7 @@ def load(path: Path) -> Settings:
         raise ConfigError(str(error)) from error
     _check_keys(path, config, members)
     site = members.at_site(members.robots[config.robot].site)
-    _check_rule(path, config, site)
+    _check_rule(path, config, members, site)
     _check_components(path, config, site)
     _check_tasks(path, config, members)
     _check_alerts(path, config, members)
@@ -434,7 +434,7 @@ def check_team(settings: Settings, team: Team) -> None:
         return
     _check_keys(path, config, team)
     site = team.at_site(team.robots[config.robot].site)
-    _check_rule(path, config, site)
+    _check_rule(path, config, team, site)
     _check_components(path, config, site)
     _check_archive(path, config, team)
 
@@ -449,7 +449,7 @@ def _check_keys(path: Path, config: Config, members: Team) -> None:
         )
 
 
-def _check_rule(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
+def _check_rule(path: Path, config: Config, members: Team, site: Mapping[str, Robot]) -> None:
     """Servers and witnesses are there to vote; a witness that has a site of its own keeps sealed copies alone."""
     voters = sorted(name for name, member in site.items() if member.role != "robot")
     by_pair = config.rule == "pair" or (config.rule == "auto" and len(site) <= 2)
@@ -457,12 +457,12 @@ def _check_rule(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
     if voters and by_pair and not keeps_copies_alone:
         raise ConfigError(f'{path}: {", ".join(voters)} would have no vote; set rule = "majority" on every member of the team')
     if config.rule == "etcd":
-        _check_etcd(path, config, site)
+        _check_etcd(path, config, members)
     elif config.coordinator.endpoints:
         raise ConfigError(f'{path}: [coordinator] has no effect without rule = "etcd"; set that on every member, or remove it')
 
 
-def _check_etcd(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
+def _check_etcd(path: Path, config: Config, members: Team) -> None:
     """etcd's leases count in seconds, and its place among the members is taken by no other."""
     if not config.coordinator.endpoints:
         raise ConfigError(f'{path}: rule = "etcd" needs to know where etcd is; add [coordinator] {EXAMPLE}')
@@ -471,7 +471,7 @@ def _check_etcd(path: Path, config: Config, site: Mapping[str, Robot]) -> None:
             f'{path}: lease_ms is {config.lease_ms}; leases at etcd last for seconds: with rule = "etcd" give at least '
             f"{ETCD_LEASE_MS_MIN}, such as lease_ms = {ETCD_LEASE_MS}"
         )
-    if COORDINATOR in site:
+    if COORDINATOR in members.robots:
         raise ConfigError(
             f'{path}: a member has the name {COORDINATOR}, which means etcd with rule = "etcd"; give it another one'
         )

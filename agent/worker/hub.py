@@ -353,8 +353,8 @@ class Switchboard:
 
     def _unread(self, peer: str, why: str) -> None:
         """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""
-        if peer in self.settings.former:
-            return
+        if peer in self.settings.former or peer in self.settings.far:
+            return  # whether they live is no matter to any decision here
         now_s = asyncio.get_running_loop().time()
         sign = (peer, why if peer else "")
         if len(self._signs) > SIGNS_MAX:

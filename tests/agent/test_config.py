@@ -479,6 +479,14 @@ def test_etcd_is_one_more_member_that_only_votes(directory: Path) -> None:
     assert config.loyalty_ns <= 2 * 10**9, "the usual lease of etcd lasts for two seconds"
 
 
+@pytest.mark.parametrize("site", ["", "hall"])
+def test_no_member_of_any_site_is_called_as_etcd_is(site: str, directory: Path) -> None:
+    """What comes from a robot of that name would be told of etcd."""
+    team.write(directory / "team", Team("lab", {"robot1": ROBOT, "robot2": ROBOT, "etcd": ROBOT.at(site)}))
+    with pytest.raises(ConfigError, match="a member has the name etcd"):
+        configuration.load(written(directory, *ETCD))
+
+
 @pytest.mark.parametrize(
     ("lines", "said"),
     [

@@ -77,7 +77,9 @@ def team(room: argparse.ArgumentParser) -> None:
         choices=ROLES,
         help="robot: runs components; server: keeps checkpoints of all and votes; witness: votes only (default: robot)",
     )
-    enrol.add_argument("--site", metavar="SITE", default="", help="where it is (default: the site without a name)")
+    enrol.add_argument(
+        "--site", metavar="SITE", help="where it is (default: where it was; of a new one, the site without a name)"
+    )
     enrol.add_argument("--public-key", metavar="KEY", help="the public half of a key made on the robot itself")
     enrol.add_argument("--replace", action="store_true", help="give a known robot new addresses and a new key")
     enrol.set_defaults(function="failover.cli.verbs.team:enrol")

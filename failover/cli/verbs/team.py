@@ -102,7 +102,7 @@ def rotate(arguments: argparse.Namespace) -> int:
 
 
 def enrol(arguments: argparse.Namespace) -> int:
-    """Add a member, with a key made here or brought along. One that is replaced keeps its role unless another is given."""
+    """Add a member, with a key made here or brought along. One that is replaced keeps its role and site where none is given."""
     directory = Path(arguments.directory)
     members = team.read(directory)
     if arguments.name in members.robots and not arguments.replace:
@@ -111,10 +111,11 @@ def enrol(arguments: argparse.Namespace) -> int:
         )
     beats = tuple(_with_port(address, DEFAULT_BEAT_PORT) for address in arguments.address)
     bulk = _with_port(arguments.bulk or beats[0].rpartition(":")[0], DEFAULT_BULK_PORT)
-    addresses.check_addresses(arguments.name, Robot(beats, bulk, site=arguments.site), members.robots)
+    known = members.robots.get(arguments.name, Robot(beats, bulk))
+    role, site = arguments.role or known.role, known.site if arguments.site is None else arguments.site
+    addresses.check_addresses(arguments.name, Robot(beats, bulk, site=site), members.robots)
     public, secret = (arguments.public_key, "") if arguments.public_key else key_pairs.new_pair()
-    role = arguments.role or (members.robots[arguments.name].role if arguments.name in members.robots else "robot")
-    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public, site=arguments.site))
+    enrolled = team.enrol(members, arguments.name, Robot(beats, bulk, role, public, site=site))
     answer = {"robot": arguments.name, "role": role, "beats": beats, "bulk": bulk, "public_key": public}
     sentence = f"{arguments.name} is enrolled as a {role}; copy {directory / team.TEAM_FILE} to every member"
     if secret:

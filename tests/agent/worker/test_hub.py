@@ -25,7 +25,7 @@ from checkpoint.keeper.messages import Channel, pair
 from checkpoint.model import Position
 from failover.config import members, team
 from failover.config.team import Robot, Team, sites_of
-from failover.core.events import Exited
+from failover.core.events import Event, Exited, Unread
 from failover.core.types import ComponentSpec, Found
 from failover.core.wire.messages import VERSION, Content, Errand, ErrandDone, Goodbye, Hello, Offer, Refuse
 
@@ -164,6 +164,23 @@ def test_a_member_that_knows_other_sites_is_known_to_live_and_nothing_else_it_sa
     key, goodbye = greets("gate", None if robot2 is None else {**sites_of(far.team), "robot2": robot2}, change=change)
     assert key == HearKey("gate", b"k" * 32, knows_other_sites=True)
     assert isinstance(goodbye, Goodbye) and "know other sites of robot2" in goodbye.reason
+
+
+def test_a_robot_of_another_site_that_cannot_be_authenticated_holds_no_decision_up(
+    far: configuration.Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Event] = []
+    monkeypatch.setattr(Worker, "tell", lambda _self, event: told.append(event))
+
+    async def comes() -> None:
+        ours, theirs = pair()
+        with ours, theirs:
+            worker = Worker(far, Channel(ours, ToWorker))
+            for peer in ("robot2", "gate", ""):
+                worker._unread(peer, "its key is another one")
+
+    asyncio.run(comes())
+    assert told == [Unread("gate", "its key is another one"), Unread("", "its key is another one")]
 
 
 def test_a_robot_without_sites_does_not_count_one_that_has_them(

@@ -21,6 +21,7 @@ from failover.cli import key_pairs, parser
 from failover.cli.verbs import team_invitations
 from failover.client import control
 from failover.client.control import Control, Output, Refused, Request, Result, Update
+from failover.config import team
 from failover.config.invitation import SECRET_SIZE, Invitation
 from failover.errors import DriverError, NoAgentError
 from tests.failover.cli.stand_in import Answer, StandIn
@@ -590,6 +591,16 @@ def test_servers_and_witnesses_are_enrolled_and_stay_what_they_are(tmp_path: Pat
     assert failover("team", "enrol", "gate", "10.0.0.9", "--replace", *place).returncode == 0
     shown = json.loads(failover("team", "show", *place).stdout)["robots"]
     assert {name: one["role"] for name, one in shown.items()} == {"hall": "server", "gate": "witness"}
+
+
+def test_a_member_with_a_fresh_key_stays_at_its_site(tmp_path: Path) -> None:
+    place = ["--directory", str(tmp_path)]
+    failover("team", "create", "lab", "--empty", *place)
+    for words in (["10.0.0.1", "--site", "harbour"], ["10.0.0.9", "--replace"]):
+        assert failover("team", "enrol", "r9", *words, *place).returncode == 0
+        assert team.read(tmp_path).robots["r9"].site == "harbour"
+    assert failover("team", "enrol", "r9", "10.0.0.9", "--replace", "--site", "", *place).returncode == 0
+    assert not team.read(tmp_path).robots["r9"].site
 
 
 def enrolled(place: Path, name: str, address: str) -> str:
