@@ -15,7 +15,7 @@ from typing import Final
 
 from agent.config import Settings
 from agent.errors import LaneError
-from agent.worker.network.links import Device
+from agent.worker.network.links import EVERY_DEVICE, Device
 from agent.worker.network.replication_link import (
     Callbacks,
     Devices,
@@ -61,7 +61,7 @@ class _DevicesOfSite:
     def listening(self, peers: Iterable[str]) -> Device | None:
         """See `agent.worker.network.replication_link.Devices`."""
         hosts = list(peers)
-        return None if self._far.intersection(hosts) else self._devices.listening(hosts)
+        return EVERY_DEVICE if self._far.intersection(hosts) else self._devices.listening(hosts)
 
 
 class AllConnections:

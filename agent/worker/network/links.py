@@ -72,6 +72,10 @@ class Device(Struct, frozen=True):
     index: int
 
 
+EVERY_DEVICE: Final = Device("", 0)
+"""A socket that was held to one is held to none: as SO_BINDTODEVICE, socket(7), takes an empty name."""
+
+
 class Scene(Struct, frozen=True):
     """The kernel's answer at one instant: interfaces by index, and the index of each address's."""
 

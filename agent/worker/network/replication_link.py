@@ -143,7 +143,7 @@ class Devices(Protocol):
         """By which a connection to that host of a peer must leave; None for any."""
 
     def listening(self, peers: Iterable[str]) -> Device | None:
-        """By which connections of the peers at those hosts must come; None for any."""
+        """By which connections of the peers at those hosts must come; None: as before, and at first any."""
 
 
 class AnyDevice:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+import os
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +14,17 @@ import pytest
 
 from agent.config import Config, Settings
 from agent.worker.network.connections import AllConnections
-from agent.worker.network.replication_link import ANY_DEVICE, Callbacks, Keys, LinkState, ReplicationLink, new_keys
+from agent.worker.network.links import Device
+from agent.worker.network.replication_link import (
+    ANY_DEVICE,
+    AnyDevice,
+    Callbacks,
+    Devices,
+    Keys,
+    LinkState,
+    ReplicationLink,
+    new_keys,
+)
 from failover.config.team import Robot, Team
 from failover.core.wire.messages import Bulk, Cancel
 from tests.agent.worker.network.test_replication_link import free_port, until
@@ -24,7 +36,7 @@ OURS, OLD, NEW = new_keys(), new_keys(), new_keys()
 class Scene:
     """robot1 with two links; whoever has a key of robot2 may connect to either of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, devices: Devices = ANY_DEVICE) -> None:
         port, theirs, beside = free_port(), free_port(), free_port()
         self.address = {"bulk": f"127.0.0.1:{port}", "further": f"127.0.0.2:{port}"}
         self.settings = Settings(
@@ -41,7 +53,7 @@ class Scene:
         )
         self.heard: list[tuple[int, Bulk]] = []
         self.connections = AllConnections(
-            self.settings, self.keys(OLD, NEW), lambda way, _, message: self.heard.append((way, message)), _nothing, ANY_DEVICE
+            self.settings, self.keys(OLD, NEW), lambda way, _, message: self.heard.append((way, message)), _nothing, devices
         )
 
     def keys(self, *theirs: tuple[str, str]) -> Keys:
@@ -140,3 +152,43 @@ def test_a_further_link_refuses_the_old_key_while_the_replication_link_is_made_a
             await changing
 
     run(body)
+
+
+class HeldElsewhere(AnyDevice):
+    """The listener is held to an interface by which nothing comes here."""
+
+    def __init__(self, device: Device) -> None:
+        self.held = device
+
+    def listening(self, _peers: Iterable[str]) -> Device | None:
+        """That one."""
+        return self.held
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: a listener is held to an interface")
+def test_the_first_robot_of_another_site_comes_in_by_any_interface_at_once() -> None:
+    """It is reached by a tunnel, and the listener was held to the interface of the bulk address until then."""
+    others = [Device(name, index) for index, name in socket.if_nameindex() if name != "lo"]
+    if not others:
+        pytest.skip("needs an interface beside lo")
+
+    def comes_in(scene: Scene) -> bool:
+        host, port = scene.address["bulk"].split(":")
+        with socket.socket() as client:
+            return client.connect_ex((host, int(port))) == 0
+
+    async def main() -> None:
+        scene = Scene(HeldElsewhere(others[0]))
+        scene.connections.open()
+        try:
+            assert not comes_in(scene)
+            robots = scene.settings.team.robots
+            far = scene.settings.with_robots({**robots, "robot2": robots["robot2"].at("harbour")})
+            await scene.connections.change(far, scene.keys(OLD))
+            assert comes_in(scene)
+            await scene.connections.change(scene.settings, scene.keys(OLD))
+            assert not comes_in(scene)
+        finally:
+            await scene.connections.close()
+
+    asyncio.run(main())
