@@ -2,7 +2,8 @@
 
 The question and its answer are an order on the replication link (`agent.worker.network.remote_orders`); heartbeats and frames do
 not leave a site. A robot asks again only after the answer, so a cut leaves no queue: the first answer after it has the newest
-values. The question names the last answer that came. From that the asked robot knows which puts the other one has.
+values, or is the one that was under way. The question names the last answer that came. From that the asked robot knows which
+puts the other one has.
 
 The bound of an age is honest by the clock of the robot that asked alone: an answer left after its question did, so it was under
 way for no longer than the whole took. Only declared items travel so; what a program adds while it runs stays at its site.
@@ -40,7 +41,13 @@ ASK_S: Final = 0.5
 """Between two questions to one robot."""
 
 ANSWER_S: Final = 0.4
-"""Between two answers to one robot: a question that comes sooner is refused."""
+"""Between two answers to one robot: one that comes sooner waits."""
+
+ANSWERS_WAITING: Final = 4
+"""For one robot; a question beyond that is refused."""
+
+PUT_MAX: Final = 1 << 62
+"""A number that is no put's."""
 
 PATIENCE_S: Final = 10.0
 """For an answer on a link that loses packets."""
@@ -56,13 +63,16 @@ SILENT_QUESTIONS: Final = 6
 
 OTHER_BOARD: Final = "{} has another [board] in its team.toml: its items are not read here; bring the same [board] to every robot"
 
+UNFIT: Final = "items of {} are not read: {}; install the same release on both"
+
 log = logging.getLogger("failover.lanes")
 
 
 class Question(Struct, frozen=True):
-    """What has changed since your answer ``got``? 0: I have nothing."""
+    """What has changed since your answer ``got``? 0: I have nothing. ``board``: digest of our declarations."""
 
     got: int
+    board: int = 0
 
 
 class Answer(Struct, frozen=True):
@@ -132,6 +142,7 @@ class FarItems:
         self._far: dict[str, _Far] = {}
         self._files: list[UnmappedFile] = []
         self._odd: set[str] = set()
+        self._unfit: dict[str, str] = {}
         self.open(place)
 
     def open(self, place: Path) -> None:
@@ -141,6 +152,16 @@ class FarItems:
             BoardError, OSError: they cannot be read.
         """
         self.close()
+        try:
+            self._open(place)
+        except (BoardError, OSError):
+            self.close()
+            raise
+        self._told = {name: told for name, told in self._told.items() if name in self._far}
+        self._odd &= set(self._far)
+        self._unfit = {name: why for name, why in self._unfit.items() if name in self._far}
+
+    def _open(self, place: Path) -> None:
         owners = AgentsFile(place).owners()
         self._files.append(UnmappedFile.open(place / directory.OWN_NAME))
         for uid in sorted({owner.uid for owner in (owners or {}).values() if owner.uid is not None}):
@@ -151,8 +172,6 @@ class FarItems:
         for name, robot in self._lines.settings.far.items():
             if robot.role == "robot":
                 self._far[name] = _Far(ReceivedItems.open(place / f"{directory.PEER_PREFIX}{name}"))
-        self._told = {name: told for name, told in self._told.items() if name in self._far}
-        self._odd &= set(self._far)
 
     def close(self) -> None:
         """Let the files go."""
@@ -172,7 +191,8 @@ class FarItems:
 
     def notes(self) -> list[str]:
         """What is wrong, for the status."""
-        return [OTHER_BOARD.format(robot) for robot in sorted(self._odd)]
+        unfit = [UNFIT.format(robot, why) for robot, why in sorted(self._unfit.items())]
+        return [*(OTHER_BOARD.format(robot) for robot in sorted(self._odd)), *unfit]
 
     # --- asking ---
 
@@ -189,16 +209,24 @@ class FarItems:
 
     async def _ask(self, robot: str, one: _Far) -> None:
         asked_ns = _now_ns()
-        question = msgspec.to_builtins(Question(one.got))
+        question = msgspec.to_builtins(Question(one.got, self._board))
         try:
             said = await self._lines.errands.send(robot, ITEMS, question, patience_s=PATIENCE_S)
             answer = msgspec.convert(said, Answer, builtin_types=(bytes,))
-        except (RefusedError, msgspec.ValidationError) as error:
+        except RefusedError as error:
             log.debug("no items of %s: %s", robot, error)
-            one.got = 0
+            return  # it knows what is here still
+        except msgspec.ValidationError as error:
+            self._unfit[robot] = str(error)
             return
-        if self._far.get(robot) is one:
+        if self._far.get(robot) is not one:
+            return
+        try:
             self._take(robot, one, answer, asked_ns, _now_ns())
+            self._unfit.pop(robot, None)
+        except Exception as error:  # noqa: BLE001  no answer of another robot ends this worker, or the questions to it
+            log.warning("items of %s: %s", robot, error)
+            self._unfit[robot] = str(error)
 
     def _take(self, robot: str, one: _Far, answer: Answer, asked_ns: int, came_ns: int) -> None:
         """Put what an answer brought into that robot's file."""
@@ -211,7 +239,7 @@ class FarItems:
             one.items.begin_life()
         way_ns = came_ns - asked_ns
         error_us = min(way_ns // NS_PER_US + 2, NO_ERROR_BOUND)  # the age was rounded, and the way is
-        items = [item for item in answer.items if item.total == 0 and item.number < ITEMS_MAX]
+        items = [item for item in answer.items if item.total == 0 and item.number < ITEMS_MAX and item.put < PUT_MAX]
         one.items.take(items, came_ns, error_us, 0)
         one.got, one.heard_ns = answer.number, came_ns
         one.items.heard(came_ns)
@@ -235,7 +263,7 @@ class FarItems:
         """Answer a robot of another site.
 
         Raises:
-            RefusedError: it is none, or asks too often, or its question is not understood.
+            RefusedError: it is none, or does not wait for answers, or its question is not understood.
         """
         if robot not in self._far:
             raise RefusedError(f"{robot} is no robot of another site: its items come in frames")
@@ -244,16 +272,21 @@ class FarItems:
         except msgspec.ValidationError as error:
             raise RefusedError(f"its question for items is not understood: {error}; same release there?") from error
         told = self._told.setdefault(robot, _Told())
-        now_ns = _now_ns()
-        if now_ns - told.told_ns < ANSWER_S * 1e9:
+        now_ns, pause_ns = _now_ns(), int(ANSWER_S * 1e9)
+        wait_ns = max(told.told_ns + pause_ns - now_ns, 0)
+        if wait_ns > ANSWERS_WAITING * pause_ns:
             raise RefusedError(f"{robot} asks for items more often than every {ANSWER_S:g} s")
-        told.told_ns = now_ns
+        told.told_ns = now_ns + wait_ns
+        if wait_ns:  # questions that came late come close together
+            await asyncio.sleep(wait_ns / 1e9)
+            if robot not in self._far:
+                raise RefusedError(f"{robot} is no robot of another site any more")
         if question.got == told.number and told.number:
             told.has |= told.under_way
         elif question.got == 0:
             told.has = {}
         told.under_way = {}
-        items = self._changed(told)
+        items = self._changed(told) if question.board in (0, self._board) else []
         told.number += 1
         for item in items:
             told.under_way[item.number] = item.put
