@@ -39,6 +39,7 @@ FOUND_S = 240.0
 
 MESSAGES = 60
 ASKS_A_SECOND = 2
+VALUES = 8
 CUT_S = float(os.environ.get("FAILOVER_CUT_S", "8"))
 
 DRIVER = """
@@ -147,7 +148,8 @@ def stage(tmp_path: Path) -> Iterator[FarStage]:
 
 
 def is_connected(robot: RobotMachine) -> bool:
-    return all(one["lane"] == "connected" for one in robot.status()["far"])
+    far = robot.status()["far"]
+    return bool(far) and all(one["lane"] == "connected" for one in far)
 
 
 def open_board(robot: RobotMachine, monkeypatch: pytest.MonkeyPatch) -> failover.Board:
@@ -176,8 +178,7 @@ def test_items_follow_with_a_true_bound_and_after_a_cut_the_newest_one_comes_fir
         there.item("mode").put("before")
         robots.until(lambda: has_come(here, second.name, "mode", "before"), "the mode")
         begun, read = now_ns(), []
-        until = time.monotonic() + 5
-        while time.monotonic() < until:  # the value is the instant of its put
+        while len({value for _, value, _, _ in read}) < VALUES:  # the value is the instant of its put
             ball.put(now_ns())
             with contextlib.suppress(failover.NeverWrittenError):
                 reading = seen.get(second.name)
@@ -187,7 +188,7 @@ def test_items_follow_with_a_true_bound_and_after_a_cut_the_newest_one_comes_fir
             time.sleep(0.01)
         values = [value for _, value, _, _ in read]
         assert values == sorted(values)
-        assert 2 <= len(set(values)) <= ASKS_A_SECOND * (now_ns() - begun) / 1e9 + 2, "one value for each question"
+        assert len(set(values)) <= ASKS_A_SECOND * (now_ns() - begun) / 1e9 + 2, "one value for each question"
         for _, value, age_ns, at_ns in read:
             assert age_ns <= at_ns - value + 10_000_000, "a lower bound of its age"
         stage.wire.cut()
@@ -197,7 +198,7 @@ def test_items_follow_with_a_true_bound_and_after_a_cut_the_newest_one_comes_fir
             ball.put(now_ns())
             time.sleep(0.01)
         there.item("mode").put("after")
-        reading = seen.get(second.name)
+        before = reading = seen.get(second.name)
         assert reading.value < cut_at and reading.age_ns > (CUT_S - 2) * 1e9, "its age tells of the cut"
         assert {one["name"] for one in first.status()["far"]} == {second.name}
         assert not first.status()["peers"], "it is no peer, and none that is dead"
@@ -208,12 +209,12 @@ def test_items_follow_with_a_true_bound_and_after_a_cut_the_newest_one_comes_fir
 
         def is_fresh() -> bool:
             value = seen.get(second.name).value
-            if value > cut_at:
+            if value != before.value:
                 fresh.append(value)
             return bool(fresh)
 
         robots.until(is_fresh, "a value after the cut")
-        assert fresh == [last], "the newest one, and no queue of older ones"
+        assert fresh == [last], "the newest one, and none of before: the cut was longer than TCP sends an answer again"
         robots.until(lambda: has_come(here, second.name, "mode", "after"), "the other item")
 
 
