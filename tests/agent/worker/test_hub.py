@@ -15,6 +15,7 @@ import pytest
 
 from agent import config as configuration
 from agent.errors import ConfigError, RefusedError
+from agent.main import main as agent_main
 from agent.main_loop.messages import Happened, HearKey, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
 from agent.worker import known_sites
 from agent.worker.network.connections import BULK
@@ -198,7 +199,9 @@ hub.live(lambda settings, main_loop: sys.exit(f"{settings.config.robot} lives"))
 """
 
 
-def test_a_worker_process_that_starts_anew_does_not_take_sites_that_were_edited_by_hand(settings: configuration.Settings) -> None:
+def test_a_worker_process_that_starts_anew_does_not_take_sites_that_were_edited_by_hand(
+    settings: configuration.Settings, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The main loop would decide with them from then on."""
     known_sites.note(settings)
 
@@ -217,6 +220,8 @@ def test_a_worker_process_that_starts_anew_does_not_take_sites_that_were_edited_
     assert "robot1 lives" not in said and "edited by hand" in said
     with pytest.raises(ConfigError, match="edited by hand"):
         known_sites.load(settings.path)
+    assert agent_main(["check", "--config", str(settings.path)]) == 1, "and a person hears it before the agent does"
+    assert "edited by hand" in capsys.readouterr().err
 
 
 def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(settings: configuration.Settings) -> None:
