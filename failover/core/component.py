@@ -171,11 +171,11 @@ class Component(Struct):
         behind_ns: since when this robot would claim it, and a server says that it keeps a newer checkpoint; 0: it does not wait.
         trail: the last acknowledged positions and their parents, for servers (`failover.core.replication.servers`).
             archives: on their way there.
-        fetched_ns: when the checkpoint that came from the archive was put there, by the other clock; -1: none came.
-            looked_ns: all that the archive had at this instant is in this robot's store. freed_ns: since when this
-            robot could take it over, 0: it could not; asked_ns: when it last ordered a look into the archive for that. fresh: it
-            has looked since then, and holds a checkpoint.
-        void: epoch of an end after which it began anew: the archive's copies up to that one are of another life of it.
+        fetched: the position of the newest checkpoint that came from the archive, and when it was put there, by the clock of the
+            robot that made it, which may be before this robot's computer started; None: none came.
+            lags: the archive has a newer one than this robot. looked_ns: all that the archive had at this instant is in this
+            robot's store. freed_ns: since when this robot could take it over, 0: it could not; asked_ns: when it last ordered a
+            look into the archive for that. fresh: it has looked since then, and holds a checkpoint.
         sealed: on a primary, the position of the newest copy in the archive; sealed_ns: when that was taken, -1 if there is none.
         promise: the sentence that the journal has of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
@@ -202,6 +202,7 @@ class Component(Struct):
     begun: bool = False
     bare: bool = False
     ended: tuple[int, int] = (0, 0)
+    void: int = 0
 
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
@@ -283,12 +284,12 @@ class Component(Struct):
     trail: deque[tuple[Position, Position | None]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     archives: dict[str, Flight] = field(default_factory=dict)
     archived_ns: int = 0
-    fetched_ns: int = -1
+    fetched: tuple[Position, int] | None = None
+    lags: bool = False
     looked_ns: int = 0
     freed_ns: int = 0
     asked_ns: int = 0
     fresh: bool = False
-    void: int = 0
     sealed: Position | None = None
     sealed_ns: int = -1
     promise: str = ""
@@ -383,6 +384,7 @@ class Component(Struct):
             self.has_begun,
             self.bare,
             self.ended,
+            self.void,
         )
 
     @classmethod
@@ -403,6 +405,7 @@ class Component(Struct):
             record.begun,
             record.bare,
             record.ended,
+            record.void,
             remembered_epoch=record.epoch,
         )
 

@@ -578,7 +578,7 @@ def _runs(component: Component, turn: Turn, event: Started | Restored) -> None:
         return
     lost = ""
     how = "it runs" if isinstance(event, Started) else f"it resumes from checkpoint {event.position.sequence}"
-    if isinstance(event, Restored) and event.age_ns >= 0:
+    if isinstance(event, Restored) and event.age_ns >= 0 and not archived.gave(component, event.position):
         component.lost_ns = event.age_ns if event.lost_ns < 0 else event.lost_ns
         component.resumed_ns = turn.now_ns - component.lost_ns
         lost = f"; it lost {component.lost_ns / NS_PER_S:.1f} s of its work"

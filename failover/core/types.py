@@ -457,6 +457,7 @@ class Record(Struct, frozen=True):
         begun: there is a checkpoint of it, or there was one when this robot heard last: it is not to begin anew.
         bare: this robot was among those that held all that was acknowledged, and has lost its checkpoints: others hold it.
         ended: generation and sequence of the last snapshot of the program before, since when another one was started anew.
+        void: epoch of an end after which it began anew: the archive's copies up to that one are of another life of it.
     """
 
     name: str
@@ -473,6 +474,7 @@ class Record(Struct, frozen=True):
     begun: bool = False
     bare: bool = False
     ended: tuple[int, int] = (0, 0)
+    void: int = 0
 
 
 class Awaited(Struct, frozen=True):

@@ -15,6 +15,7 @@ from failover.core.election.pair import (
     begin,
     claim,
     clear_away,
+    drop,
     first_of_equals,
     follow,
     heard_end,
@@ -146,6 +147,7 @@ def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry) -
     if (entry.epoch, sender) != (component.epoch, component.primary):
         if not majority.may_follow(component, turn, sender, entry):
             return
+        archived.void(component)
         accept(component, turn, sender, entry.epoch)
     component.entrusted = (entry.standby,) if entry.standby else ()
     follow(component, turn, sender, entry)
@@ -247,6 +249,8 @@ def _needs_the_vote(component: Component, turn: Turn) -> bool:
 
 def _adopt(component: Component, turn: Turn, entry: Entry) -> None:
     archived.void(component)
+    if component.state in ENDED:
+        drop(component, turn, "it runs anew")
     accept(component, turn, entry.primary, entry.epoch)
     component.entrusted = (entry.standby,) if entry.standby else ()
     if component.state is State.ABSENT or component.state in ENDED:

@@ -9,15 +9,17 @@ counts. Invariants:
   there before is in its store then, and it claims without the wait for the old primary (``fresh``). Where the archive does not
   answer, that wait (``patience_ms``) is the limit.
 * A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
+* Where the archive alone tells of a component, and no member of the team, it may have ended, or have been released and run on:
+  no robot claims it by itself.
 """
 
 from __future__ import annotations
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.component import Component, Turn
+from failover.core.component import Cause, Component, Turn
 from failover.core.events import Archived, Fetched, Looked
-from failover.core.types import MS, PEERS_MAX, State
+from failover.core.types import ENDED, MS, PEERS_MAX, State
 from failover.core.wire.messages import FREE
 
 KEPT = 2
@@ -37,10 +39,13 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
     if not _takes(component, turn, event.position):
         turn.order(acts.Discard(component.name, component.epoch, event.position))
         return
+    if component.state is State.ABSENT:
+        component.move(Cause.FOLLOW)
     component.held = [*component.held, event.position][-KEPT:]
     component.spec, component.keeps_state = event.spec, event.keeps_state
     component.stored_ns = turn.now_ns
-    component.fetched_ns = max(turn.now_ns - event.age_ns, 0)
+    component.fetched = event.position, turn.now_ns - event.age_ns
+    component.lags = component.lags and not event.begun_ns
     component.unable, component.tries, component.unstored = "", 0, ""
     turn.order(acts.Accept(component.name, component.epoch, event.position))
     turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
@@ -55,9 +60,15 @@ def _takes(component: Component, turn: Turn, position: Position) -> bool:
 
 
 def looked(component: Component, event: Looked) -> None:
-    """All that the archive had of this component when that look began is in our store."""
-    if component.name not in event.behind:
+    """All that the archive had of this component when that look began is in our store; or it has something newer (``lags``)."""
+    component.lags = component.name in event.behind
+    if not component.lags:
         component.looked_ns = max(component.looked_ns, event.begun_ns)
+
+
+def gave(component: Component, position: Position) -> bool:
+    """Whether a checkpoint came from the archive: the time of its file here does not say how old its state is."""
+    return component.fetched is not None and component.fetched[0] == position
 
 
 def archived(component: Component, event: Archived) -> None:
@@ -74,7 +85,7 @@ def sealed_ns(component: Component) -> int:
 
 def void(component: Component) -> None:
     """It begins anew after an end: what the archive has of it up to that end is another life of it."""
-    if component.state in (State.FINISHED, State.RELEASED):
+    if component.state in ENDED:
         component.void = max(component.void, component.epoch)
 
 
@@ -103,13 +114,22 @@ def _would_coordinator(component: Component, turn: Turn) -> bool:
 
 def waits(component: Component, turn: Turn) -> bool:
     """Whether this robot looks into the archive before it claims the component."""
-    if not turn.config.copies_ms or 0 < component.freed_ns <= component.looked_ns:
+    if not turn.config.copies_ms:
         return False
-    if component.newest is None:
-        return component.epoch > 0
+    if is_told_by_it_alone(component):
+        return True
+    if 0 < component.freed_ns <= component.looked_ns:
+        return False
+    if component.newest is None and component.epoch > 0:  # our own, of which no checkpoint was ever made, is nowhere else
+        return component.primary != turn.me or component.has_begun
     if component.primary == turn.me and is_own(component, turn):
         return False
     return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
+
+
+def is_told_by_it_alone(component: Component) -> bool:
+    """Whether no record, no member and no configuration tells of the component: who ran it last, and how it ended, is unknown."""
+    return component.epoch == 0 and bool(component.held) and not component.autostart
 
 
 def is_own(component: Component, turn: Turn) -> bool:
@@ -121,4 +141,4 @@ def _limit_ns(component: Component, turn: Turn) -> int:
     peer = turn.team.peers.get(component.primary)
     lately_ns = component.freed_ns - HEARD_LATELY * turn.config.loyalty_ns
     is_standby = turn.me in component.entrusted and peer is not None and peer.boot > 0 and peer.heard_ns >= lately_ns
-    return (turn.config.retry_ms if is_standby else turn.config.patience_ms) * MS
+    return (turn.config.retry_ms if is_standby and not component.lags else turn.config.patience_ms) * MS

@@ -97,6 +97,8 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
     if protection is not Protection.PROTECTED:
         return "If this robot is lost now, the component resumes from its last checkpoint, if there is one."
     if turn.config.copies_ms and not turn.alive(component.standby):
+        if component.waits:
+            return f"If {turn.me} is lost, its newest copy in the archive waits until {turn.me} is back: no other one resumes it."
         return (
             f"If {turn.me} is silent and etcd votes for another robot, that one resumes it from its newest copy in the archive; "
             "the work since then is lost; it stands still here first."

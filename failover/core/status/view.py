@@ -117,11 +117,16 @@ def _archive_notes(component: Component, turn: Turn) -> list[str]:
         return []
     if not component.held:
         return [f"NOT PROTECTED: {turn.me} does not hear {component.primary}, and no copy of it came from the archive yet"]
-    if component.fetched_ns < 0 or archived.is_own(component, turn):
-        return []
-    age_s = (turn.now_ns - component.fetched_ns) / NS_PER_S
-    notes = [f"its checkpoint here came from the archive and is {age_s:.0f} s old"]
-    if component.freed_ns and archived.waits(component, turn):
+    notes = []
+    if component.fetched is not None and archived.gave(component, component.held[-1]):
+        age_s = (turn.now_ns - component.fetched[1]) / NS_PER_S
+        notes.append(f"its checkpoint here came from the archive and is {age_s:.0f} s old")
+    if archived.is_told_by_it_alone(component):
+        notes.append(
+            f"the archive alone tells of it: it may have ended, or run on at a robot that released it; failover handover "
+            f"{component.name} resumes it at {turn.me}, failover release {component.name} forgets it"
+        )
+    elif component.freed_ns and archived.waits(component, turn):
         notes.append(f"{turn.me} looks into the archive before it takes it over")
     return notes
 

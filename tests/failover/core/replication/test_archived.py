@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import msgspec
+import pytest
+
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.acts import Ready
 from failover.core.election.consent import STATES
-from failover.core.events import Event, Fetched, Looked, Received, Tick
+from failover.core.events import Archived, Event, Fetched, Handover, Looked, Received, Restored, Started, Tick
 from failover.core.node import Node
-from failover.core.types import COORDINATOR, MS, PEERS_MAX, ComponentSpec, Config, Launch, Rule, State, VoteRecord
+from failover.core.types import (
+    COORDINATOR,
+    MS,
+    PEERS_MAX,
+    ComponentSpec,
+    Config,
+    Launch,
+    OnLoss,
+    Record,
+    Rule,
+    Rules,
+    State,
+    VoteRecord,
+)
 from failover.core.wire.messages import FREE, FRESH, OPEN, RULES, Beat, Echo, Entry
 
 NAME = "/lab/robot1/mapper"
@@ -16,6 +32,8 @@ SPEC = ComponentSpec(NAME, "robot1", Launch(("mapper",)))
 CONFIG = Config(
     "robot2", (COORDINATOR, "robot1"), lease_ms=200, rule=Rule.ETCD, witnesses=(COORDINATOR,), patience_ms=60_000, copies_ms=1_000
 )
+
+DECLARED = msgspec.structs.replace(CONFIG, components=(SPEC,))
 
 
 def position(epoch: int, sequence: int) -> Position:
@@ -25,17 +43,21 @@ def position(epoch: int, sequence: int) -> Position:
 class Lonely:
     """robot2, and etcd's word about the component: robot1 runs it in this epoch, or is silent (``flags``)."""
 
-    def __init__(self, config: Config = CONFIG) -> None:
+    def __init__(self, config: Config = CONFIG, record: VoteRecord = VoteRecord(), seat: str = "robot1") -> None:  # noqa: B008
         self.now_ns = 0
+        self.seat, self.record = seat, record
         self.epoch, self.flags, self.state = 1, 0, State.STANDBY
         self.counter, self.standby = 0, ""
-        self.node = Node(config, 1, VoteRecord(), 0)
+        self.node = Node(config, 1, record, 0)
         self.acts: list[acts.Act] = []
+        self.said: list[str] = []
         self.live(5_000)
 
     def step(self, event: Event) -> Ready:
         ready = self.node.step(event, self.now_ns)
         self.acts += ready.act
+        self.record = ready.persist or self.record
+        self.said += [one.sentence for one in ready.told]
         return ready
 
     def live(self, ms: int) -> None:
@@ -43,19 +65,19 @@ class Lonely:
             self.now_ns += 20 * MS
             self.step(Tick())
             self.counter += 1
-            seat = Entry(NAME, STATES.index(self.state), self.epoch, "robot1", standby=self.standby, flags=self.flags)
+            seat = Entry(NAME, STATES.index(self.state), self.epoch, self.seat, standby=self.standby, flags=self.flags)
+            seats = (seat,) if self.seat else ()
             echo = Echo("robot2", 1, self.node.word().counter)
             rule = RULES.index(Rule.ETCD)
-            self.step(
-                Received(Beat(COORDINATOR, 1, self.counter, 1, total=1, echoes=(echo,), entries=(seat,), rule=rule), "etcd")
-            )
+            beat = Beat(COORDINATOR, 1, self.counter, 1, total=len(seats), echoes=(echo,), entries=seats, rule=rule)
+            self.step(Received(beat, "etcd"))
 
     def fetched(self, epoch: int, sequence: int) -> None:
         self.step(Fetched(NAME, epoch, position(epoch, sequence), SPEC, self.now_ns))
 
     @property
-    def held(self) -> tuple[Position, ...]:
-        return next((one.positions for one in self.node.status(self.now_ns).components), ())
+    def held(self) -> list[Position]:
+        return [position for one in self.node.status(self.now_ns).components for position in one.positions]
 
     def claims(self) -> bool:
         """Whether it claims it, or has done so in vain."""
@@ -81,10 +103,10 @@ def test_a_later_checkpoint_is_never_replaced_by_an_earlier_one() -> None:
     robot.fetched(2, 3)
     robot.live(100)
     robot.fetched(1, 900)
-    assert robot.held == (position(2, 3),)
+    assert robot.held == [position(2, 3)]
     assert acts.Discard(NAME, 2, position(1, 900)) in robot.acts
     robot.fetched(2, 4)
-    assert robot.held == (position(2, 4), position(2, 3))
+    assert robot.held == [position(2, 4), position(2, 3)]
 
 
 def test_it_looks_into_the_archive_once_more_and_then_claims_without_waiting_for_the_old_primary() -> None:
@@ -132,7 +154,7 @@ def test_a_standby_that_heard_its_primary_waits_for_no_patience_once_it_has_look
 
 
 def test_what_ran_elsewhere_does_not_begin_anew_before_the_archive_has_answered() -> None:
-    declared = Lonely(Config(**{name: getattr(CONFIG, name) for name in CONFIG.__struct_fields__} | {"components": (SPEC,)}))
+    declared = Lonely(DECLARED)
     declared.flags = FREE | OPEN
     declared.live(100_000)
     assert not declared.claims()
@@ -141,15 +163,117 @@ def test_what_ran_elsewhere_does_not_begin_anew_before_the_archive_has_answered(
     assert declared.claims()
 
 
-def test_copies_of_a_life_that_has_ended_count_no_more_once_it_begins_anew() -> None:
+@pytest.mark.parametrize("end", [State.FINISHED, State.FAILED, State.RELEASED])
+def test_copies_of_a_life_that_has_ended_count_no_more_once_it_begins_anew(end: State) -> None:
     robot = Lonely()
     robot.fetched(1, 5)
     robot.live(100)
-    robot.state = State.RELEASED
+    robot.state = end
     robot.live(100)
     robot.state, robot.epoch = State.STANDBY, 2
     robot.live(100)
+    assert robot.held == [], "what it held is of the former life too"
     robot.fetched(1, 6)
-    assert robot.held == ()
+    assert robot.held == []
+    robot.node = Node(CONFIG, 2, robot.record, 0)
+    robot.live(100)
+    robot.fetched(1, 6)
+    assert robot.held == [], "an agent that restarts knows it still"
     robot.fetched(2, 1)
-    assert robot.held == (position(2, 1),)
+    assert robot.held == [position(2, 1)]
+
+
+def test_a_copy_alone_makes_no_program_run_before_an_operator_orders_it() -> None:
+    """It may have ended, or have been released and run on, at a robot that is not heard: etcd has no seat of it."""
+    robot = Lonely(seat="")
+    robot.fetched(9, 5)
+    for _ in range(5):
+        robot.live(20_000)
+        robot.step(Looked(robot.now_ns))
+    assert robot.held and not robot.claims()
+    (shown,) = robot.node.status(robot.now_ns).components
+    assert any("failover handover /lab/robot1/mapper resumes it at robot2" in note for note in shown.notes)
+    robot.step(Handover(7, NAME))
+    robot.live(100)
+    entry = robot.node.word().entry(NAME)
+    assert entry is not None and (entry.epoch, entry.primary) == (10, "robot2")
+
+
+def test_what_is_declared_where_nobody_knows_it_looks_into_the_archive_before_it_begins_anew() -> None:
+    robot = Lonely(DECLARED, seat="")
+    robot.live(20_000)
+    assert robot.looks() and not robot.claims()
+    robot.step(Looked(robot.now_ns, (NAME,)))
+    robot.fetched(9, 5)
+    robot.live(100)
+    entry = robot.node.word().entry(NAME)
+    assert entry is not None and (entry.epoch, entry.primary) == (10, "robot2")
+    silent = Lonely(DECLARED, seat="")
+    silent.live(70_000)
+    assert silent.claims(), "an archive that does not answer stops nothing new for longer than the patience"
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_program_of_this_robot_that_never_had_a_checkpoint_starts_again_while_the_archive_is_silent(begun: bool) -> None:
+    record = VoteRecord((Record(NAME, 1, "robot2", State.STANDBY, spec=SPEC, begun=begun),))
+    robot = Lonely(DECLARED, record, seat="robot2")
+    robot.flags = FREE | OPEN
+    robot.live(10_000)
+    entry = robot.node.word().entry(NAME)
+    assert entry is not None and (entry.epoch > 1) != begun
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_a_standby_that_heard_its_primary_waits_for_a_newer_copy_that_it_knows_of(behind: bool) -> None:
+    robot = Lonely()
+    robot.standby = "robot2"
+    robot.fetched(1, 5)
+    for counter in range(1, 50):
+        held = Entry(NAME, STATES.index(State.PRIMARY), 1, "robot1", 1 * (PEERS_MAX + 1), 5, b"d", standby="robot2")
+        robot.step(Received(Beat("robot1", 1, counter, 1, total=1, entries=(held,), rule=RULES.index(Rule.ETCD)), "lan"))
+        robot.live(20)
+    robot.flags = FREE
+    for _ in range(10):
+        robot.live(500)
+        if behind:
+            robot.step(Looked(robot.now_ns, (NAME,)))
+    assert robot.claims() != behind
+
+
+def test_a_copy_that_is_older_than_this_boot_of_the_computer_says_how_old_it_is() -> None:
+    robot = Lonely()
+    robot.step(Fetched(NAME, 1, position(1, 5), SPEC, robot.now_ns, age_ns=3 * 86_400_000 * MS))
+    robot.live(100)
+    (shown,) = robot.node.status(robot.now_ns).components
+    assert any("came from the archive and is 2592" in note for note in shown.notes), shown.notes
+
+
+def test_after_a_takeover_from_the_archive_no_sentence_tells_how_much_was_lost() -> None:
+    """The time of the file here is when the copy came: it does not say how old the state is."""
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.live(100)
+    robot.flags = FREE
+    robot.live(100)
+    robot.step(Looked(robot.now_ns))
+    robot.live(100)
+    robot.seat, robot.epoch, robot.flags = "robot2", 2, 0
+    robot.live(100)
+    assert any(isinstance(act, acts.Restore) for act in robot.acts)
+    robot.step(Restored(NAME, 2, position(1, 5), age_ns=100 * MS, lost_ns=100 * MS))
+    assert any("resumes from checkpoint 5" in said for said in robot.said)
+    assert not any("of its work" in said for said in robot.said)
+
+
+def test_a_component_that_waits_for_its_robot_is_not_said_to_be_resumed_elsewhere_from_the_archive() -> None:
+    spec = msgspec.structs.replace(SPEC, rules=Rules(on_loss=OnLoss.HOLD))
+    robot = Lonely(msgspec.structs.replace(CONFIG, components=(spec,)), seat="")
+    robot.step(Looked(robot.now_ns))
+    robot.live(100)
+    robot.seat, robot.epoch = "robot2", 1
+    robot.live(100)
+    robot.step(Started(NAME, 1))
+    robot.step(Archived(NAME, 1, position(1, 1), robot.now_ns))
+    robot.live(100)
+    (shown,) = robot.node.status(robot.now_ns).components
+    assert "in the archive waits until robot2 is back" in shown.promise
