@@ -33,6 +33,8 @@ from checkpoint.model import Position
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
+from checkpoint.store.index import folder_name
+from failover.archive.archive import Copy
 from failover.archive.sealed import key_path
 from failover.core.events import Archived, Event, Noticed
 
@@ -53,12 +55,15 @@ class _Shelf(Struct):
 
     Attributes:
         position: of the newest copy; None: none was made by this worker with this key.
+        epoch: of that one; put_ns: when it was there, by the boot clock.
         since_s: when that was made, or the component was first seen here; monotonic.
         trouble: why the last try failed, wholly or for a file that it needs; "" if it did not.
     """
 
     since_s: float
     position: Position | None = None
+    epoch: int = 0
+    put_ns: int = 0
     trouble: str = ""
     has: set[bytes] = field(default_factory=set)
     """Digests of the files that it needs and that were found in the archive."""
@@ -109,6 +114,19 @@ class Archiving:
             for shelf in self._shelves.values():
                 shelf.position, shelf.has = None, set()
         self._key_file = found
+
+    def listed(self, copies: Collection[Copy], begun_ns: int) -> None:
+        """What the archive had from that instant on: a copy that has gone, and was followed by no later one, is put again."""
+        newest: dict[str, tuple[int, int]] = {}
+        for copy in copies:
+            newest[copy.folder] = max(newest.get(copy.folder, (0, 0)), (copy.generation, copy.sequence))
+        for name, shelf in self._shelves.items():
+            if shelf.position is None or shelf.put_ns >= begun_ns:
+                continue
+            if newest.get(folder_name(name), (0, 0)) < (shelf.position.generation, shelf.position.sequence):
+                shelf.position, shelf.has = None, set()
+                self._tell(Archived(name, shelf.epoch, None, begun_ns))
+                self._tell(Noticed(name, "its newest copy is in the archive no more: it is put again"))
 
     def complaints(self) -> list[str]:
         """For the status: what is not in the archive as it should be."""
@@ -182,6 +200,7 @@ class Archiving:
         finally:
             close_all(chain)
         shelf.position, shelf.since_s = header.position, begun_s
+        shelf.epoch, shelf.put_ns = header.epoch, clock.now_ns()
         if fetches(self._settings):
             self._tell(Archived(name, header.epoch, header.position, begun_ns))
         log.debug("%s is in the archive: %s, %d bytes", name, done.name, done.size)

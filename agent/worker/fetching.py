@@ -14,7 +14,7 @@ import itertools
 import logging
 import os
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from typing import Final
 
 import msgspec
@@ -25,6 +25,7 @@ from agent.config import Settings
 from agent.errors import TROUBLE
 from agent.main_loop.messages import Told
 from agent.system import clock
+from agent.system.threads import to_its_end
 from agent.worker.archive_process import LEAST_RATE, ArchiveProcess, NotArchivedError
 from agent.worker.replication.receive_files import is_in_place
 from checkpoint.engine import COOPERATIVE
@@ -32,11 +33,13 @@ from checkpoint.errors import UNDECODABLE
 from checkpoint.model import Position, Snapshot
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
+from checkpoint.snapshot.untrusted import NOT_UNDERSTOOD
 from checkpoint.store.contract import SnapshotStore
+from checkpoint.store.index import folder_name
 from failover.archive.archive import Copy, Label
 from failover.core.acts import Accept
 from failover.core.events import Event, Fetched, Looked, Noticed
-from failover.core.types import ComponentSpec, State, StatusView
+from failover.core.types import ENDED, ComponentSpec, State, StatusView
 
 ANSWER_S: Final = 30.0
 """For a list, and for a copy besides its bytes; the start of the process on a busy machine is in it."""
@@ -72,12 +75,15 @@ class Fetching:
         told: Callable[[], Awaitable[Told]],
         tell: Callable[[Event], None],
         kept: Callable[[Arrived], None],
+        listed: Callable[[Collection[Copy], int], None] = lambda _copies, _begun_ns: None,
     ) -> None:
         """
         Args:
             told: the core's view of the team.
             kept: called with a checkpoint once the core has accepted it.
+            listed: called with what the archive had, and the instant at which it was asked.
         """
+        self._listed = listed
         self._settings, self._store = settings, store
         self._told, self._tell, self._kept = told, tell, kept
         self._process = ArchiveProcess(settings.path)
@@ -85,6 +91,9 @@ class Fetching:
         self._ordered = asyncio.Event()
         self._fetched: dict[str, Position] = {}
         self._seen: dict[str, tuple[int, Line]] = {}
+        self._looked_for: set[str] = set()
+        self._in_advance, self._gives_way = "", False
+        self._absent: set[bytes] = set()
         self._refused: dict[str, int] = {}
         self._troubles: dict[str, str] = {}
         self._silent = ""
@@ -103,9 +112,13 @@ class Fetching:
         finally:
             self._process.close()
 
-    def look(self) -> None:
-        """The core orders a look: it does not wait for the next period."""
+    def look(self, component: str) -> None:
+        """The core orders a look, because it could take that component over: what is fetched in advance gives way to it."""
+        self._looked_for.add(component)
         self._ordered.set()
+        if self._in_advance not in ("", component):
+            self._gives_way = True
+            self._process.hang_up()
 
     def accepted(self, act: Accept) -> bool:
         """The core counts a checkpoint as held here; False if it did not come from the archive."""
@@ -140,21 +153,44 @@ class Fetching:
         if self._silent:
             self._tell(Noticed("", "the archive answers again"))
         self._silent, self._answered_s = "", time.monotonic()
+        self._listed(copies, begun_ns)
+        if view is None:
+            return
+        names = self._names(view)
         wanted: dict[str, list[Copy]] = {}
         for folder, group in itertools.groupby(copies, key=lambda copy: copy.folder):
             found = list(group)
-            self._look_for_a_rollback(found[0])
-            if not _takes(found[0].component, view):
+            name = names.get(folder, found[0].component)
+            self._look_for_a_rollback(name, found[0])
+            if not _takes(name, view):
                 self._fetched.pop(folder, None)
-            elif newer := [copy for copy in found if self._is_newer(copy)]:
-                wanted[found[0].component] = newer[:TRIES_MAX]
+            elif newer := self._newer(name, found, view):
+                wanted[name] = newer
+        self._look_for_an_empty_archive({copy.folder for copy in copies}, names, view)
         self._tell(Looked(begun_ns, tuple(wanted)))
-        for name, newer in wanted.items():
-            await self._fetch(name, newer, begun_ns, number)
+        looked_for, self._looked_for = self._looked_for, set()
+        for name in sorted(wanted, key=lambda one: (one not in looked_for, wanted[one][0].size)):
+            self._in_advance = "" if name in looked_for else name
+            await self._fetch(name, wanted[name], begun_ns, number)
+            self._in_advance, self._gives_way = "", False
+            if self._ordered.is_set():
+                return  # the list is old: the next round begins at once, with what is looked for
 
-    def _look_for_a_rollback(self, newest: Copy) -> None:
+    def _names(self, view: StatusView) -> dict[str, str]:
+        """Folder of the archive → component: the name of a folder is cut where the component's is too long."""
+        known = (*self._settings.config.components, *self._store.components(), *(one.name for one in view.components))
+        return {folder_name(name): name for name in known}
+
+    def _look_for_an_empty_archive(self, folders: set[str], names: dict[str, str], view: StatusView) -> None:
+        """As `_look_for_a_rollback`, of components of which not even an older copy is there; those that ended may be removed."""
+        lives = {one.name for one in view.components if one.state not in ENDED}
+        for folder in self._seen.keys() - folders:
+            if (name := names.get(folder, "")) in lives:
+                self._troubles[name] = f"{name}: the archive has lost all copies of it, or was rolled back to a time before them"
+
+    def _look_for_a_rollback(self, name: str, newest: Copy) -> None:
         """An archive that has only older copies than it had is told of; what this robot holds is newer, and stays."""
-        name, line = newest.component, (newest.epoch, (newest.generation, newest.sequence))
+        line = newest.epoch, (newest.generation, newest.sequence)
         had = self._seen.get(newest.folder, line)
         self._seen[newest.folder] = max(had, line)
         if line < had:
@@ -165,19 +201,24 @@ class Fetching:
         elif "rolled back" in self._troubles.get(name, ""):
             del self._troubles[name]
 
-    def _is_newer(self, copy: Copy) -> bool:
-        known = (self._store.newest(copy.component), self._fetched.get(copy.folder))
-        ours = max(((one.generation, one.sequence) for one in known if one is not None), default=(0, 0))
-        return (copy.generation, copy.sequence) > ours
+    def _newer(self, name: str, found: list[Copy], view: StatusView) -> list[Copy]:
+        """The copies that are newer than what the core counts as held here, the newest first."""
+        held = (position for one in view.components if one.name == name for position in one.positions)
+        had = self._fetched.get(found[0].folder)
+        ours = max(((one.generation, one.sequence) for one in (*held, had) if one is not None), default=(0, 0))
+        return [copy for copy in found if (copy.generation, copy.sequence) > ours]
 
     async def _fetch(self, name: str, newer: list[Copy], begun_ns: int, number: int) -> None:
-        """Take the newest copy that is whole; never raises."""
-        for copy in newer:
-            if self._refused.get(copy.name, 0) > number:
-                continue
+        """Take the newest copy that is whole; never raises. Where it is not the newest of all, the core looks again."""
+        tried = [copy for copy in newer if self._refused.get(copy.name, 0) <= number]
+        for copy in tried[:TRIES_MAX]:
             try:
-                await self._take(copy, begun_ns)
-            except TROUBLE as error:
+                await self._take(copy, begun_ns if copy is newer[0] else 0)
+            except (*TROUBLE, *NOT_UNDERSTOOD) as error:  # who sealed it has the key, and still its word is its own
+                if self._gives_way:
+                    return
+                if not isinstance(error, TROUBLE):
+                    log.warning("%s is not understood", copy.name, exc_info=error)
                 self._refused[copy.name] = number + PAUSE_ROUNDS
                 if name not in self._troubles:
                     self._tell(Noticed(name, f"a copy in the archive was not taken: {error}"))
@@ -185,7 +226,8 @@ class Fetching:
             else:
                 if copy is newer[0]:
                     self._troubles.pop(name, None)
-                    self._refused.clear()
+                    for one in newer:
+                        self._refused.pop(one.name, None)
                 return
 
     async def _take(self, copy: Copy, begun_ns: int) -> None:
@@ -197,7 +239,7 @@ class Fetching:
             spec = _spec(copy, label)
             header = format.read_header(descriptor)
             await self._bring(descriptor)
-            snapshot = await asyncio.to_thread(self._store.put, descriptor)
+            snapshot = await to_its_end(self._store.put, descriptor)
         finally:
             os.close(descriptor)
         self._fetched[copy.folder] = header.position
@@ -213,24 +255,27 @@ class Fetching:
             return
         outline = await asyncio.to_thread(format.read_outline, descriptor)
         contents = self._store.contents
-        for need in needs(outline):
+        opened = self._settings.component(outline.component).bring_data
+        for need in needs(outline, opened=opened):
             if not need.digest or await asyncio.to_thread(is_in_place, need) or contents.hold(need.digest, need.size):
                 continue
             file = await asyncio.to_thread(self._store.unnamed)
             try:
                 await self._process.ask(FetchContent(need), (file,), limit_s=ANSWER_S + need.size / LEAST_RATE)
-                await asyncio.to_thread(contents.put, file, need.digest)
+                await to_its_end(contents.put, file, need.digest)
             except TROUBLE as error:
-                log.warning("a file that a program needs did not come from the archive: %s", error)
+                if need.digest not in self._absent:
+                    log.warning("a file that a program needs did not come from the archive: %s", error)
+                self._absent.add(need.digest)
             finally:
                 os.close(file)
 
 
-def _takes(name: str, view: StatusView | None) -> bool:
+def _takes(name: str, view: StatusView) -> bool:
     """Whether this robot may have to run a component whose primary it does not hear."""
-    known = next((one for one in view.components if one.name == name), None) if view is not None else None
-    if known is None or view is None:
-        return view is not None
+    known = next((one for one in view.components if one.name == name), None)
+    if known is None:
+        return True
     is_heard = any(peer.robot == known.primary and peer.state in ("alive", "suspect", "restarting") for peer in view.peers)
     return known.state in _IDLE and not is_heard
 

@@ -170,7 +170,9 @@ class Worker(Switchboard):
         if fetches(self.settings):
             from agent.worker.fetching import Fetching  # here: with rule = "etcd" and an archive alone
 
-            self._fetching = Fetching(self.settings, store, lambda: self.ask("status"), self.tell, self._arrived)
+            assert self._archiving is not None, "it fetches from the archive that it puts copies into"
+            listed = self._archiving.listed
+            self._fetching = Fetching(self.settings, store, lambda: self.ask("status"), self.tell, self._arrived, listed)
             self._task(self._fetching.run())
         found = await self._find_guards(records)
         await self._mend_logs(found)
@@ -305,7 +307,7 @@ class Worker(Switchboard):
                     self._deposit.accept(act)
             case acts.Look():
                 if self._fetching is not None:
-                    self._fetching.look()
+                    self._fetching.look(act.component)
             case acts.Discard():
                 self._task(self._deposit.discard(act))
             case acts.Show():

@@ -210,6 +210,7 @@ class Fetched(Struct, frozen=True):
 
     Attributes:
         epoch: under which it was taken.
+        begun_ns: 0 where the archive had a newer one that did not come.
         age_ns: how old the copy is, by the clock of the robot that made it.
     """
 
@@ -223,11 +224,11 @@ class Fetched(Struct, frozen=True):
 
 
 class Archived(Struct, frozen=True):
-    """The archive has a copy of the component that runs here, as it was at ``begun_ns`` or a moment before."""
+    """The archive has a copy of the component that runs here, as it was at ``begun_ns`` or a moment before; None: no more."""
 
     component: str
     epoch: int
-    position: Position
+    position: Position | None
     begun_ns: int
 
 

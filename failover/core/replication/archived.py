@@ -74,7 +74,7 @@ def gave(component: Component, position: Position) -> bool:
 def archived(component: Component, event: Archived) -> None:
     """A copy of what runs here is in the archive, as it was at that instant or a moment before."""
     if event.epoch == component.epoch and component.holding:
-        component.sealed, component.sealed_ns = event.position, event.begun_ns
+        component.sealed, component.sealed_ns = event.position, event.begun_ns if event.position is not None else -1
 
 
 def sealed_ns(component: Component) -> int:

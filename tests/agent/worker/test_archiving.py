@@ -22,6 +22,7 @@ from agent import config as configuration
 from agent.archive.messages import KeepCheckpoint
 from agent.archive.process import Archivist
 from agent.errors import LaneError
+from agent.system import clock
 from agent.worker.archiving import Archiving
 from agent.worker.network.remote_orders import Errands
 from agent.worker.replication.send_files import Reader
@@ -39,7 +40,7 @@ from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
 from failover.config import team
 from failover.config.team import Robot, Role, Team
-from failover.core.events import Event
+from failover.core.events import Archived, Event
 from failover.core.wire.messages import Bulk, Chunk, Offer
 from tests.checkpoint.snapshots import COMPONENT, history, page, pages_of, snapshot
 
@@ -313,3 +314,24 @@ def test_a_process_that_does_not_end_when_it_is_killed_is_told_and_no_second_one
                 process.send_signal(signal.SIGKILL)
                 process.wait()
         assert len(started) == 1
+
+
+def test_a_copy_that_has_gone_from_the_archive_is_put_again_and_the_core_hears_of_it(tmp_path: Path) -> None:
+    with member(tmp_path) as robot:
+        robot.put(*history(1))
+        robot.running.add(COMPONENT)
+
+        async def work() -> None:
+            await until(lambda: robot.archived() and robot.archiving._shelves[COMPONENT].position)
+            (copy,) = robot.archive().copies()
+            robot.archiving.listed([copy], clock.now_ns())
+            assert not robot.events, "it is there"
+            (tmp_path / "place" / copy.name).unlink()
+            begun_ns = robot.archiving._shelves[COMPONENT].put_ns
+            robot.archiving.listed([], begun_ns)
+            assert not robot.events, "the archive was asked before the copy was there"
+            robot.archiving.listed(robot.archive().copies(), clock.now_ns())
+            assert [event.position for event in robot.events if isinstance(event, Archived)] == [None]
+            await until(robot.archived)
+
+        run(robot, work)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,11 +12,14 @@ import msgspec
 import pytest
 
 from agent import config as configuration
+from agent.archive.messages import Done, Fetch, Request
 from agent.main_loop.messages import Told
+from agent.worker import fetching
 from agent.worker.fetching import Arrived, Fetching
 from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
+from checkpoint.store.chain import position_of
 from checkpoint.store.store import open_store
 from failover.archive import sealed
 from failover.archive.archive import Archive
@@ -23,7 +27,7 @@ from failover.archive.objects import FolderObjects
 from failover.config import team
 from failover.config.team import Robot, Team
 from failover.core.events import Event, Fetched, Looked
-from failover.core.types import ComponentSpec, StatusView
+from failover.core.types import ComponentSpec, ComponentView, Protection, State, StatusView
 from tests.checkpoint.snapshots import COMPONENT, history
 
 pytest.importorskip("cryptography")
@@ -35,7 +39,7 @@ SPEC = ComponentSpec(COMPONENT)
 class Member:
     """A robot's store, the archive beside it, and what the core would hear."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, bring: bool = False, components: str = "") -> None:
         robots = {f"robot{place}": Robot((f"127.0.0.1:74{place}0",), f"127.0.0.1:74{place}1") for place in (1, 2)}
         team.write(directory / "team", Team("lab", robots))
         sealed.new_key(directory / "team")
@@ -44,15 +48,16 @@ class Member:
         path = directory / "agent.toml"
         path.write_text(
             f'robot = "robot1"\nteam_directory = "{directory}/team"\nstate_directory = "{directory}/state"\ninsecure = true\n'
-            f'bring = false\nrule = "etcd"\nlease_ms = 1800\n[coordinator]\nendpoints = ["http://127.0.0.1:1"]\n'
-            f'[store]\ns3 = "{directory}/place"\ns3_every_s = 1\n'
+            f'bring = {str(bring).lower()}\nrule = "etcd"\nlease_ms = 1800\n[coordinator]\nendpoints = ["http://127.0.0.1:1"]\n'
+            f'[store]\ns3 = "{directory}/place"\ns3_every_s = 1\n{components}'
         )
         self.directory, self.events = directory, list[Event]()
+        self.seen: tuple[ComponentView, ...] = ()
         self.store = open_store(directory / "state" / "store")
         self.fetching = Fetching(configuration.load(path), self.store, self.told, self.events.append, self.kept)
 
     async def told(self) -> Told:
-        return Told(1, 0, StatusView("robot1", 1, "etcd", "", True, (), ()))
+        return Told(1, 0, StatusView("robot1", 1, "etcd", "", True, (), self.seen))
 
     def kept(self, arrived: Arrived) -> None:
         raise AssertionError("no core accepts it here")
@@ -74,9 +79,9 @@ class Member:
                 await asyncio.sleep(0.02)
 
 
-def run(tmp_path: Path, work: Callable[[Member], object]) -> None:
+def run(tmp_path: Path, work: Callable[[Member], object], bring: bool = False, components: str = "") -> None:
     async def both() -> None:
-        member = Member(tmp_path)
+        member = Member(tmp_path, bring, components)
         taking = asyncio.create_task(member.fetching.run())
         try:
             await work(member)  # type: ignore[misc]
@@ -88,12 +93,16 @@ def run(tmp_path: Path, work: Callable[[Member], object]) -> None:
     asyncio.run(both())
 
 
-def bases() -> list[Snapshot]:
+def bases(count: int = 3, component: str = COMPONENT) -> list[Snapshot]:
     """Whole checkpoints of one component, each later than the one before."""
-    first = history(1)[0]
-    return [
-        msgspec.structs.replace(first, position=msgspec.structs.replace(first.position, sequence=number)) for number in (1, 2, 3)
-    ]
+    first = msgspec.structs.replace(history(1)[0], component=component)
+    return [msgspec.structs.replace(first, position=position_of(first, 1, number)) for number in range(1, count + 1)]
+
+
+def harm(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
 
 
 def test_the_newest_copy_comes_into_the_store_an_altered_one_is_named_and_a_rollback_is_told(tmp_path: Path) -> None:
@@ -104,9 +113,7 @@ def test_the_newest_copy_comes_into_the_store_an_altered_one_is_named_and_a_roll
         assert member.store.newest(COMPONENT) == first.position
         assert any(isinstance(event, Looked) and event.behind == (COMPONENT,) for event in member.events)
         harmed = member.directory / "place" / member.put(third)
-        content = bytearray(harmed.read_bytes())
-        content[len(content) // 2] ^= 1
-        harmed.write_bytes(content)
+        harm(harmed)
         await member.until(lambda: "was not taken" in " ".join(member.fetching.complaints()))
         assert member.store.newest(COMPONENT) == first.position, "nothing of an altered copy is used"
         harmed.unlink()
@@ -115,5 +122,108 @@ def test_the_newest_copy_comes_into_the_store_an_altered_one_is_named_and_a_roll
         await member.until(lambda: "rolled back" in " ".join(member.fetching.complaints()))
         assert (member.directory / "place" / name).exists()
         assert member.store.newest(COMPONENT) == second.position
+
+    run(tmp_path, work)
+
+
+def test_a_copy_that_is_not_the_newest_does_not_say_that_this_robot_has_all_that_the_archive_had(tmp_path: Path) -> None:
+    """Three newer ones do not open: the fourth is taken all the same, and the core waits as for an archive that is silent."""
+
+    async def work(member: Member) -> None:
+        first, *newer = bases(4)
+        for one in newer:
+            harm(member.directory / "place" / member.put(one))
+        member.put(first)
+        await member.until(lambda: member.fetched() == [1])
+        (event,) = (event for event in member.events if isinstance(event, Fetched))
+        assert event.begun_ns == 0
+        looks = len(member.events)
+        await member.until(lambda: any(isinstance(event, Looked) for event in member.events[looks:]))
+        assert all(event.behind == (COMPONENT,) for event in member.events if isinstance(event, Looked))
+
+    run(tmp_path, work)
+
+
+def test_a_success_of_one_component_does_not_have_the_harmed_copy_of_another_tried_again(tmp_path: Path) -> None:
+    other = "/lab/robot1/planner"
+
+    async def work(member: Member) -> None:
+        harm(member.directory / "place" / member.put(bases(1)[0]))
+        await member.until(member.fetching.complaints)
+        refused = dict(member.fetching._refused)
+        member.put(bases(1, other)[0])
+        await member.until(lambda: member.fetched() == [1])
+        assert member.fetching._refused == refused
+
+    run(tmp_path, work)
+
+
+def test_a_component_whose_name_is_too_long_for_an_object_is_told_of_by_its_whole_name(tmp_path: Path) -> None:
+    name = "/lab/robot1/" + "\u5730\u56fe" * 8
+
+    async def work(member: Member) -> None:
+        harm(member.directory / "place" / member.put(bases(1, name)[0]))
+        await member.until(lambda: any(isinstance(event, Looked) and event.behind for event in member.events))
+        assert all(event.behind in ((), (name,)) for event in member.events if isinstance(event, Looked))
+
+    run(tmp_path, work, components=f'[components."{name}"]\nbring_data = false\n')
+
+
+def test_what_is_fetched_in_advance_gives_way_to_what_the_core_looks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The archive's process stands still in the middle of the one copy."""
+    other = "/lab/robot1/planner"
+
+    async def work(member: Member) -> None:
+        process, stopped = member.fetching._process, list[int]()
+        ask = process.ask
+
+        async def stopping(request: Request, descriptors: tuple[int, ...] = (), limit_s: float = 0.0) -> Done:
+            if isinstance(request, Fetch) and not stopped:
+                assert process._child is not None
+                stopped.append(process._child.pid)
+                os.kill(stopped[0], signal.SIGSTOP)
+            return await ask(request, descriptors, limit_s)
+
+        monkeypatch.setattr(process, "ask", stopping)
+        member.put(bases(1)[0])
+        await member.until(lambda: stopped)
+        member.put(bases(2, other)[1])
+        member.fetching.look(other)
+        await member.until(lambda: len(member.fetched()) == 2)
+        assert member.fetched() == [2, 1]
+        assert not member.fetching.complaints()
+
+    run(tmp_path, work)
+
+
+def test_a_copy_that_is_not_understood_is_refused_by_name_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def misread(*_: object, **__: object) -> None:
+        raise KeyError("executable")
+
+    monkeypatch.setattr(fetching, "needs", misread)
+
+    async def work(member: Member) -> None:
+        member.put(bases(1)[0])
+        await member.until(member.fetching.complaints)
+        monkeypatch.undo()
+        member.put(bases(2)[1])
+        await member.until(lambda: member.fetched() == [2])
+
+    run(tmp_path, work, bring=True)
+
+
+def test_what_the_core_does_not_count_as_held_is_taken_again_and_an_emptied_archive_is_told(tmp_path: Path) -> None:
+    async def work(member: Member) -> None:
+        (first,) = bases(1)
+        descriptor = memfd_holding(format.encode_bytes(first), "snapshot")
+        member.store.put(descriptor)
+        os.close(descriptor)
+        name = member.put(first)
+        await member.until(lambda: member.fetched() == [1])
+        member.seen = (ComponentView(COMPONENT, State.STANDBY, 1, "robot2", "", Protection.NONE, -1, 0, (first.position,), ""),)
+        (member.directory / "place" / name).unlink()
+        await member.until(lambda: "lost all copies" in " ".join(member.fetching.complaints()))
 
     run(tmp_path, work)
