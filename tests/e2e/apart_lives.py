@@ -81,6 +81,7 @@ class Lives:
         new = robots.until(fresh, "its first acts", PATIENCE_S)
         old = next(act for act in reversed(site.acts()) if act.life != new[0].life)
         took_s, lost = (new[1].at_ns - old.at_ns) / 1e9, old.number + 1 - new[0].number
+        assert new[0].number > 0, f"{other.name} began anew, although the archive had a copy"
         assert took_s > 0, f"{other.name} acted {-took_s:.1f} s before the last act of {robot.name}"
         self.takeovers_s.append(took_s)
         self.lost.append(lost)

@@ -30,6 +30,8 @@ RECONNECT_EVERY_S: Final = 0.2
 LOOK_EVERY_S: Final = 0.2
 """Between two looks whether a component is protected."""
 
+IN_THE_ARCHIVE: Final = "a copy of it is in the archive: a robot that has the archive key, and that etcd votes for, can resume it"
+
 ENDED: Final = OVER_STATES | {"failed"}
 
 
@@ -59,7 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
                 name = str(answer.get("started", answer)["name"])
                 standby = until_protected(agent, name, is_quiet=arguments.json)
                 if not arguments.json:
-                    print(visible(f"{standby} holds a checkpoint of it: it is protected"), file=sys.stderr)
+                    told = f"{standby} holds a checkpoint of it: it is protected" if standby else IN_THE_ARCHIVE
+                    print(visible(told), file=sys.stderr)
             return _started(answer, arguments)
         with follower.passing_signals_on():
             return exit_like(follower.follow(agent, wanted))
@@ -146,7 +149,7 @@ class _Follower:
 
 
 def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> str:
-    """Return when another robot, or the archive, holds a checkpoint of a component, and which; tell meanwhile how far that is.
+    """Return when a robot ("": the archive) holds a checkpoint of a component, and which; tell meanwhile how far that is.
 
     Raises:
         FailoverError: the component has ended, or cannot be protected.
@@ -160,7 +163,7 @@ def until_protected(agent: Control, name: str, *, is_quiet: bool = False) -> str
             if one["state"] in ENDED:
                 raise FailoverError(f"{name} is {one['state']}: it will not be protected; see failover why {name}")
             if one["protection"] == "protected":
-                return str(one["standby"]) or "the archive"
+                return str(one["standby"])
             if one["protection"] == "stopped":
                 why = "; ".join(one["reasons"]) or "on_unsupported = stop_protecting"
                 raise FailoverError(f"{name} runs and stays unprotected: {why}")

@@ -196,6 +196,12 @@ def waiting(*pictures: dict[str, Any], every: int = 8) -> Callable[[Request], An
     return answer
 
 
+def test_a_copy_in_the_archive_alone_is_not_said_to_be_at_a_robot_that_stands_by(agent: Start) -> None:
+    ran = failover("run", "--wait", "--detach", "--", "x", socket=agent(waiting({"protection": "protected", "standby": ""})).path)
+    assert ran.returncode == 0
+    assert "a copy of it is in the archive" in ran.stderr and "it is protected" not in ran.stderr
+
+
 @pytest.mark.parametrize("words", [("protect", "41"), ("run", "--detach", "--", "x")])
 def test_waiting_for_the_first_checkpoint_tells_how_much_of_what_has_arrived(agent: Start, words: tuple[str, ...]) -> None:
     socket = agent(waiting(*WAITS, {"protection": "protected"})).path

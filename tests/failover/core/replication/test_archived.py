@@ -19,6 +19,7 @@ from failover.core.types import (
     Config,
     Launch,
     OnLoss,
+    Protection,
     Record,
     Rule,
     Rules,
@@ -277,3 +278,19 @@ def test_a_component_that_waits_for_its_robot_is_not_said_to_be_resumed_elsewher
     robot.live(100)
     (shown,) = robot.node.status(robot.now_ns).components
     assert "in the archive waits until robot2 is back" in shown.promise
+
+
+def test_a_primary_whose_copy_the_archive_has_lost_is_not_said_to_be_protected_by_it() -> None:
+    robot = Lonely(DECLARED, seat="")
+    robot.step(Looked(robot.now_ns))
+    robot.live(100)
+    robot.seat, robot.epoch = "robot2", 1
+    robot.live(100)
+    robot.step(Started(NAME, 1))
+    robot.step(Archived(NAME, 1, position(1, 1), robot.now_ns))
+    (shown,) = robot.node.status(robot.now_ns).components
+    assert shown.protection is Protection.PROTECTED
+    robot.step(Archived(NAME, 1, None, robot.now_ns))
+    (shown,) = robot.node.status(robot.now_ns).components
+    assert shown.protection is Protection.NONE
+    assert any("NOT PROTECTED" in note for note in shown.notes)
