@@ -23,6 +23,9 @@ LATE_MS = 1_500
 
 KEPT = 3
 
+FAILS = 0.1
+"""Of the copies that a robot wants; it lists them again in the next period."""
+
 
 class SimulatedArchive:
     """The copies, and the ways to them.
@@ -105,8 +108,15 @@ class SimulatedArchive:
             if copies and self._takes(robot, component) and (not own or max(own) < max(copies)):
                 wanted[component] = max(copies)
         self._world.feed(robot, Looked(begun_ns, tuple(wanted)))
-        for component, position in wanted.items():
-            self._world.after(self._while_ns(), lambda c=component, p=position: self._come(robot, life, begun_ns, c, p))  # type: ignore[misc]
+        for component, newest in wanted.items():
+            position, proves_ns = newest, begun_ns
+            if self._random.random() < FAILS:  # the newest does not come: the one before it does, and proves nothing
+                older = sorted(one for one in given[component] if one < newest)
+                own = robot.store.get(component, [])
+                if not older or (own and older[-1] <= max(own)):
+                    continue
+                position, proves_ns = older[-1], 0
+            self._world.after(self._while_ns(), lambda c=component, p=position, b=proves_ns: self._come(robot, life, b, c, p))  # type: ignore[misc]
 
     def _takes(self, robot: Robot, component: str) -> bool:
         assert robot.node is not None
