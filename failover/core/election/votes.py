@@ -139,6 +139,8 @@ def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
         _heard_end(component, turn, sender, entry, theirs)
     elif entry.epoch > component.epoch:
         _heard_later_epoch(component, turn, sender, entry)
+    elif entry.epoch == component.epoch:
+        _heard_spent_vote(component, turn, entry)
 
 
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
@@ -237,6 +239,18 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
         lose(component, turn, entry.primary, entry)
     elif not component.holding and (decided or (not component.primary and turn.team.rested(turn.now_ns))):
         _adopt(component, turn, entry)
+
+
+def _heard_spent_vote(component: Component, turn: Turn, entry: Entry) -> None:
+    """The member has voted in our own epoch for another robot, whose claim came to nothing: a later one may have its vote."""
+    claimant = turn.team.peers.get(entry.primary)
+    if claimant is None or not component.is_settled:
+        return
+    told = claimant.entry(component.name)
+    if turn.alive(entry.primary) and told is not None and state_of(told) in HOLDING:
+        return
+    if _needs_the_vote(component, turn):
+        renew(component, turn, entry.epoch)
 
 
 def _needs_the_vote(component: Component, turn: Turn) -> bool:
