@@ -36,6 +36,10 @@ WITHDRAWN_BEATS = 2
 """Beats for each place in the order of names that a robot waits after a claim in vain: the next one finds no rival."""
 
 
+EQUALS_WAIT = 2
+"""Loyalties that the first in that order leaves a component, which it could run as well, to another robot."""
+
+
 def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant, a majority would agree, and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns:
@@ -58,7 +62,14 @@ def _chosen(component: Component, turn: Turn, mine: Position | None) -> bool:
     best = _newest_of([one for one in entries if turn.config.runs(one[0])])
     if (best is not None and mine < best) or _waits_for_a_server(component, turn, mine, _newest_of(entries)):
         return False
-    return component.primary == turn.me if component.waits else first_of_equals(component, turn, entries, mine)
+    if component.waits:
+        return component.primary == turn.me
+    return first_of_equals(component, turn, entries, mine) or _equals_differ(component, turn)
+
+
+def _equals_differ(component: Component, turn: Turn) -> bool:
+    """Whether equals leave it to each other: one whose copy came from the archive may not know whom the others prefer."""
+    return component.freed_ns > 0 and turn.now_ns >= component.freed_ns + (EQUALS_WAIT + _place(turn)) * turn.config.loyalty_ns
 
 
 def _newest_of(entries: list[tuple[str, Entry]]) -> Position | None:
@@ -111,10 +122,14 @@ def withdraw(component: Component, turn: Turn, why: str) -> None:
     """Give a claim up; our vote for ourselves in its epoch stands, and helps no robot."""
     component.move(Cause.YIELD_CLAIM)
     component.ordered = False
-    place = sorted((turn.me, *turn.config.peers), key=weight).index(turn.me) + 1
-    component.retry_ns = turn.now_ns + place * WITHDRAWN_BEATS * turn.config.beat_ns
+    component.retry_ns = turn.now_ns + _place(turn) * WITHDRAWN_BEATS * turn.config.beat_ns
     refuse_request(component, turn, f"cannot run {component.name}: {why}; failover status tells which robots {turn.me} hears")
     turn.say(component, f"{turn.me} withdraws its claim of epoch {component.epoch}: {why}")
+
+
+def _place(turn: Turn) -> int:
+    """This robot's in the order of names, from 1 on."""
+    return sorted((turn.me, *turn.config.peers), key=weight).index(turn.me) + 1
 
 
 def step_down(component: Component, turn: Turn) -> None:
