@@ -395,8 +395,6 @@ def test_robots_of_another_site_join_and_each_site_decides_for_itself(tmp_path: 
             )
             assert sorted(one["name"] for one in machine.status()["far"]) == others
             assert machine.status()["rule"] == "pair", "two robots at each site, and no majority of four"
-        refused = stage.typed("robot1", "remove", "robot3")
-        assert refused.returncode == 1 and "robot3 lives, as robot4 sees" in refused.stderr
         stage.machine("robot3").cut_power()
         robots.until(lambda: state_at(stage, "robot4", "robot3") == "dead", "robot3 to be dead at its own site")
         assert [peer["name"] for peer in stage.machine("robot1").status()["peers"]] == ["robot2"]

@@ -80,7 +80,7 @@ def test_a_witness_decides_between_two_robots_and_does_nothing_else(tmp_path: Pa
             status = Path(f"/proc/{pid}/status").read_text()
             assert re.search(r"^CapEff:\s+0+$", status, re.MULTILINE) and re.search(r"^CapBnd", status, re.MULTILINE)
         names = {path.name.partition(".")[0] for path in (gate.directory / "state").iterdir()}
-        assert names <= {"ballot", "story"}, names
+        assert names <= {"ballot", "sites", "story"}, names
         assert {path.name for path in (gate.directory / "run").iterdir()} == {"control.sock"}
         stage.switch_on("robot1")
         robots.until(lambda: hears_all(gate), "robot1 to be back")

@@ -264,7 +264,8 @@ def verbs_at(place: Path, gate: RightsGate | None = None, **peers: str) -> Verbs
 
     team = SimpleNamespace(team="lab", robots={name: SimpleNamespace(role=role) for name, role in peers.items()})
     config = SimpleNamespace(robot="robot1", state_directory=str(place), insecure=False)
-    robot.settings, robot.errands = SimpleNamespace(team=team, config=config), SimpleNamespace(send=send, told=told)
+    robot.settings = SimpleNamespace(team=team, near=team.robots, config=config)
+    robot.errands = SimpleNamespace(send=send, told=told)
     picture = {"peers": [{"name": name, "state": "live"} for name in peers], "components": []}
     robot.picture = lambda _told: picture | {"components": [dict(one) for one in COMPONENTS]}
     return Verbs(robot, gate)
