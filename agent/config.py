@@ -367,7 +367,12 @@ class Settings:
     @property
     def far(self) -> Mapping[str, Robot]:
         """The members of other sites, by name: they are connected to, and have no part in any decision here."""
-        return {name: robot for name, robot in self.team.robots.items() if robot.site != self.me.site}
+        return {name: robot for name, robot in self.team.robots.items() if self.is_far(name)}
+
+    def is_far(self, robot: str) -> bool:
+        """Whether it is a member, of another site."""
+        member = self.team.robots.get(robot)
+        return member is not None and member.site != self.me.site
 
     @property
     def others(self) -> Mapping[str, Robot]:

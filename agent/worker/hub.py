@@ -353,7 +353,7 @@ class Switchboard:
 
     def _unread(self, peer: str, why: str) -> None:
         """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""
-        if peer in self.settings.former or peer in self.settings.far:
+        if peer in self.settings.former or self.settings.is_far(peer):
             return  # whether they live is no matter to any decision here
         now_s = asyncio.get_running_loop().time()
         sign = (peer, why if peer else "")
@@ -382,7 +382,7 @@ class Switchboard:
         if peer not in self.settings.others:
             self._hear_former(peer, message)
             return
-        is_far = peer in self.settings.far
+        is_far = self.settings.is_far(peer)
         match message:
             case Hello():
                 self._greeted(way, peer, message)

@@ -361,7 +361,7 @@ class TeamChanges:
 
     async def _may_live(self, robot: str) -> bool:
         """Whether a member is heard, or may be on its way still. One of another site is never heard: is it connected?"""
-        if robot in self._lines.settings.far:
+        if self._lines.settings.is_far(robot):
             return not self._lines.hindrance(robot)
         status = (await self._lines.ask("status")).status
         return status is None or any(_may_live(peer) for peer in status.peers if peer.robot == robot)
@@ -371,7 +371,7 @@ class TeamChanges:
         status = (await self._lines.ask("status")).status
         if status is None:
             return "its agent is starting; try again"
-        if robot in self._lines.settings.far:
+        if self._lines.settings.is_far(robot):
             return ""  # it objects itself where it can be asked, and the members of its site do
         peer = next((one for one in status.peers if one.robot == robot), None)
         lives = peer is not None and _may_live(peer)
