@@ -77,6 +77,11 @@ def archived(component: Component, event: Archived) -> None:
         component.sealed, component.sealed_ns = event.position, event.begun_ns if event.position is not None else -1
 
 
+def is_alone(component: Component, turn: Turn) -> bool:
+    """Whether the archive alone can protect it: no standby of it is heard, and a robot that etcd votes for would look there."""
+    return turn.config.copies_ms > 0 and component.holding and not turn.alive(component.standby)
+
+
 def sealed_ns(component: Component) -> int:
     """When the state was taken of which the archive has a copy; -1: it has none of this primacy."""
     is_as_it_was = component.sealed is not None and component.sealed == component.acked

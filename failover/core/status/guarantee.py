@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from failover.core.component import Component, Turn
+from failover.core.replication import archived
 from failover.core.types import ENDED, MS, Protection
 from failover.core.wire.messages import OTHER_SITES
 
@@ -96,7 +97,7 @@ def one(component: Component, turn: Turn, protection: Protection) -> str:
         return f"If {turn.me} is lost now, so is its state: no robot keeps a checkpoint of it."
     if protection is not Protection.PROTECTED:
         return "If this robot is lost now, the component resumes from its last checkpoint, if there is one."
-    if turn.config.copies_ms and not turn.alive(component.standby):
+    if archived.is_alone(component, turn):
         if component.waits:
             return f"If {turn.me} is lost, its newest copy in the archive waits until {turn.me} is back: no other one resumes it."
         return (

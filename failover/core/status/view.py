@@ -51,7 +51,7 @@ def _is_nothing(component: Component) -> bool:
 
 def _component(component: Component, turn: Turn) -> ComponentView:
     protection = _protection(component, turn)
-    acked_ns = archived.sealed_ns(component) if _is_archived_alone(component, turn) else component.acked_ns
+    acked_ns = archived.sealed_ns(component) if archived.is_alone(component, turn) else component.acked_ns
     lag_ns = turn.now_ns - acked_ns if acked_ns >= 0 and component.holding else -1
     return ComponentView(
         component.name,
@@ -94,21 +94,16 @@ def _protection(component: Component, turn: Turn) -> Protection:
         return Protection.NONE
     if component.degraded or _overdue(component, turn):
         return Protection.DEGRADED
-    if component.sealed is not None and not turn.alive(component.standby):
+    if component.sealed is not None and archived.is_alone(component, turn):
         is_old = turn.now_ns - archived.sealed_ns(component) > COPIES_LATE * turn.config.copies_ms * MS + STALE_NS
         return Protection.DEGRADED if is_old else Protection.PROTECTED
     protected = component.acked is not None and component.standby in component.entrusted and turn.alive(component.standby)
     return Protection.PROTECTED if protected else Protection.NONE
 
 
-def _is_archived_alone(component: Component, turn: Turn) -> bool:
-    """Whether the archive alone can protect it: no standby of it is heard, and a robot that etcd votes for would look there."""
-    return turn.config.copies_ms > 0 and component.holding and not turn.alive(component.standby)
-
-
 def _archive_notes(component: Component, turn: Turn) -> list[str]:
     """How old what the archive has of it is, at its primary; at a robot that took it from there the same."""
-    if _is_archived_alone(component, turn):
+    if archived.is_alone(component, turn):
         if component.sealed is None:
             return ["NOT PROTECTED: no standby of it is heard, and no copy of it is in the archive yet"]
         age_s = (turn.now_ns - archived.sealed_ns(component)) / NS_PER_S
