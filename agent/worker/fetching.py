@@ -96,6 +96,7 @@ class Fetching:
         self._absent: set[bytes] = set()
         self._refused: dict[str, int] = {}
         self._troubles: dict[str, str] = {}
+        self._lost: dict[str, str] = {}
         self._silent = ""
         self._answered_s = time.monotonic()
         self._arrived: dict[tuple[str, Position], Arrived] = {}
@@ -138,7 +139,7 @@ class Fetching:
         if self._silent:
             since_s = time.monotonic() - self._answered_s
             return [f"the archive has not answered for {since_s:.0f} s: no checkpoints come from there: {self._silent}"]
-        return list(self._troubles.values())
+        return [*self._lost.values(), *self._troubles.values()]
 
     async def _round(self, number: int) -> None:
         begun_ns = clock.now_ns()
@@ -186,7 +187,7 @@ class Fetching:
         lives = {one.name for one in view.components if one.state not in ENDED}
         for folder in self._seen.keys() - folders:
             if (name := names.get(folder, "")) in lives:
-                self._troubles[name] = f"{name}: the archive has lost all copies of it, or was rolled back to a time before them"
+                self._lost[name] = f"{name}: the archive has lost all copies of it, or was rolled back to a time before them"
 
     def _look_for_a_rollback(self, name: str, newest: Copy) -> None:
         """An archive that has only older copies than it had is told of; what this robot holds is newer, and stays."""
@@ -194,12 +195,12 @@ class Fetching:
         had = self._seen.get(newest.folder, line)
         self._seen[newest.folder] = max(had, line)
         if line < had:
-            self._troubles[name] = (
+            self._lost[name] = (
                 f"{name}: the archive has lost copies, or was rolled back: its newest is number {newest.sequence} of epoch "
                 f"{newest.epoch}, and it had number {had[1][1]} of epoch {had[0]}; nothing older is taken from it"
             )
-        elif "rolled back" in self._troubles.get(name, ""):
-            del self._troubles[name]
+        else:
+            self._lost.pop(name, None)
 
     def _newer(self, name: str, found: list[Copy], view: StatusView) -> list[Copy]:
         """The copies that are newer than what the core counts as held here, the newest first."""
