@@ -118,7 +118,7 @@ class Team:
         return roster(self.robots, self._terms())
 
     def roster_of_site(self, site: str) -> Roster:
-        """The members of a site by rank, as frames mean it. Robots that know other sites do not read each other's frames."""
+        """The members of a site by rank, as frames mean it. Of a robot that knows other sites a frame's items are not read."""
         return roster(self.at_site(site), self._terms() + sites_digest(self))
 
     def at_site(self, site: str) -> dict[str, Robot]:
