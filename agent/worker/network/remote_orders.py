@@ -8,6 +8,7 @@ the connection is lost in between, the agent tells the client that the result is
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 from collections.abc import Awaitable, Callable, Mapping
 from types import MappingProxyType
@@ -24,6 +25,12 @@ from failover.errors import FailoverError
 
 PATIENCE_S: Final = 75.0
 """How long an answer may take; the other robot gives its own orders up sooner."""
+
+ANSWER_S: Final = 15.0
+"""How long an answer waits for a connection to the robot that asked. Each robot makes its own: the other's may stand first."""
+
+LOOK_S: Final = 0.02
+"""How often it is looked whether the connection stands."""
 
 UNDER_WAY_MAX: Final = 64
 """Errands of one peer that are carried out at a time; more are refused."""
@@ -139,7 +146,14 @@ class Errands:
             done = ErrandDone(message.number, b"", str(trouble) or type(trouble).__name__)
         if len(done.content) > CONTENT_MAX:
             done = ErrandDone(message.number, b"", f"its answer of {len(done.content)} bytes is too long to travel; ask there")
+        await self._until_it_can_be_told(peer)
         self._say(peer, done)
+
+    async def _until_it_can_be_told(self, peer: str) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(ANSWER_S):
+                while self._hindrance(peer):
+                    await asyncio.sleep(LOOK_S)
 
     async def _result(self, peer: str, message: Errand) -> dict[str, Any]:
         if message.verb in self._of_peers:
