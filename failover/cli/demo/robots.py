@@ -134,6 +134,11 @@ class RobotMachine(Struct):
         """The output of its agent."""
         return self.directory / "agent.log"
 
+    @property
+    def start_s(self) -> float:
+        """How long its agent may take until it answers."""
+        return START_S
+
     def switch_on(self) -> None:
         """Let the host start the agent."""
         assert self.process.stdin is not None
@@ -150,7 +155,7 @@ class RobotMachine(Struct):
         Raises:
             FailoverError: it ended, with the last lines of its log, or does not answer in time.
         """
-        waiting = Waiting(f"the agent of {self.name} to answer", START_S, tell)
+        waiting = Waiting(f"the agent of {self.name} to answer", self.start_s, tell)
         while True:
             try:
                 link = Control.open(self.socket)
@@ -160,7 +165,7 @@ class RobotMachine(Struct):
                 if self.process.poll() is not None:
                     raise FailoverError(f"the agent of {self.name} ended at once: {self.last_words()}") from error
                 if waiting.is_over():
-                    raise FailoverError(f"the agent of {self.name} did not answer in {START_S:.0f} s") from error
+                    raise FailoverError(f"the agent of {self.name} did not answer in {self.start_s:.0f} s") from error
                 time.sleep(POLL_S)
 
     def status(self) -> dict[str, Any]:
