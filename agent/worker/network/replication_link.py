@@ -49,6 +49,9 @@ RECONNECT_FIRST_MS: Final = 50
 RECONNECT_MOST_MS: Final = 2_000
 """ZeroMQ doubles the pause from first to most and adds a random part of its own."""
 
+CONNECT_LIMIT_MS: Final = 3_000
+"""An attempt to connect that nobody answers is given up, and another one begins: the kernel's own pauses grow to a minute."""
+
 RETRANSMIT_LIMIT_MS: Final = 3_000
 """A connection whose bytes stay unacknowledged so long is dead (TCP_USER_TIMEOUT); the beats have known it much earlier."""
 
@@ -232,6 +235,7 @@ class PeerConnection:
             self._socket.setsockopt(zmq.BINDTODEVICE, device.name.encode())
         self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_FIRST_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MOST_MS)
+        self._socket.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_LIMIT_MS)
         self._socket.setsockopt(zmq.TCP_MAXRT, RETRANSMIT_LIMIT_MS)
         if keys.present:
             self._socket.curve_publickey = keys.public.encode()

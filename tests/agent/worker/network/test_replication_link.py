@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 from collections.abc import Awaitable, Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -95,6 +97,38 @@ def test_words_and_chunks_arrive_whole_and_in_order(keyed: bool) -> None:
         assert pair.heard["robot1"] == [("robot2", Cancel(7))]
 
     run(keys1, keys2, body)
+
+
+def test_an_attempt_that_gets_no_answer_is_given_up_and_made_again() -> None:
+    """A listener whose queue is full answers no attempt, as a network does that is cut."""
+
+    async def body(listener: socket.socket, fillers: list[socket.socket]) -> None:
+        where = listener.getsockname()
+        for filler in fillers:
+            filler.setblocking(False)
+            filler.connect_ex(where)
+        await until(lambda: _attempts(where[1]) >= 1)  # an attempt of the fillers waits: the queue is full
+        states: list[tuple[LinkState, str]] = []
+        changed = Callbacks(lambda *_: None, lambda _, state, reason: states.append((state, reason)))
+        link = ReplicationLink(
+            "robot1", f"127.0.0.1:{free_port()}", {"robot2": f"127.0.0.1:{where[1]}"}, Keys("", "", {}), changed
+        )
+        try:
+            link.open()
+            await until(lambda: (LinkState.CONNECTING, "no agent listens there") in states)
+        finally:
+            await link.close()
+
+    with socket.socket() as listener, contextlib.ExitStack() as files:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(0)
+        asyncio.run(body(listener, [files.enter_context(socket.socket()) for _ in range(3)]))
+
+
+def _attempts(port: int) -> int:
+    """Connections to a port of the loopback that have begun and got no answer (SYN_SENT)."""
+    lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    return sum(int(words[2].rpartition(":")[2], 16) == port and words[3] == "02" for words in lines)
 
 
 def test_a_stranger_with_a_key_of_its_own_is_refused_and_both_sides_say_so() -> None:
