@@ -7,10 +7,12 @@ checkpoint, and which no robot runs.
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import msgspec
 
@@ -19,8 +21,10 @@ from agent.core_config import fetches, retention
 from agent.errors import AgentError
 from agent.main_loop.vote_record import VoteRecordFile
 from agent.mend import check_agent_stopped, check_right, check_stopped
+from agent.system.last_alive import FILE_NAME as LAST_ALIVE
 from agent.worker.replication.receive_files import is_in_place
 from checkpoint.errors import UNDECODABLE, CheckpointError
+from checkpoint.keeper.messages import close_all
 from checkpoint.sentences import in_words
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
@@ -31,7 +35,11 @@ from failover.archive.archive import Archive, Copy, Label, object_store
 from failover.archive.objects import ObjectStore
 from failover.archive.witness import WitnessObjects
 from failover.core import vote_record as core_vote_record
-from failover.core.types import ComponentSpec, Record, State, VoteRecord
+from failover.core.types import SPAN, ComponentSpec, Record, State, VoteRecord
+from failover.errors import ArchiveError
+
+TRIES: Final = 5
+"""To have the newest copy, where newer ones come meanwhile."""
 
 
 def recover(settings: Settings, name: str) -> int:
@@ -72,11 +80,6 @@ def _objects(settings: Settings, key: bytes) -> Iterator[ObjectStore]:
 
 
 def _recover(settings: Settings, name: str, archive: Archive, directory: Path) -> int:
-    copies = archive.named(name)
-    if not copies:
-        raise AgentError(
-            f"the archive {settings.config.store.place} has no checkpoint of {name}; failover archive list shows those there are"
-        )
     record_file = VoteRecordFile(directory, settings.config.robot)
     before = core_vote_record.decode(record_file.read().core)
     try:
@@ -84,32 +87,90 @@ def _recover(settings: Settings, name: str, archive: Archive, directory: Path) -
             contextlib.closing(open_store(directory / "store", None, retention(settings.config))) as store,
             tempfile.TemporaryFile(dir=directory) as file,
         ):
-            component, label = _fetched(archive, copies[0], file, before, settings)
+            copy, label = _newest(settings, name, archive, file)
+            component = _checked(file, before, settings)
+            epoch = _epoch(settings, component, label, copy, before)
             spec = _spec(label)
             missing = _keep_files(archive, store, file, directory)
             store.put(file.fileno())
+            _date(store, component, label, directory)
     except (CheckpointError, OSError) as error:
         raise AgentError(f"cannot recover {name}: {in_words(error)}; nothing is on record of it") from error
-    record = Record(component, copies[0].epoch, state=State.STANDBY, spec=spec, begun=True)
-    record_file.keep(core_vote_record.encode(msgspec.structs.replace(before, records=(*before.records, record))))
-    robot, epoch = settings.config.robot, copies[0].epoch
+    record = Record(component, epoch, state=State.STANDBY, spec=spec, begun=True)
+    others = (one for one in before.records if one.name != component)
+    record_file.keep(core_vote_record.encode(msgspec.structs.replace(before, records=(*others, record))))
+    robot = settings.config.robot
     print(f"{robot} holds {component} as {label.robot} archived it, epoch {epoch}; start the agent, and see failover status")
+    age_s = max(time.time() - label.at_s, 0)
+    print(f"this copy was sealed at {_instant(label)}, {age_s:.0f} s ago by the clock of {robot}: the work since then is lost")
     for path in missing:
         print(f"{component} needs {path}, which is neither here nor whole in the archive: install it before it goes on here")
     return 0
 
 
-def _fetched(archive: Archive, copy: Copy, file: BinaryIO, before: VoteRecord, settings: Settings) -> tuple[str, Label]:
-    """Have the checkpoint in a file; its component, whose name the object may have cut, and its label."""
-    label = archive.fetch(copy, file)
+def _newest(settings: Settings, name: str, archive: Archive, file: BinaryIO) -> tuple[Copy, Label]:
+    """Have the newest checkpoint in a file. Where the component runs, newer copies take the place of older ones meanwhile."""
+    for _ in range(TRIES):
+        copies = archive.named(name)
+        if not copies:
+            place = settings.config.store.place
+            raise AgentError(f"the archive {place} has no checkpoint of {name}; failover archive list shows those there are")
+        file.seek(0)
+        file.truncate()
+        try:
+            return copies[0], archive.fetch(copies[0], file)
+        except ArchiveError:
+            if copies[0] in archive.named(name):
+                raise
+    raise AgentError(
+        f"{TRIES} times the newest copy of {name} was removed before it was here: {name} runs, and newer copies came; stop it "
+        "first (failover stop), or set a larger s3_keep where it runs"
+    )
+
+
+def _checked(file: BinaryIO, before: VoteRecord, settings: Settings) -> str:
+    """The component, whose name the object may have cut; it may be recovered here."""
     component = format.read_header(file.fileno()).component
     check_stopped(settings, component)
-    if any(one.name == component for one in before.records):
+    if (known := _known(before, component)) is not None and not settings.is_far(known.primary):
         raise AgentError(
             f"{component} is on record at {settings.config.robot}: its team knows it; start the agent and see failover status, "
             "or failover release it first"
         )
-    return component, label
+    return component
+
+
+def _known(before: VoteRecord, component: str) -> Record | None:
+    return next((one for one in before.records if one.name == component), None)
+
+
+def _epoch(settings: Settings, component: str, label: Label, copy: Copy, before: VoteRecord) -> int:
+    """The epoch to have on record; the first of the next span where the component was at another site.
+
+    That site may have claimed later epochs than the copy's since. See `failover.core.election.sites`.
+    """
+    known = _known(before, component)
+    if known is None and not settings.is_far(label.robot):
+        return copy.epoch
+    return (max(copy.epoch, known.epoch if known is not None else 0) // SPAN + 1) * SPAN
+
+
+def _date(store: SnapshotStore, component: str, label: Label, directory: Path) -> None:
+    """Let the checkpoint's file be as old as the state in it: by that the agent tells how much work is lost.
+
+    For how long this robot was off says nothing of a program that ran elsewhere: its sign of life goes.
+    """
+    at_ns = int(label.at_s * 1e9)
+    chain = tuple(store.open_chain(component))
+    try:
+        os.utime(chain[-1], ns=(at_ns, at_ns))
+    finally:
+        close_all(chain)
+    (directory / LAST_ALIVE).unlink(missing_ok=True)
+
+
+def _instant(label: Label) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(label.at_s))
 
 
 def _keep_files(archive: Archive, store: SnapshotStore, checkpoint: BinaryIO, directory: Path) -> list[str]:

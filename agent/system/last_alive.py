@@ -13,6 +13,10 @@ SIGN_S: Final = 1.0
 """Between two signs while a program runs here: an agent knows this closely when its earlier life ended."""
 
 
+FILE_NAME: Final = "last_alive"
+"""Below the state directory."""
+
+
 class LastAlive(Struct):
     """The sign of this agent's earlier life, and that of this one. Times by this machine's calendar, in nanoseconds.
 

@@ -142,7 +142,7 @@ class Archiving:
             is_waiting = self._busy_with not in ("", name)
             why = shelf.trouble or (f"it waits behind {self._busy_with}" if is_waiting else "a copy is on its way")
             alone = "a robot that does not hear this one would resume from that copy" if fetches(self._settings) else ""
-            stays = alone or "it is protected by its standby as before"
+            stays = alone or "a standby, if it has one, protects it as before"
             behind.append(f"ARCHIVE BEHIND: {name}: {since}: {why}; {stays}; next try within {every_s} s")
         more = len(behind) - SAID_MAX
         return behind[:SAID_MAX] + ([f"ARCHIVE BEHIND: {more} more components"] if more > 0 else [])

@@ -50,7 +50,7 @@ from agent.worker.control.server import ControlServer
 from agent.worker.network.connections import BULK, AllConnections, keys_of
 from agent.worker.network.link_monitor import Wires
 from agent.worker.network.links import Facts, Link, Links, Medium
-from agent.worker.network.remote_orders import ITEMS, SEALED, Errands, OrderOfPeer
+from agent.worker.network.remote_orders import ITEMS, RECOVERED, SEALED, Errands, OrderOfPeer
 from agent.worker.network.replication_link import LinkState
 from agent.worker.team_changes import TEAM_IS, TEAM_TOLD, TeamChanges, digest
 from checkpoint.errors import CheckpointError
@@ -394,7 +394,7 @@ class Switchboard:
                 self._connections.say(
                     peer, ErrandDone(message.number, b"", f"{peer} is a witness: it votes, and gives no orders")
                 )
-            case Errand(verb=verb) if is_far and verb not in (*QUESTIONS, *self.team_changes.orders(), SEALED, ITEMS):
+            case Errand(verb=verb) if is_far and verb not in (*QUESTIONS, *self.team_changes.orders(), SEALED, ITEMS, RECOVERED):
                 self._connections.say(peer, ErrandDone(message.number, b"", OTHER_SITE.format(peer)))
             case Offer() if is_far:
                 self._connections.say(peer, Refuse(message.transfer, OTHER_SITE.format(peer)))

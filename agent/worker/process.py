@@ -19,6 +19,7 @@ from agent.config import Settings
 from agent.core_config import fetches, retention
 from agent.errors import TROUBLE, AgentError, GuardLostError, LaneError, RefusedError
 from agent.main_loop.messages import Inventory, Told, ToWorker
+from agent.system import last_alive
 from agent.system.crash import end_worker_on_mistake
 from agent.system.last_alive import SIGN_S, LastAlive
 from agent.system.systemd_units import starter
@@ -36,7 +37,7 @@ from agent.worker.components.supervisor import Supervisor
 from agent.worker.control.status_view import WorkerView, team_view
 from agent.worker.control.verbs import Verbs
 from agent.worker.hub import Switchboard, live, make_directory
-from agent.worker.network.remote_orders import ITEMS
+from agent.worker.network.remote_orders import ITEMS, RECOVERED
 from agent.worker.replication.receive_files import Limits, Stock
 from agent.worker.replication.receive_snapshots import Deposit
 from agent.worker.replication.send_files import Bringing, Sources
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
     from agent.worker.archiving import Archiving
     from agent.worker.far_items import FarItems
     from agent.worker.fetching import Arrived, Fetching
+    from agent.worker.recoveries import Recoveries
 
 BYTES_A_MEGABIT: Final = 125_000
 TIDY_S: Final = 900.0
@@ -102,7 +104,7 @@ class Worker(Switchboard):
         self._starter = starter()
         self._process_pool = ProcessPool(sockets, self._starter)
         contents = str(self._store_path / CONTENTS_FOLDER) if config.bring else ""
-        self._alive = LastAlive.found(state / "last_alive")
+        self._alive = LastAlive.found(state / last_alive.FILE_NAME)
         self.places = Places(
             sockets, state / "logs", self._process_pool, "", config.robot, contents, PageBudget(config.xor_cache_size)
         )
@@ -110,7 +112,8 @@ class Worker(Switchboard):
         verbs = Verbs(self, self.gate)
         self._reservations = verbs.reservations
         self._far_items: FarItems | None = None
-        self.connect(verbs, {ITEMS: self._asked_for_items})
+        self._recoveries: Recoveries | None = None
+        self.connect(verbs, {ITEMS: self._asked_for_items, RECOVERED: self._asked_for_recoveries})
         self._alerts: Alerts | None = None
         self._archiving: Archiving | None = None
         self._fetching: Fetching | None = None
@@ -150,6 +153,7 @@ class Worker(Switchboard):
 
             self._task(Keeper(self._board_place, Path(self.settings.config.state_directory)).watch())
         self._exchange_far_items()
+        self._exchange_recoveries()
         if self.settings.me.role == "robot":
             self._task(self._look_what_is_lacking())
         if self.settings.config.bring:
@@ -185,6 +189,20 @@ class Worker(Switchboard):
         if self._board_place is not None:
             await self._provide_board()
         self._exchange_far_items()
+        self._exchange_recoveries()
+
+    def _exchange_recoveries(self) -> None:
+        """Hear and tell what operators recovered at which site; a robot that knows no other site loads nothing for that."""
+        if self._recoveries is None and self.settings.far:
+            from agent.worker.recoveries import Recoveries
+
+            self._recoveries = Recoveries(self)
+            self._task(self._recoveries.run())
+
+    async def _asked_for_recoveries(self, _peer: str, _arguments: dict[str, Any]) -> dict[str, Any]:
+        if self._recoveries is None:
+            raise RefusedError(f"{self.settings.config.robot} knows no other site")
+        return await self._recoveries.told()
 
     def _exchange_far_items(self) -> None:
         """Have the items of other sites, and let them have ours; a robot that knows no other site loads nothing for that."""

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import majority
+from failover.core.election import majority, sites
 from failover.core.election.pair import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
 from failover.core.replication import archived
@@ -99,6 +99,8 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
         again_s = left_ns // (1_000 * MS) + 1
         how = "its agent restarts" if turn.team.peers[component.primary].is_asked else "it is not heard"
         return f"cannot {verb} {name}: {component.primary} has it, and {how}; ask again in {again_s} s"
+    if there := sites.elsewhere(component, turn):
+        return f"cannot {verb} {name}: {there}, of another site, has it; choose another name, or failover release {name} first"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
         if entry is not None and not vacant(component, turn) and component.state not in ENDED:
@@ -118,7 +120,7 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
         turn.order(acts.LetGo(component.name, component.epoch))
     elif restarts.waits(component):
         pass  # its program is cleared away already
-    elif component.holding or component.state is State.STOPPING or not (component.state in ENDED or vacant(component, turn)):
+    elif component.holding or component.state is State.STOPPING or not _may_be_forgotten(component, turn):
         _elsewhere(component, turn, command.request, "release")
         return
     waited = "released: its program had ended, and is not started anew"
@@ -130,6 +132,10 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
     drop(component, turn, "an operator released it")
     turn.order(acts.Answer(command.request, True, f"{component.name} is protected no longer"))
     turn.say(component, f"{turn.me} {Cause.RELEASE}: an operator asked for it")
+
+
+def _may_be_forgotten(component: Component, turn: Turn) -> bool:
+    return component.state in ENDED or bool(sites.elsewhere(component, turn)) or vacant(component, turn)
 
 
 def _stop(component: Component, turn: Turn, command: Stop) -> None:

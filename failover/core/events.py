@@ -232,6 +232,18 @@ class Archived(Struct, frozen=True):
     begun_ns: int
 
 
+class Recovered(Struct, frozen=True):
+    """A robot of another site says that an operator recovered the component there: it holds this epoch, or ended it."""
+
+    component: str
+    epoch: int
+    robot: str
+
+
+class SitesHeard(Struct, frozen=True):
+    """A robot of each other site has told in this life of ours what was recovered there."""
+
+
 class Restored(Struct, frozen=True):
     """The act Restore is done: the program runs from ``position``, which was captured ``age_ns`` ago (-1: not known).
 
@@ -423,6 +435,8 @@ Event = (
     | Looked
     | Fetched
     | Archived
+    | Recovered
+    | SitesHeard
     | Restored
     | ActFailed
     | Stopped

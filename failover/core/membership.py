@@ -181,6 +181,7 @@ class Membership:
         self._configure(config)
         self._asked: deque[tuple[int, int]] = deque(maxlen=ASKED_MAX)
         self._stranger_ns = 0
+        self.sites_heard = False
         self._former: dict[str, Peer] = {}
         self.peers = {robot: Peer(robot, now_ns) for robot in config.peers}
         for peer in self.peers.values():

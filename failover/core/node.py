@@ -14,7 +14,7 @@ from failover.core.acts import Ready
 from failover.core.beat_builder import Speaker, entry_of
 from failover.core.beat_pace import BeatPace
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import lease, majority, pair, votes
+from failover.core.election import lease, majority, pair, sites, votes
 from failover.core.election.coordinator import Word
 from failover.core.events import (
     ActFailed,
@@ -38,10 +38,12 @@ from failover.core.events import (
     Prefer,
     Promote,
     Received,
+    Recovered,
     Release,
     Restored,
     Run,
     ShipEnded,
+    SitesHeard,
     Started,
     Stop,
     Stopped,
@@ -317,7 +319,9 @@ class Node:
             self._leave(turn)
         if isinstance(event, Drain):
             self._drain(event, turn)
-        if isinstance(event, Tick | TeamChanged | Leave | Drain):
+        if isinstance(event, SitesHeard):
+            self._team.sites_heard = True
+        if isinstance(event, Tick | TeamChanged | Leave | Drain | SitesHeard):
             return list(self._components.values())
         if isinstance(event, Noticed):
             self._note(event, turn)
@@ -401,7 +405,8 @@ class Node:
         rules = votes if self._config.by_majority else pair
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
-            component = None if entry.name in refused else self._known(entry.name, beat.sender)
+            is_hearsay = entry.primary in self._config.far  # of another site, which tells by itself
+            component = None if entry.name in refused or is_hearsay else self._known(entry.name, beat.sender)
             if component is None:
                 continue
             rules.heard(component, turn, beat.sender, entry)
@@ -552,6 +557,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             archived.fetched(component, turn, event)
         case Archived():
             archived.archived(component, event)
+        case Recovered():
+            sites.recovered(component, turn, event)
         case ActFailed():
             exits.failed(component, turn, event)
         case Exited():
@@ -619,7 +626,8 @@ def _review(component: Component, turn: Turn) -> None:
 def _review_idle(component: Component, turn: Turn) -> None:
     exits.retry(component, turn)
     servers.admit_a_return(component, turn)
-    (votes if turn.config.by_majority else pair).consider(component, turn)
+    if not sites.waits_ns(component, turn):
+        (votes if turn.config.by_majority else pair).consider(component, turn)
     if component.state in (State.ABSENT, State.STANDBY):
         servers.give_back(component, turn)
 

@@ -302,6 +302,7 @@ class Config(Struct, frozen=True, dict=True):
             order of names.
         restart_grace_ms: how long the peers are asked to wait for this agent when it restarts, and the most that it waits for
             one of theirs; 0: neither.
+        far: robots of other sites, which are no peers.
     """
 
     robot: str
@@ -326,6 +327,7 @@ class Config(Struct, frozen=True, dict=True):
     boot_patience_ms: int = 0
     seat: int = -1
     restart_grace_ms: int = 0
+    far: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.restart_grace_ms and not self.lease_ms <= self.restart_grace_ms <= GRACE_MS_MAX:
@@ -411,6 +413,9 @@ class Config(Struct, frozen=True, dict=True):
         """How long a peer that was never heard in this life may be on its way; never less than the loyalty."""
         return max(self.grace_ms * MS, self.loyalty_ns)
 
+
+SPAN = 1 << 16
+"""Epochs between two recoveries of a component at another site; the site that was lost has claimed fewer since its last copy."""
 
 EPOCH_MAX = 1 << 40
 """No epoch is as large as this: its beats would be malformed to all."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
+import time
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 import pytest
@@ -13,10 +16,12 @@ from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.snapshot import format
 from checkpoint.store.store import open_store
 from failover.archive import sealed
-from failover.archive.archive import Archive
+from failover.archive.archive import Archive, Copy, Label
 from failover.archive.objects import FolderObjects
+from failover.config import team
+from failover.config.team import Robot
 from failover.core import vote_record as core_vote_record
-from failover.core.types import ComponentSpec, Launch, Record, State, VoteRecord
+from failover.core.types import SPAN, ComponentSpec, Launch, Record, State, VoteRecord
 from tests.agent.test_mend import config
 from tests.checkpoint.snapshots import page, pages_of, snapshot
 
@@ -37,11 +42,7 @@ def place(config: Path) -> Path:
         file.write(f'[store]\ns3 = "{place}"\n')
     sealed.new_key(config.parent / "team")
     for sequence in (1, 2):
-        with tempfile.TemporaryFile() as file:
-            file.write(format.encode_bytes(snapshot({1: page(str(sequence))}, sequence=sequence, component=COMPONENT)))
-            file.flush()
-            key = sealed.read_key(config.parent / "team")
-            Archive(FolderObjects(place), key, "lab", config.parent).put(file, "robot9", msgspec.msgpack.encode(SPEC))
+        put(place, config, sequence)
     return place
 
 
@@ -69,6 +70,21 @@ def test_the_newest_copy_is_in_the_store_and_on_record(config: Path, place: Path
         store.close()
     assert recover(config, "planner") == 1
     assert "is on record at robot1" in capsys.readouterr().err and records(config)[-1] == record
+
+
+def test_a_checkpoint_from_the_archive_is_as_old_as_its_state(
+    config: Path, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the file's age the agent tells how much work is lost; of that it takes off for how long this robot was off."""
+    (config.parent / "state" / "last_alive").touch()
+    newest = max(place.rglob("*.sealed"))
+    sealed_at_s = int(newest.name.partition("-")[0], 16) / 1000
+    time.sleep(1.1)
+    assert recover(config, "planner") == 0
+    assert re.search(r"this copy was sealed at .* UTC, \d+ s ago by the clock of robot1: the work since", capsys.readouterr().out)
+    (kept,) = (config.parent / "state" / "store").rglob("*.base")
+    assert abs(kept.stat().st_mtime - sealed_at_s) < 0.1
+    assert not (config.parent / "state" / "last_alive").exists()
 
 
 @pytest.mark.parametrize(
@@ -119,6 +135,41 @@ def test_what_cannot_be_recovered_changes_nothing(
     store.close()
 
 
+def put(place: Path, config: Path, sequence: int) -> None:
+    with tempfile.TemporaryFile() as file:
+        file.write(format.encode_bytes(snapshot({1: page(str(sequence))}, sequence=sequence, component=COMPONENT)))
+        file.flush()
+        key = sealed.read_key(config.parent / "team")
+        Archive(FolderObjects(place), key, "lab", config.parent).put(file, "robot9", msgspec.msgpack.encode(SPEC))
+
+
+@pytest.mark.parametrize("is_too_quick", [False, True])
+def test_a_copy_that_newer_ones_replace_while_it_comes_gives_way_to_the_newest(
+    is_too_quick: bool, config: Path, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the robot does that runs the component: it puts a newer copy, and removes the older ones."""
+    fetch, sequences = Archive.fetch, iter(range(3, 100))
+
+    def fetch_late(archive: Archive, copy: Copy, file: BinaryIO) -> Label:
+        if (sequence := next(sequences)) == 3 or is_too_quick:
+            older = list(place.rglob("*.sealed"))
+            put(place, config, sequence)
+            for path in older:
+                path.unlink()
+        return fetch(archive, copy, file)
+
+    monkeypatch.setattr(Archive, "fetch", fetch_late)
+    before = records(config)
+    assert recover(config, "planner") == int(is_too_quick)
+    if is_too_quick:
+        assert "stop it first (failover stop), or set a larger s3_keep" in capsys.readouterr().err
+        assert records(config) == before
+        return
+    store = open_store(config.parent / "state" / "store")
+    assert pages_of(store.load(COMPONENT)) == {1: page("3")}
+    store.close()
+
+
 def test_without_an_archive_there_is_nothing_to_recover_from(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert recover(config, "planner") == 1
     assert "names no archive" in capsys.readouterr().err
@@ -130,3 +181,38 @@ def test_a_vote_record_of_none_gets_its_first_record(config: Path, place: Path) 
     record_file.keep(core_vote_record.encode(VoteRecord()))
     assert recover(config, COMPONENT) == 0
     assert [one.name for one in records(config)] == [COMPONENT]
+
+
+def have_on_record(config: Path, *known: Record) -> None:
+    record_file = VoteRecordFile(config.parent / "state", "robot1")
+    record_file.read()
+    record_file.keep(core_vote_record.encode(VoteRecord(known)))
+
+
+def enrol_robot9(config: Path, site: str) -> None:
+    members = team.read(config.parent / "team")
+    robot = Robot(("127.0.0.1:7430",), "127.0.0.1:7431", site=site)
+    team.write(config.parent / "team", team.enrol(members, "robot9", robot))
+
+
+def test_what_another_site_ran_goes_on_above_each_epoch_that_that_one_can_have_claimed(config: Path, place: Path) -> None:
+    enrol_robot9(config, "harbour")
+    assert recover(config, "planner") == 0
+    assert records(config)[-1] == Record(COMPONENT, SPAN, state=State.STANDBY, spec=SPEC, begun=True)
+
+
+def test_what_a_robot_of_this_site_ran_keeps_its_epoch(config: Path, place: Path) -> None:
+    enrol_robot9(config, "")
+    assert recover(config, "planner") == 0
+    assert records(config)[-1].epoch == 1
+
+
+def test_what_another_site_has_by_an_operators_order_is_brought_back(
+    config: Path, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    enrol_robot9(config, "harbour")
+    other = Record("/lab/robot1/other", 3, "robot1", State.PRIMARY)
+    have_on_record(config, Record(COMPONENT, SPAN + 7, "robot9", State.STANDBY, spec=SPEC, begun=True), other)
+    assert recover(config, "planner") == 0
+    assert records(config) == (other, Record(COMPONENT, 2 * SPAN, state=State.STANDBY, spec=SPEC, begun=True))
+    assert recover(config, "planner") == 1 and "is on record at robot1" in capsys.readouterr().err

@@ -41,6 +41,9 @@ SEALED: Final = "sealed"
 ITEMS: Final = "items"
 """The verb by which a robot asks one of another site for the items of its board (`agent.worker.far_items`)."""
 
+RECOVERED: Final = "recovered"
+"""The verb by which it asks what an operator recovered there (`agent.worker.recoveries`)."""
+
 CONTENT_MAX: Final = CHUNK_SIZE_MAX
 """Bytes of an answer: the replication link takes no larger message than a chunk of a snapshot."""
 

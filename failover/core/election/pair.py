@@ -107,6 +107,8 @@ def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> boo
         is_ordered: an operator says so of robots whose packets cannot be authenticated.
     """
     is_doubtful = False
+    if component.primary in turn.config.far:
+        return False  # an operator recovered it at another site
     if component.primary not in ("", turn.me) and component.primary not in turn.team.peers and not turn.dead(component.primary):
         return False  # it was taken out of the team, and may act until the lease that it had here is over
     for robot, peer in turn.team.peers.items():

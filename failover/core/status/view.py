@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from failover.core.component import Component, Turn
-from failover.core.election import pair
+from failover.core.election import pair, sites
 from failover.core.election.consent import state_of
 from failover.core.peer_claims import Testimony
 from failover.core.replication import archived, standby
@@ -221,6 +221,16 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
     if component.state is State.STANDBY and (left_ns := pair.waits_after_boot_ns(component, turn)):
         notes.append(_waits_after_boot(component, turn, left_ns))
+    if component.state is State.STANDBY and (left_ns := sites.waits_ns(component, turn)):
+        notes.append(
+            f"waiting: an operator may have recovered it at another site, and not every site has answered since {turn.me} started"
+            f"; {turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
+        )
+    if there := sites.elsewhere(component, turn):
+        notes.append(
+            f"an operator recovered it at {there}, of another site, which has it now: no robot of this site runs it by itself; "
+            f"{sites.CURE.format(component.name)}"
+        )
     if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
         notes.append(f"waiting: {unread}; failover promote does not wait")
     if (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from failover.core import acts
 from failover.core.component import Cause, Component, Handing, Turn
-from failover.core.election import majority
+from failover.core.election import majority, sites
 from failover.core.election.pair import claim, exhaustion, renew, vacant
 from failover.core.election.votes import step_down
 from failover.core.replication import standby
@@ -38,7 +38,8 @@ def resume_here(component: Component, turn: Turn, request: int) -> None:
     elif component.is_exhausted:
         _answer(turn, request, False, exhaustion(component, turn.me))
     elif not vacant(component, turn) or (turn.config.by_majority and not majority.is_free(component, turn)):
-        _answer(turn, request, False, f"{component.name} belongs to {component.primary}; ask there")
+        cure = f", of another site; {sites.CURE.format(component.name)}" if sites.elsewhere(component, turn) else "; ask there"
+        _answer(turn, request, False, f"{component.name} belongs to {component.primary}{cure}")
     elif component.elects and not majority.may_claim(component, turn, component.newest):
         where = " or ".join(one for one in (*component.entrusted, component.primary) if one)
         refusal = f"a newer checkpoint of {component.name} may be at {where}; start it, or promote {turn.me}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.component import Component, Turn, Wanted
-from failover.core.election import majority
+from failover.core.election import majority, sites
 from failover.core.election.pair import claim, exhaustion, living_entries, renew, vacant
 from failover.core.events import Promote
 from failover.core.replication.servers import offer
@@ -92,6 +92,8 @@ def _refusal(component: Component, turn: Turn) -> str:
 
 
 def _why_not_vacant(component: Component, turn: Turn) -> str:
+    if there := sites.elsewhere(component, turn):
+        return f"an operator recovered it at {there}, of another site; {sites.CURE.format(component.name)}"
     if component.primary and turn.alive(component.primary):
         return f"{component.primary} lives and has it; ask there"
     if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):

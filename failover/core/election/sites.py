@@ -1,0 +1,57 @@
+"""Components that an operator recovered at another site (``failover-agent recover``): one site runs each, by that order.
+
+Sites hear no heartbeats of each other, and no vote of one counts at another. A person alone decides that a site is lost. So the
+order opens a *span* of epochs of its own: the first epoch of the next span, above all that the lost site can have claimed. Robots
+tell each other over the replication link which components were recovered at their site. Invariants:
+
+* The later span stays. A robot that hears of one gives its copy up, keeps its state aside, and names the robot of the other site
+  as the primary. While that is on record, no robot claims the component, and no order but ``recover`` brings it back.
+* A robot that has just started does not claim what another member ran last before each other site has told what was recovered
+  there, or ``boot_patience_ms`` are over: its site may be the one that was lost.
+* The word comes from the other site itself. What a robot of this site says of it counts for nothing: one stolen key would end
+  what runs.
+"""
+
+from __future__ import annotations
+
+from failover.core.component import Cause, Component, Turn
+from failover.core.election.pair import accept, admit, lose
+from failover.core.events import Recovered
+from failover.core.peer_claims import epoch_max
+from failover.core.types import ENDED, MS, SPAN, State
+from failover.core.wire.messages import Entry
+
+CURE = "to bring it back: failover-agent recover {} at a robot of this site, while its agent is stopped"
+
+
+def recovered(component: Component, turn: Turn, event: Recovered) -> None:
+    """A robot of another site runs it there, or did, by the order of an operator.
+
+    What is said again changes nothing; nor does an epoch that nobody can have opened yet.
+    """
+    is_news = component.epoch // SPAN < event.epoch // SPAN and event.epoch <= epoch_max(component, turn)
+    if not is_news or event.robot not in turn.config.far:
+        return
+    turn.say(component, f"an operator recovered it at {event.robot}, of another site, in epoch {event.epoch}")
+    if component.holding:
+        lose(component, turn, event.robot, Entry(component.name, 0, event.epoch, event.robot))
+    else:
+        accept(component, turn, event.robot, event.epoch)
+        if component.state is State.ABSENT or component.state in ENDED:
+            component.move(Cause.FOLLOW)
+    admit(component, turn, "")
+
+
+def elsewhere(component: Component, turn: Turn) -> str:
+    """The robot of another site that has it, by the order of an operator; "" if none has."""
+    return component.primary if component.primary in turn.config.far else ""
+
+
+def waits_ns(component: Component, turn: Turn) -> int:
+    """For how long this robot waits still for the word of the other sites before it claims the component; 0: not any more.
+
+    Where no robot is known to have run it, an operator has just recovered it here, or it has never begun.
+    """
+    if not turn.config.far or turn.team.sites_heard or not component.primary:
+        return 0
+    return max(turn.config.boot_patience_ms * MS - turn.team.lived_ns(turn.now_ns), 0)

@@ -1,0 +1,149 @@
+"""Single rules of components that an operator recovered at another site, one event at a time."""
+
+from __future__ import annotations
+
+import pytest
+
+from failover.core import acts
+from failover.core.events import Handover, Promote, Recovered, Release, Run, SitesHeard, Started, Stopped
+from failover.core.peer_claims import EPOCHS_AWAY_MAX
+from failover.core.types import SPAN, ComponentView, Config, Held, Record, Rule, State, VoteRecord
+from tests.failover.core.election.test_majority import NAME, NEWEST, SPEC, Talk, entry
+
+ALONE = Config("robot1", grace_ms=300, boot_patience_ms=5_000, far=("robot3",))
+THREE = Config("robot1", ("robot2", "witness1"), rule=Rule.MAJORITY, witnesses=("witness1",), grace_ms=300, far=("robot3",))
+PAIR = Config("robot2", ("robot1",), grace_ms=300, far=("robot3",))
+HELD = (Held(NAME, (NEWEST,)),)
+RAN_HERE = Record(NAME, 1, "robot1", State.PRIMARY, spec=SPEC, begun=True)
+THERE = Recovered(NAME, SPAN + 1, "robot3")
+
+
+def booted(*records: Record, config: Config = ALONE) -> Talk:
+    """A robot after a loss of power: with its disk, and no program."""
+    return Talk(config, VoteRecord(records), HELD)
+
+
+def view(talk: Talk) -> ComponentView:
+    (one,) = talk.node.status(talk.now_ns).components
+    return one
+
+
+def tell(talk: Talk, *events: Recovered | SitesHeard | Started | Stopped | Run | Release | Promote | Handover) -> acts.Ready:
+    for event in events:
+        ready = talk.node.step(event, talk.now_ns)
+        talk.readies.append(ready)
+    return ready
+
+
+def refusal(ready: acts.Ready) -> str:
+    (answer,) = (act for act in ready.act if isinstance(act, acts.Answer))
+    assert not answer.ok
+    return answer.sentence
+
+
+def running() -> Talk:
+    talk = Talk(ALONE)
+    tell(talk, Run(1, SPEC), Started(NAME, 1))
+    return talk
+
+
+def test_a_robot_that_boots_waits_until_each_other_site_has_told() -> None:
+    talk = booted(RAN_HERE)
+    talk.tick(4_000)
+    assert not talk.orders(acts.Restore) and "claims it in 1 s (boot_patience_s)" in " ".join(view(talk).notes)
+    tell(talk, SitesHeard())
+    talk.tick(1_000)
+    assert talk.orders(acts.Restore), "nothing was recovered elsewhere"
+
+
+def test_where_no_word_of_the_other_site_comes_it_goes_on_after_the_patience() -> None:
+    talk = booted(RAN_HERE)
+    talk.tick(6_000)
+    assert talk.orders(acts.Restore)
+
+
+def test_what_an_operator_has_just_recovered_here_waits_for_nobody() -> None:
+    talk = booted(Record(NAME, SPAN, state=State.STANDBY, spec=SPEC, begun=True))
+    talk.tick(1_000)
+    assert talk.orders(acts.Restore) and view(talk).epoch == SPAN + 1
+
+
+def test_a_robot_that_boots_runs_nothing_that_was_recovered_elsewhere_also_after_another_boot() -> None:
+    talk = booted(RAN_HERE)
+    talk.tick(400)
+    tell(talk, THERE, SitesHeard())
+    talk.tick(20_000)
+    assert not talk.orders(acts.Restore)
+    assert (view(talk).primary, view(talk).epoch, view(talk).state) == ("robot3", SPAN + 1, State.STANDBY)
+    assert "an operator recovered it at robot3" in " ".join(view(talk).notes)
+    kept = [ready.persist for ready in talk.readies if ready.persist is not None][-1]
+    again = Talk(ALONE, kept, HELD)
+    again.tick(20_000)
+    assert not again.orders(acts.Restore), "it is on record"
+
+
+def test_a_copy_that_acts_is_stopped_and_its_state_kept_aside() -> None:
+    talk = running()
+    tell(talk, THERE)
+    assert talk.orders(acts.KeepAside) and talk.orders(acts.Stop)
+    tell(talk, Stopped(NAME, SPAN + 1))
+    talk.tick(20_000)
+    assert view(talk).state is State.STANDBY and not talk.orders(acts.Restore)
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (Recovered(NAME, SPAN - 1, "robot3"), "the span is ours"),
+        (Recovered(NAME, SPAN + 1, "robot2"), "it is of no other site"),
+        (Recovered(NAME, EPOCHS_AWAY_MAX + 2 * SPAN, "robot3"), "no operator can have recovered it so often"),
+    ],
+)
+def test_a_word_that_is_none_stops_nothing(said: Recovered, why: str) -> None:
+    talk = running()
+    tell(talk, said)
+    talk.tick(1_000)
+    assert view(talk).state is State.PRIMARY, why
+
+
+def test_whom_it_was_brought_back_from_gives_it_up_and_who_has_the_later_span_does_not() -> None:
+    record = Record(NAME, 2 * SPAN, state=State.STANDBY, spec=SPEC, begun=True)
+    talk = booted(record)
+    talk.tick(1_000)
+    restores = talk.orders(acts.Restore)
+    tell(talk, THERE)
+    talk.tick(1_000)
+    assert restores and view(talk).epoch == 2 * SPAN + 1 and not talk.orders(acts.KeepAside)
+
+
+def test_the_word_of_a_robot_of_our_own_site_that_another_site_has_it_counts_for_nothing() -> None:
+    talk = Talk(PAIR)
+    talk.tick(400)
+    tell(talk, Run(1, SPEC), Started(NAME, 1))
+    talk.hear("robot1", entry(State.STANDBY, SPAN + 1, "robot3", NEWEST))
+    talk.tick(20)
+    assert view(talk).state is State.CLAIMING or view(talk).primary == "robot2"
+    assert view(talk).epoch < SPAN
+
+
+def test_votes_elect_no_robot_for_what_another_site_has() -> None:
+    record = Record(NAME, 1, "robot1", State.PRIMARY, spec=SPEC, begun=True)
+    talk = Talk(THREE, VoteRecord((record,)), HELD)
+    tell(talk, THERE, SitesHeard())
+    for _ in range(100):
+        talk.hear("robot2", entry(State.STANDBY, 1, "robot1", NEWEST))
+        talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
+        talk.tick(20)
+    assert view(talk).primary == "robot3" and view(talk).epoch == SPAN + 1
+
+
+def test_orders_of_its_former_site_are_refused_with_the_cure_but_release_forgets_it() -> None:
+    talk = booted(RAN_HERE)
+    tell(talk, THERE, SitesHeard())
+    talk.tick(400)
+    assert "to bring it back: failover-agent recover /lab/x" in refusal(tell(talk, Promote(1, NAME)))
+    assert "to bring it back: failover-agent recover /lab/x" in refusal(tell(talk, Handover(2, NAME)))
+    assert "robot3, of another site, has it; choose another name, or failover release" in refusal(tell(talk, Run(3, SPEC)))
+    tell(talk, Release(4, NAME), Run(5, SPEC))
+    tell(talk, THERE)
+    assert view(talk).primary == "robot1" and view(talk).epoch == SPAN + 2, "its operator has begun another one of that name"
