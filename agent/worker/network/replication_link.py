@@ -577,7 +577,7 @@ class ReplicationLink:
                     self._callbacks.receive(peer, message)
                 elif peer:
                     self._misunderstood[peer] += 1
-                else:
+                elif not self._is_of_another_member(frames):
                     self._refused("a sender under another robot's name, or with a key that does not count any more")
         finally:
             router.close(0)
@@ -593,6 +593,12 @@ class ReplicationLink:
                     self._arrivals.ended(event["value"])
         finally:
             monitor.close(0)
+
+    def _is_of_another_member(self, frames: list[Any]) -> bool:
+        """Whether it is of a member that this link is not for: `agent.visit` talks with one alone."""
+        claimed = bytes(frames[0].bytes).decode(errors="replace")
+        is_proved = self._keys.present and self._owners.owner(frames[-1].get("User-Id")) == claimed
+        return is_proved and claimed not in self._peers
 
     def _speaker(self, frames: list[Any]) -> str:
         """The peer whose message this is, by its key; "" for a stranger or a peer under another's name."""
