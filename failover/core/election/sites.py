@@ -6,8 +6,8 @@ tell each other over the replication link which components were recovered at the
 
 * The later span stays. A robot that hears of one gives its copy up, keeps its state aside, and names the robot of the other site
   as the primary. While that is on record, no robot claims the component, and no order but ``recover`` brings it back.
-* A robot that has just started does not claim what another member ran last before each other site has told what was recovered
-  there, or ``boot_patience_ms`` are over: its site may be the one that was lost.
+* A robot that has just started claims nothing before each other site has told what was recovered there, or ``boot_patience_ms``
+  are over: its site may be the one that was lost. Nor does it begin anew what agent.toml declares: its disk may be a new one.
 * The word comes from the other site itself. What a robot of this site says of it counts for nothing: one stolen key would end
   what runs.
 """
@@ -50,8 +50,9 @@ def elsewhere(component: Component, turn: Turn) -> str:
 def waits_ns(component: Component, turn: Turn) -> int:
     """For how long this robot waits still for the word of the other sites before it claims the component; 0: not any more.
 
-    Where no robot is known to have run it, an operator has just recovered it here, or it has never begun.
+    What an operator has just recovered here waits for nobody: no robot of it is on record yet.
     """
-    if not turn.config.far or turn.team.sites_heard or not component.primary:
+    is_recovered = component.epoch > 0 and not component.primary
+    if not turn.config.far or turn.team.sites_heard or is_recovered:
         return 0
     return max(turn.config.boot_patience_ms * MS - turn.team.lived_ns(turn.now_ns), 0)

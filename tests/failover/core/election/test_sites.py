@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from failover.core import acts
 from failover.core.events import Handover, Promote, Recovered, Release, Run, SitesHeard, Started, Stopped
@@ -60,6 +61,19 @@ def test_where_no_word_of_the_other_site_comes_it_goes_on_after_the_patience() -
     talk = booted(RAN_HERE)
     talk.tick(6_000)
     assert talk.orders(acts.Restore)
+
+
+def test_a_declared_program_begins_on_a_new_disk_once_the_other_site_has_told_that_it_has_it_not() -> None:
+    config = replace(ALONE, components=(SPEC,))
+    first, second = Talk(config), Talk(config)
+    for talk in (first, second):
+        talk.tick(4_000)
+        assert not talk.orders(acts.Start)
+    tell(first, SitesHeard())
+    tell(second, THERE, SitesHeard())
+    for talk in (first, second):
+        talk.tick(1_000)
+    assert first.orders(acts.Start) and not second.orders(acts.Start)
 
 
 def test_what_an_operator_has_just_recovered_here_waits_for_nobody() -> None:
