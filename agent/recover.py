@@ -30,8 +30,8 @@ from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.store import open_store
-from failover.archive import sealed
 from failover.archive.archive import Archive, Copy, Label, object_store
+from failover.archive.keys import read_keys
 from failover.archive.objects import ObjectStore
 from failover.archive.witness import WitnessObjects
 from failover.core import vote_record as core_vote_record
@@ -59,9 +59,9 @@ def recover(settings: Settings, name: str) -> int:
     except OSError as error:
         raise AgentError(f"cannot make the state directory {directory}: {error.strerror}") from error
     check_right(directory)
-    key = sealed.read_key(Path(settings.config.team_directory))
-    with _objects(settings, key) as objects:
-        archive = Archive(objects, key, settings.team.team, directory, by_epoch=fetches(settings))
+    keys = read_keys(Path(settings.config.team_directory), settings.team)
+    with _objects(settings, keys.shared) as objects:
+        archive = Archive(objects, keys, settings.team.team, directory, by_epoch=fetches(settings))
         return _recover(settings, name, archive, directory)
 
 

@@ -27,8 +27,7 @@ from benchmarks.figures import OURS, Absent, Figure, Findings, percentile
 from benchmarks.running import PROGRAMS, BenchmarkError, Running, running
 from checkpoint.keeper import messages
 from checkpoint.keeper.messages import Channel, pair
-from failover.archive import sealed as sealing
-from failover.archive import signature
+from failover.archive import keys, signature
 from failover.archive.archive import object_store
 from failover.cli.demo.robots import RobotMachine
 from failover.cli.keeper_client import Keeper
@@ -163,20 +162,20 @@ def _cost(
         for robot in stage.robots:
             robot.end()
         if key.exists():
-            key.replace(sealing.key_path(primary.directory / "team"))
+            key.replace(keys.key_path(primary.directory / "team"))
         return _figures(place, by_arm) + afterwards(primary.directory / "agent.toml")
 
 
 def _new_key(primary: RobotMachine, gate: RobotMachine) -> Path:
     """Make the archive key and give the witness its half; the key lies aside until copies are to be made."""
-    path = sealing.new_key(primary.directory / "team")
-    signature.write_public(gate.directory / "team", sealing.read_key(primary.directory / "team"))
+    path = keys.new_key(primary.directory / "team")
+    signature.write_public(gate.directory / "team", keys.read_key(primary.directory / "team"))
     return path.replace(path.with_suffix(".aside"))
 
 
 def _switch(primary: RobotMachine, key: Path, is_copying: bool) -> None:
     """Have copies made, or no more of them; returns when one has been, or when the last one is over."""
-    path = sealing.key_path(primary.directory / "team")
+    path = keys.key_path(primary.directory / "team")
     if is_copying and key.exists():
         copies = _copies(primary)
         key.replace(path)

@@ -59,7 +59,12 @@ DOORS = {
     "zstandard": ("checkpoint/snapshot/compression.py", "failover/recording/mcap_file.py"),
     "zmq": ("agent/worker/network/replication_link.py", "failover/drivers/sockets.py"),
     "obstore": ("failover/archive/s3.py",),
-    "cryptography": ("failover/programs/keys.py", "failover/archive/sealed.py", "failover/archive/signature.py"),
+    "cryptography": (
+        "failover/programs/keys.py",
+        "failover/archive/keys.py",
+        "failover/archive/sealed.py",
+        "failover/archive/signature.py",
+    ),
     "mcap": ("failover/recording/mcap_file.py",),
     "fastavro": ("failover/core/messaging/avro.py",),
     "foxglove": ("failover/recording/foxglove_server.py",),

@@ -9,7 +9,7 @@ from failover.archive.archive import Copy, Label
 
 
 class Look(Struct, frozen=True, tag=True):
-    """Which of these contents does the archive lack, or hold harmed? ``digests``: blake3, 32 bytes each."""
+    """Which of these contents does the archive lack, or hold harmed, or for other readers? ``digests``: blake3, 32 bytes each."""
 
     digests: tuple[bytes, ...]
 

@@ -40,10 +40,11 @@ from checkpoint.sentences import in_words
 from checkpoint.snapshot import format
 from checkpoint.store.chain_files import fold_to
 from checkpoint.store.fold_rules import count_at_once
-from failover.archive import sealed
 from failover.archive.archive import Archive, object_store
+from failover.archive.keys import read_keys
 from failover.archive.objects import require_room
 from failover.archive.witness import Witness, WitnessObjects
+from failover.config.team import read as read_team
 from failover.core import vote_record
 from failover.errors import ArchiveError, FailoverError
 
@@ -78,7 +79,7 @@ class ByWorker:
 
 
 class Archivist:
-    """Carries requests out. The place, the key and the bucket's keys are looked for at each: they may come later, and change."""
+    """Carries requests out. The place, the members and all keys are looked for at each: they may come later, and change."""
 
     def __init__(self, settings: Settings, witness: Witness | None = None) -> None:
         self._settings = settings
@@ -98,7 +99,7 @@ class Archivist:
         archive = self._opened()
         match request:
             case Look():
-                return Done(lacking=tuple(digest for digest in request.digests if not archive.holds_whole(digest)))
+                return Done(lacking=tuple(digest for digest in request.digests if not archive.holds_for_all(digest)))
             case KeepContent():
                 with open(descriptors[0], "rb", buffering=0, closefd=False) as content:
                     return Done(size=archive.put_content(request.digest, content))
@@ -120,10 +121,12 @@ class Archivist:
                 return Done()
 
     def _opened(self) -> Archive:
-        store, team = self._settings.config.store, self._settings.team.team
-        key = sealed.read_key(Path(self._settings.config.team_directory))
-        objects = WitnessObjects(self._witness, key) if self._witness is not None else object_store(store.s3, store.s3_endpoint)
-        return Archive(objects, key, team, self._aside, by_epoch=fetches(self._settings))
+        store, directory = self._settings.config.store, Path(self._settings.config.team_directory)
+        team = read_team(directory)
+        keys = read_keys(directory, team)
+        witness = self._witness
+        objects = WitnessObjects(witness, keys.shared) if witness is not None else object_store(store.s3, store.s3_endpoint)
+        return Archive(objects, keys, team.team, self._aside, by_epoch=fetches(self._settings))
 
     @contextlib.contextmanager
     def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:

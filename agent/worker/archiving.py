@@ -9,7 +9,6 @@ Loaded when it is wanted: an agent without an archive does not carry it.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import time
@@ -35,7 +34,8 @@ from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.index import folder_name
 from failover.archive.archive import Copy
-from failover.archive.sealed import key_path
+from failover.archive.keys import key_path
+from failover.config.team import TEAM_FILE
 from failover.core.events import Archived, Event, Noticed
 
 BEHIND_ROUNDS: Final = 3
@@ -54,7 +54,7 @@ class _Shelf(Struct):
     """One component's copies.
 
     Attributes:
-        position: of the newest copy; None: none was made by this worker with this key.
+        position: of the newest copy; None: none was made by this worker for these readers.
         epoch: of that one; put_ns: when it was there, by the boot clock.
         since_s: when that was made, or the component was first seen here; monotonic.
         trouble: why the last try failed, wholly or for a file that it needs; "" if it did not.
@@ -92,13 +92,13 @@ class Archiving:
         self._shelves: dict[str, _Shelf] = {}
         self._process = ArchiveProcess(settings.path, courier)
         self._busy_with = ""
-        self._key_file: tuple[int, int] | None = None
+        self._sealed_by: tuple[tuple[int, int] | None, ...] = ()
 
     async def run(self) -> None:
         """Make copies until cancelled."""
         try:
             while True:
-                await self._look_at_key()
+                await self._look_at_keys()
                 for name in self._wanted():
                     self._busy_with = name
                     await self._copy(name)
@@ -107,13 +107,14 @@ class Archiving:
         finally:
             self._process.close()
 
-    async def _look_at_key(self) -> None:
-        """With another key all copies are made again: what was sealed before cannot be opened with it."""
-        found = await asyncio.to_thread(_sign_of, key_path(Path(self._settings.config.team_directory)))
-        if found != self._key_file:
+    async def _look_at_keys(self) -> None:
+        """With another archive key, or for other members, all copies are made again: not all could open those of before."""
+        directory = Path(self._settings.config.team_directory)
+        found = await asyncio.to_thread(_signs_of, key_path(directory), directory / TEAM_FILE)
+        if found != self._sealed_by:
             for shelf in self._shelves.values():
                 shelf.position, shelf.has = None, set()
-        self._key_file = found
+        self._sealed_by = found
 
     def listed(self, copies: Collection[Copy], begun_ns: int) -> None:
         """What the archive had from that instant on: a copy that has gone, and was followed by no later one, is put again."""
@@ -246,9 +247,13 @@ class Archiving:
         shelf.trouble = trouble
 
 
-def _sign_of(path: Path) -> tuple[int, int] | None:
-    """What changes when a file is replaced or written; None where there is none."""
-    with contextlib.suppress(OSError):
-        about = path.stat()
-        return about.st_ino, about.st_mtime_ns
-    return None
+def _signs_of(*paths: Path) -> tuple[tuple[int, int] | None, ...]:
+    """What changes when one of the files is replaced or written; None for one that is not there."""
+    signs: list[tuple[int, int] | None] = []
+    for path in paths:
+        try:
+            about = path.stat()
+            signs.append((about.st_ino, about.st_mtime_ns))
+        except OSError:
+            signs.append(None)
+    return tuple(signs)

@@ -23,6 +23,7 @@ from checkpoint.snapshot.required_files import Need
 from checkpoint.store.content_store import digest_of_descriptor
 from checkpoint.store.index import BASE_SUFFIX, FOLDER_PREFIX, file_name, folder_name, order_of_name
 from failover.archive import sealed
+from failover.archive.keys import Keys, ids_of
 from failover.archive.objects import FULL, FolderObjects, ObjectStore, PutRefusedError, require_room
 from failover.config.store import S3
 from failover.errors import ArchiveError
@@ -112,22 +113,22 @@ class Archive:
     """The objects of one team.
 
     Args:
-        key: the archive key.
+        keys: what is sealed here is for their readers.
         aside: a folder for files without a name that are sealed, or that arrive.
         by_epoch: the newest copy is that of the latest epoch, and none of an earlier epoch is put any more.
     """
 
-    def __init__(self, objects: ObjectStore, key: bytes, team: str, aside: Path, *, by_epoch: bool = False) -> None:
+    def __init__(self, objects: ObjectStore, keys: Keys, team: str, aside: Path, *, by_epoch: bool = False) -> None:
         self._by_epoch = by_epoch
         self._objects = objects
-        self._key = key
+        self._keys = keys
         self._team = quote(team, safe="")
         self._aside = aside
 
     # Keeping
 
     def put(self, checkpoint: BinaryIO, robot: str, spec: bytes = b"") -> tuple[str, int]:
-        """Keep a whole checkpoint, unless it is there unharmed; prove that it arrived.
+        """Keep a whole checkpoint, unless it is there unharmed for the same readers; prove that it arrived.
 
         Args:
             checkpoint: a file of the disk, of one base.
@@ -150,7 +151,7 @@ class Archive:
                 "robot has run it since; if none has, remove the copies of that epoch"
             )
         for copy in before:
-            if copy.file == file and not self._refusal(copy.name, copy.size):
+            if copy.file == file and not self._lack(copy.name, copy.size):
                 return copy.name, copy.size
         try:
             return self._put_now(checkpoint, header, robot, spec, before)
@@ -176,15 +177,21 @@ class Archive:
         size = self._objects.size(name)
         return size is not None and not self._refusal(name, size)
 
+    def holds_for_all(self, digest: bytes) -> bool:
+        """The same, and each reader can open it, and no other."""
+        name = self._content_name(digest)
+        size = self._objects.size(name)
+        return size is not None and not self._lack(name, size)
+
     def put_content(self, digest: bytes, content: BinaryIO) -> int:
         """Keep a file that programs need, by its blake3 digest; the size of its object. Raises as `put`.
 
-        An object of it that was harmed is replaced.
+        An object of it that was harmed, or was sealed for other readers, is replaced.
         """
         name, found = self._content_name(digest), blake3()
         there = self._objects.size(name)
         if there is not None:
-            if not self._refusal(name, there):
+            if not self._lack(name, there):
                 return there
             self._objects.remove(name)
 
@@ -218,7 +225,7 @@ class Archive:
         """
         require_room(self._aside, size)
         with tempfile.TemporaryFile(dir=self._aside) as file:
-            there = sealed.seal(self._key, name, parts, file)
+            there = sealed.seal(self._keys, name, parts, file)
             prove()
             file.flush()
             is_ours = self._put_in_room(name, file, spare)
@@ -243,19 +250,32 @@ class Archive:
         return self._objects.put(name, file)
 
     def _refusal(self, name: str, size: int) -> str:
-        """Why an object is not whole; "" where its size and its two ends prove it: this key, this name, the last frame."""
-        found = self._objects.size(name)
-        if found != size or size < sealed.HEAD_SIZE + sealed.TAG_SIZE:
-            return f"it was sent with {size} bytes, and has {found or 0} there"
-        with closing(self._objects.open(name)) as source:
-            head = sealed.exactly(source, sealed.HEAD_SIZE)
-        with closing(self._objects.open(name, sealed.last_frame(size))) as source:
-            last = sealed.exactly(source, sealed.FRAME_SIZE + sealed.TAG_SIZE)
+        """Why an object is not whole; "" where its size and its two ends prove it: these keys, this name, the last frame."""
         try:
-            sealed.check_end(self._key, name, head, size, last)
+            self._proved(name, size)
         except ArchiveError as error:
             return str(error)
         return ""
+
+    def _lack(self, name: str, size: int) -> str:
+        """The same; or that it was sealed for others than those who are to open it."""
+        try:
+            readers = sealed.readers_in(self._proved(name, size))
+        except ArchiveError as error:
+            return str(error)
+        return "" if readers == ids_of(self._keys.readers) else f"{name} was sealed for other members"
+
+    def _proved(self, name: str, size: int) -> bytes:
+        """The head of an object that is whole."""
+        found = self._objects.size(name)
+        if found != size:
+            raise ArchiveError(f"it was sent with {size} bytes, and has {found or 0} there")
+        with closing(self._objects.open(name)) as source:
+            head = sealed.read_head(name, source)
+        with closing(self._objects.open(name, sealed.last_frame(head, size))) as source:
+            last = sealed.exactly(source, sealed.FRAME_SIZE + sealed.TAG_SIZE)
+        sealed.check_end(self._keys, name, head, size, last)
+        return head
 
     # Asking
 
@@ -292,7 +312,7 @@ class Archive:
             OSError: the file does not take it.
         """
         with closing(self._objects.open(copy.name)) as source:
-            parts = sealed.unsealed(self._key, copy.name, source)
+            parts = sealed.unsealed(self._keys, copy.name, source)
             first = next(parts, b"")
             size = int.from_bytes(first[:4], "little")
             label = _label(copy.name, first[4 : 4 + size]) if size <= LABEL_SIZE_MAX else None
@@ -316,14 +336,14 @@ class Archive:
         if self._objects.size(name) is None:
             raise ArchiveError(f"{need.path}, which the program needs, is not in the archive; install it here")
         with closing(self._objects.open(name)) as source:
-            for part in sealed.unsealed(self._key, name, source):
+            for part in sealed.unsealed(self._keys, name, source):
                 file.write(part)
         file.flush()
         if digest_of_descriptor(file.fileno()) != need.digest:
             raise ArchiveError(f"{name} in the archive is not the content of {need.path}")
 
     def _content_name(self, digest: bytes) -> str:
-        keyed = blake3(self._key + digest, derive_key_context=_NAMES).hexdigest()
+        keyed = blake3(self._keys.shared + digest, derive_key_context=_NAMES).hexdigest()
         return f"{self._team}/{CONTENTS}/{keyed}{SUFFIX}"
 
 

@@ -3,9 +3,9 @@
 By AES-256-GCM, or ChaCha20-Poly1305 where the processor has no instructions for AES: without these AES is slow, and the time that
 it takes tells of its key. An object says by which it was sealed, and opens on any robot.
 
-The byte table is in ``ARCHIVE.md``. One key for the team, the *archive key*: 32 random bytes, ``keys/archive.key`` in the team
-directory. Each object has a key of its own, derived from that, from a random salt and from the object's name: an object under
-another name is refused. Its frames are numbered, and the last one is marked: a part is refused.
+The byte table is in ``ARCHIVE.md``; who opens what, in `failover.archive.keys`. The key of an object's frames is derived from
+its content key, the archive key, its whole head and its name: an object under another name, or with another head, is refused.
+Its frames are numbered, and the last one is marked: a part is refused.
 
 Sources: RFC 5869 (HKDF); NIST SP 800-38D (GCM); RFC 8439 (ChaCha20-Poly1305); Hoang, Reyhanitabar, Rogaway,
 Vizár, CRYPTO 2015 (STREAM: numbered frames).
@@ -13,81 +13,31 @@ Vizár, CRYPTO 2015 (STREAM: numbered frames).
 
 from __future__ import annotations
 
-import os
 import secrets
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from checkpoint.store.whole_file import write_new
+from blake3 import blake3
+
+from failover.archive.keys import COUNT_SIZE, KEY_SIZE, READERS_MAX, WRAP_SIZE, Keys, ids_in, unwrapped, wrapped
 from failover.archive.objects import Readable
 from failover.errors import ArchiveError
 
-AES: Final = b"FOARCHV1"
-CHACHA: Final = b"FOARCHC1"
+AES: Final = b"FOARCHV2"
+CHACHA: Final = b"FOARCHC2"
 MAGIC_SIZE: Final = 8
 SALT_SIZE: Final = 32
-HEAD_SIZE: Final = MAGIC_SIZE + SALT_SIZE
+WRAPS_AT: Final = MAGIC_SIZE + SALT_SIZE
+HEAD_SIZE_LEAST: Final = WRAPS_AT + KEY_SIZE + COUNT_SIZE
 FRAME_SIZE: Final = 1 << 20
 TAG_SIZE: Final = 16
-KEY_SIZE: Final = 32
-KEY_FILE: Final = "archive.key"
 FRAMES_MAX: Final = 1 << 32
 PROCESSOR: Final = Path("/proc/cpuinfo")
-CURE: Final = "failover archive key makes one; every robot and server of the team needs the same"
 
 
-def key_path(team: Path) -> Path:
-    """Where the archive key is, in a team directory. A robot's secret key ends otherwise: no name is taken."""
-    return team / "keys" / KEY_FILE
-
-
-def new_key(team: Path) -> Path:
-    """Make an archive key; one that is there is never overwritten.
-
-    Raises:
-        ArchiveError: there is one, or it cannot be written.
-    """
-    path = key_path(team)
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_new(path, secrets.token_hex(KEY_SIZE).encode() + b"\n")
-    except FileExistsError as error:
-        raise ArchiveError(
-            f"{path} exists, and what was sealed with it can be opened by it alone: move it away first if you want another"
-        ) from error
-    except OSError as error:
-        raise ArchiveError(f"cannot write {path}: {error.strerror}") from error
-    return path
-
-
-def read_key(team: Path) -> bytes:
-    """The archive key.
-
-    Raises:
-        ArchiveError: it is missing, others may read it, or it is none.
-    """
-    path = key_path(team)
-    try:
-        with path.open() as file:
-            mode, text = os.fstat(file.fileno()).st_mode, file.read(4 * KEY_SIZE).strip()
-    except OSError as error:
-        raise ArchiveError(f"cannot read the archive key {path}: {error.strerror}; {CURE}") from error
-    except UnicodeDecodeError as error:
-        raise ArchiveError(f"{path} is no archive key; {CURE}") from error
-    if mode & 0o077:
-        raise ArchiveError(f"{path} is open to others (mode {mode & 0o777:o}); run: chmod 600 {path}")
-    try:
-        key = bytes.fromhex(text)
-    except ValueError:
-        key = b""
-    if len(key) != KEY_SIZE:
-        raise ArchiveError(f"{path} is no archive key: it is not {2 * KEY_SIZE} hexadecimal digits; {CURE}")
-    return key
-
-
-def seal(key: bytes, name: str, parts: Iterator[bytes], file: BinaryIO) -> int:
+def seal(keys: Keys, name: str, parts: Iterator[bytes], file: BinaryIO) -> int:
     """Write sealed content to an empty file; its size in bytes.
 
     Args:
@@ -95,11 +45,12 @@ def seal(key: bytes, name: str, parts: Iterator[bytes], file: BinaryIO) -> int:
         parts: the content, in pieces of any size.
 
     Raises:
-        ArchiveError: the library is not installed.
+        ArchiveError: the library is not installed; a reader's key is none.
         OSError: the file does not take it.
     """
-    head = (AES if has_aes() else CHACHA) + secrets.token_bytes(SALT_SIZE)
-    cipher = _cipher(key, head, name)
+    content_key = secrets.token_bytes(KEY_SIZE)
+    head = (AES if has_aes() else CHACHA) + secrets.token_bytes(SALT_SIZE) + wrapped(content_key, keys.readers, name)
+    cipher = _cipher(content_key, keys.shared, head, name)
     size = file.write(head)
     number, held = 0, bytearray()
     for part in parts:
@@ -111,13 +62,13 @@ def seal(key: bytes, name: str, parts: Iterator[bytes], file: BinaryIO) -> int:
     return size + file.write(cipher.encrypt(_nonce(number, True), bytes(held), None))
 
 
-def unsealed(key: bytes, name: str, source: Readable) -> Iterator[bytes]:
+def unsealed(keys: Keys, name: str, source: Readable) -> Iterator[bytes]:
     """The content, frame by frame: each was proved. Whoever takes frames undoes all if a later one is refused.
 
     Raises:
         ArchiveError: it was altered, cut off, put under another name, or sealed with another key.
     """
-    cipher, number = _cipher(key, exactly(source, HEAD_SIZE), name), 0
+    cipher, number = _opener(keys, name, read_head(name, source)), 0
     frame = exactly(source, FRAME_SIZE + TAG_SIZE)
     while following := exactly(source, FRAME_SIZE + TAG_SIZE):
         yield _opened(cipher, number, False, frame, name)
@@ -125,23 +76,40 @@ def unsealed(key: bytes, name: str, source: Readable) -> Iterator[bytes]:
     yield _opened(cipher, number, True, frame, name)
 
 
-def check_end(key: bytes, name: str, head: bytes, size: int, frame: bytes) -> None:
-    """Prove the last frame of a sealed object, which proves the key, the name and the size.
+def check_end(keys: Keys, name: str, head: bytes, size: int, frame: bytes) -> None:
+    """Prove the last frame of a sealed object, which proves the keys, the head, the name and the size.
 
     Args:
-        head: the first `HEAD_SIZE` bytes; ``size``: of the whole object; ``frame``: its bytes from `last_frame` on.
+        head: as `read_head` gave it; ``size``: of the whole object; ``frame``: its bytes from `last_frame` on.
 
     Raises:
         ArchiveError: as `unsealed`.
     """
-    number = (last_frame(size) - HEAD_SIZE) // (FRAME_SIZE + TAG_SIZE)
-    _opened(_cipher(key, head, name), number, True, frame, name)
+    number = (last_frame(head, size) - len(head)) // (FRAME_SIZE + TAG_SIZE)
+    _opened(_opener(keys, name, head), number, True, frame, name)
 
 
-def last_frame(size: int) -> int:
-    """Where the last frame of a sealed object of this size begins."""
-    whole = max(size - HEAD_SIZE - 1, 0) // (FRAME_SIZE + TAG_SIZE)
-    return HEAD_SIZE + whole * (FRAME_SIZE + TAG_SIZE)
+def last_frame(head: bytes, size: int) -> int:
+    """Where the last frame of a sealed object of this head and size begins."""
+    whole = max(size - len(head) - 1, 0) // (FRAME_SIZE + TAG_SIZE)
+    return len(head) + whole * (FRAME_SIZE + TAG_SIZE)
+
+
+def read_head(name: str, source: Readable) -> bytes:
+    """An object's bytes before its frames. Raises ArchiveError: there is no head."""
+    head = exactly(source, HEAD_SIZE_LEAST)
+    count = int.from_bytes(head[-COUNT_SIZE:], "little")
+    if head[:MAGIC_SIZE] not in (AES, CHACHA) or len(head) < HEAD_SIZE_LEAST or not 0 < count <= READERS_MAX:
+        raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
+    wraps = exactly(source, count * WRAP_SIZE)
+    if len(wraps) < count * WRAP_SIZE:
+        raise ArchiveError(f"{name} in the archive was cut off in its head")
+    return head + wraps
+
+
+def readers_in(head: bytes) -> frozenset[bytes]:
+    """Who can open an object, as `failover.archive.keys.ids_of` has it."""
+    return ids_in(head[WRAPS_AT:])
 
 
 def _opened(cipher: Any, number: int, is_last: bool, frame: bytes, name: str) -> bytes:
@@ -178,18 +146,16 @@ def has_aes() -> bool:
         return False
 
 
-def _cipher(key: bytes, head: bytes, name: str) -> Any:
-    """The cipher that an object's head names, with the key of that object. Raises ArchiveError: it names none."""
-    if head[:MAGIC_SIZE] not in (AES, CHACHA) or len(head) < HEAD_SIZE:
-        raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
-    magic, salt = head[:MAGIC_SIZE], head[MAGIC_SIZE:]
-    try:
-        from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
-        from cryptography.hazmat.primitives.hashes import SHA256
-        from cryptography.hazmat.primitives.kdf.hkdf import HKDF
-    except ImportError as error:
-        raise ArchiveError(
-            "an archive needs the library cryptography, which is not installed: pip install 'failover[s3]'"
-        ) from error
-    kind, meant = (ChaCha20Poly1305, b"failover-archive-1 chacha\0") if magic == CHACHA else (AESGCM, b"failover-archive-1\0")
-    return kind(HKDF(SHA256(), KEY_SIZE, salt, meant + name.encode()).derive(key))
+def _opener(keys: Keys, name: str, head: bytes) -> Any:
+    return _cipher(unwrapped(head[WRAPS_AT:], keys.secrets, name), keys.shared, head, name)
+
+
+def _cipher(content_key: bytes, shared: bytes, head: bytes, name: str) -> Any:
+    """The cipher that an object's head names, with the key of its frames."""
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
+    from cryptography.hazmat.primitives.hashes import SHA256
+    from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+    salt, meant = head[MAGIC_SIZE:WRAPS_AT], b"failover-archive-2 frames\0" + blake3(head).digest() + name.encode()
+    derived = HKDF(SHA256(), KEY_SIZE, salt, meant).derive(content_key + shared)
+    return (ChaCha20Poly1305 if head[:MAGIC_SIZE] == CHACHA else AESGCM)(derived)

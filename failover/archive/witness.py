@@ -21,7 +21,7 @@ from failover.errors import ArchiveError
 READ_MAX: Final = 192 << 10
 """Bytes of one answer: it travels as one message."""
 
-HEAD: Final = 64
+HEAD: Final = 1 << 10
 """Bytes that are asked for first: who looks at an object's head needs no more."""
 
 LISTED_MAX: Final = 500

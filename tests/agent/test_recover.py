@@ -15,7 +15,7 @@ from agent.main import main
 from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.snapshot import format
 from checkpoint.store.store import open_store
-from failover.archive import sealed
+from failover.archive import keys
 from failover.archive.archive import Archive, Copy, Label
 from failover.archive.objects import FolderObjects
 from failover.config import team
@@ -40,10 +40,16 @@ def place(config: Path) -> Path:
     place.mkdir()
     with config.open("a") as file:
         file.write(f'[store]\ns3 = "{place}"\n')
-    sealed.new_key(config.parent / "team")
+    keys.new_key(config.parent / "team")
     for sequence in (1, 2):
         put(place, config, sequence)
     return place
+
+
+def keys_at(config: Path) -> keys.Keys:
+    """Those of its team directory."""
+    directory = config.parent / "team"
+    return keys.read_keys(directory, team.read(directory))
 
 
 def records(config: Path) -> tuple[Record, ...]:
@@ -93,7 +99,7 @@ def test_a_checkpoint_from_the_archive_is_as_old_as_its_state(
         ("nothing named", "recover needs a component"),
         ("not there", "has no checkpoint of mapper"),
         ("altered", "was altered, cut off or sealed with another archive key"),
-        ("another key", "was altered, cut off or sealed with another archive key"),
+        ("another key", "was sealed with other keys than those that are here: bring archive.recovery"),
         ("no key", "failover archive key makes one"),
         ("no place", "mount the disk"),
         ("store in use", "another process has it open"),
@@ -104,7 +110,7 @@ def test_what_cannot_be_recovered_changes_nothing(
     spoil: str, said: str, config: Path, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = records(config)
-    key = sealed.key_path(config.parent / "team")
+    key = keys.key_path(config.parent / "team")
     words = {"nothing named": (), "not there": ("mapper",)}.get(spoil, ("planner",))
     held = open_store(config.parent / "state" / "store") if spoil == "store in use" else None
     match spoil:
@@ -114,14 +120,13 @@ def test_what_cannot_be_recovered_changes_nothing(
         case "another key" | "no key":
             key.unlink()
             if spoil == "another key":
-                sealed.new_key(config.parent / "team")
+                keys.recovery_path(config.parent / "team").unlink()
+                keys.new_key(config.parent / "team")
         case "newer":
             with tempfile.TemporaryFile() as file:
                 file.write(format.encode_bytes(snapshot({1: page("3")}, sequence=3, component=COMPONENT)))
                 file.flush()
-                Archive(FolderObjects(place), sealed.read_key(config.parent / "team"), "lab", config.parent).put(
-                    file, "robot9", b"x"
-                )
+                Archive(FolderObjects(place), keys_at(config), "lab", config.parent).put(file, "robot9", b"x")
         case "no place":
             place.rename(place.with_name("elsewhere"))
     assert recover(config, *words) == 1
@@ -139,7 +144,7 @@ def put(place: Path, config: Path, sequence: int) -> None:
     with tempfile.TemporaryFile() as file:
         file.write(format.encode_bytes(snapshot({1: page(str(sequence))}, sequence=sequence, component=COMPONENT)))
         file.flush()
-        key = sealed.read_key(config.parent / "team")
+        key = keys_at(config)
         Archive(FolderObjects(place), key, "lab", config.parent).put(file, "robot9", msgspec.msgpack.encode(SPEC))
 
 

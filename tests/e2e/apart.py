@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from failover.archive import sealed
+from failover.archive import keys
 from failover.cli.demo.robots import ADDRESS, NAMES, Pace, RobotMachine, Stage, ip_command, ip_inside, run, wait_for_network
 from failover.core.types import PEERS_MAX
 from tests import s3_servers
@@ -172,8 +172,9 @@ def site(directory: Path, settings: str = SETTINGS) -> Iterator[Site]:
         with stage:
             stage.directory.mkdir()
             stage._write_team()
-            key = sealed.new_key(stage.directory / NAMES[0] / "team")
-            shutil.copy2(key, sealed.key_path(stage.directory / NAMES[1] / "team"))
+            key = keys.new_key(stage.directory / NAMES[0] / "team")
+            shutil.copy2(key, keys.key_path(stage.directory / NAMES[1] / "team"))
+            keys.recovery_path(stage.directory / NAMES[0] / "team").unlink()
             try:
                 for name in NAMES:
                     made.boot(name)

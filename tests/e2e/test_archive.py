@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from failover.archive import sealed
+from failover.archive import keys
 from tests import s3_servers
 from tests.e2e import robots
 from tests.e2e.robots import RobotMachine
@@ -50,15 +50,16 @@ def archive_of(kind: str, tmp_path: Path) -> Iterator[tuple[str, str]]:
 
 
 def give_key(*machines: RobotMachine) -> Path:
-    """A team directory as a new machine gets it: the team file and the archive key; the robots have the same key."""
+    """A team directory as a new machine gets it: team file, archive key, and the recovery key, which no robot has."""
     team = machines[0].directory / "team"
-    path = sealed.new_key(team)
+    path = keys.new_key(team)
     for robot in machines[1:]:
-        shutil.copy2(path, sealed.key_path(robot.directory / "team"))
+        shutil.copy2(path, keys.key_path(robot.directory / "team"))
     alone = machines[0].directory.parent.parent / "new machine"
     (alone / "keys").mkdir(parents=True)
     shutil.copy2(team / "team.toml", alone)
     shutil.copy2(path, alone / "keys")
+    shutil.move(keys.recovery_path(team), alone / "keys")
     return alone
 
 

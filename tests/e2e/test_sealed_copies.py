@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from failover.archive import sealed, signature
+from failover.archive import keys, signature
 from failover.cli.demo.robots import RobotMachine
 from failover.config.team import Role
 from tests.e2e import robots, teams
@@ -53,13 +53,14 @@ def team(tmp_path: Path) -> Iterator[TeamStage]:
     """Two robots that put sealed copies into the keeping of a witness, and one program with secrets that is protected."""
     with teams.acting(tmp_path, ROLES, BOOTS_FAST, OWN) as stage:
         first, second, _ = (stage.members[name].directory / "team" for name in ROLES)
-        sealed.new_key(first)
-        shutil.copy2(sealed.key_path(first), sealed.key_path(second))
+        keys.new_key(first)
+        shutil.copy2(keys.key_path(first), keys.key_path(second))
+        keys.recovery_path(first).unlink()  # the robots' own keys open what the robots sealed
         robots.run(stage.members["robot1"], "count", "/usr/bin/python3", "-S", "-c", KEEPS_SECRETS)
         robots.until_protected(stage.members["robot1"])
         cure = "archive.public: No such file or directory; failover archive key writes it beside the archive key"
         until(lambda: any(cure in note for note in behind(stage.members["robot1"])), "the witness to miss its half of the key")
-        signature.write_public(stage.members["gate"].directory / "team", sealed.read_key(first))
+        signature.write_public(stage.members["gate"].directory / "team", keys.read_key(first))
         yield stage
 
 
@@ -154,7 +155,7 @@ def test_a_team_that_lost_every_disk_goes_on_from_the_witness_which_is_refused_w
         for spoiled in (whole[:-1] + bytes([whole[-1] ^ 1]), whole[:-100], older.read_bytes()):
             newest_copy.write_bytes(spoiled)
             refused = recovering(second, "count")
-            assert refused.returncode == 1 and f"{newest_copy.name} in the archive was altered, cut off or" in refused.stderr
+            assert refused.returncode == 1 and f"{newest_copy.name} in the archive was altered, " in refused.stderr
             assert not list((second.directory / "state" / "store").rglob("*.base"))
         newest_copy.write_bytes(whole)
         said = recovering(second, "count")

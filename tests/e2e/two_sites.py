@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from failover.archive import sealed, signature
+from failover.archive import keys, signature
 from failover.cli import key_pairs
 from failover.cli.demo.robots import RobotMachine, ip_inside, run, wait_for_network
 from failover.config import team
@@ -96,10 +96,10 @@ class TwoSites(TeamStage):
     def _give_keys(self) -> None:
         """Of the archive: all to each robot, and its public half to the witness."""
         first = self.directory / "robot1" / "team"
-        own = sealed.new_key(first)
+        own = keys.new_key(first)
         for path in own.parent.glob("archive.*"):
             shutil.copy2(path, self.directory / "robot3" / "team" / "keys")
-        signature.write_public(self.directory / "gate" / "team", sealed.read_key(first))
+        signature.write_public(self.directory / "gate" / "team", keys.read_key(first))
 
 
 @contextlib.contextmanager

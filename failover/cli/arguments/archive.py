@@ -35,8 +35,9 @@ def _add_place(room: argparse.ArgumentParser) -> None:
 
 KEY_DESCRIPTION: Final = """
     Make the archive key of the team: keys/archive.key in the team directory. Carry it to the same place at every robot and server
-    that archives or fetches, and keep a copy where no robot is: without it nobody opens the archive. The file
-    keys/archive.public beside it opens nothing: it is for a witness that is to keep sealed copies.
+    that archives or fetches: each opens copies with it and its own key. Beside it, keys/archive.recovery opens copies when no
+    robot of the team is left: move it, with a copy of archive.key, to where no robot is. The file keys/archive.public opens
+    nothing: it is for a witness that is to keep sealed copies.
 
       failover archive key
     """
@@ -51,7 +52,7 @@ LIST_DESCRIPTION: Final = """
 FETCH_DESCRIPTION: Final = """
     Bring a checkpoint here, with its files that this machine lacks (in FILE.contents), and prove every byte of it. failover
     restore starts its program from that file, and failover protect protects that program again. This needs the team file, the
-    archive key and the keys of the bucket, and no agent.
+    archive key, a robot's own key or the recovery key, and the keys of the bucket; no agent.
 
       failover archive fetch mapper --output mapper.snapshot
       failover archive fetch /lab/r1/mapper --output mapper.snapshot --place s3://robots/lab

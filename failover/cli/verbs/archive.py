@@ -19,7 +19,7 @@ from checkpoint.sentences import visible
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import Need, needs
 from checkpoint.store.content_store import CONTENT_MODE, digest_of_file, path_in
-from failover.archive import sealed, signature
+from failover.archive import keys, signature
 from failover.archive.archive import Archive, Copy, object_store
 from failover.cli.output import render, team_tree
 from failover.config import team as team_directory
@@ -34,17 +34,18 @@ NAMED: Final = 3
 
 
 def key(arguments: argparse.Namespace) -> int:
-    """Make the team's archive key, and write its public half, by which a witness proves what it keeps."""
+    """Make the team's archive key, its recovery key, and the public half by which a witness proves what it keeps."""
     team = Path(arguments.directory)
-    path = sealed.key_path(team)
+    path, recovery = keys.key_path(team), keys.recovery_path(team)
     if not path.exists() or signature.public_path(team).exists():
-        path = sealed.new_key(team)  # refuses where there is one
-    signature.write_public(team, sealed.read_key(team))
+        path = keys.new_key(team)  # refuses where there is one
+    signature.write_public(team, keys.read_key(team))
     public = signature.public_path(team)
     if arguments.json:
-        render.as_json({"file": str(path), "public": str(public)})
+        render.as_json({"file": str(path), "recovery": str(recovery), "public": str(public)})
     else:
         print(f"{path} is the archive key: carry it to the same place at every robot and server, and keep a copy elsewhere")
+        print(f"{recovery} opens each copy when no robot's own key is left: move it, with that copy, to where no robot is")
         print(f"{public} opens nothing: carry it to the same place at a witness that is to keep sealed copies")
     return 0
 
@@ -126,8 +127,8 @@ def _archive(arguments: argparse.Namespace) -> tuple[str, Archive]:
     if not place:
         raise ArchiveError(f"no archive is named: {CONFIG} has no s3 in [store]; name it by --place s3://BUCKET/PREFIX")
     directory = Path(arguments.directory)
-    team = team_directory.read(directory).team
-    return place, Archive(object_store(place, endpoint or ""), sealed.read_key(directory), team, Path("."))
+    team = team_directory.read(directory)
+    return place, Archive(object_store(place, endpoint or ""), keys.read_keys(directory, team), team.team, Path("."))
 
 
 def _meant(archive: Archive, place: str, arguments: argparse.Namespace) -> Copy:

@@ -25,6 +25,7 @@ from agent.errors import LaneError
 from agent.system import clock
 from agent.worker.archiving import Archiving
 from agent.worker.network.remote_orders import Errands
+from agent.worker.network.replication_link import new_keys
 from agent.worker.replication.send_files import Reader
 from agent.worker.replication.send_sealed import Courier
 from agent.worker.replication.transfer import Shipper
@@ -35,7 +36,7 @@ from checkpoint.snapshot.required_files import Need
 from checkpoint.store import chain
 from checkpoint.store.chain_files import fold_to
 from checkpoint.store.store import Store, open_store
-from failover.archive import sealed
+from failover.archive import keys, sealed
 from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
 from failover.config import team
@@ -61,8 +62,8 @@ class Member:
     events: list[Event] = field(default_factory=list)
 
     def archive(self) -> Archive:
-        key = sealed.read_key(self.directory / "team")
-        return Archive(FolderObjects(self.directory / "place"), key, "lab", self.directory)
+        known = keys.read_keys(self.directory / "team", team.read(self.directory / "team"))
+        return Archive(FolderObjects(self.directory / "place"), known, "lab", self.directory)
 
     def put(self, *made: Snapshot) -> None:
         for one in made:
@@ -96,7 +97,7 @@ def member(
     robots = {f"robot{place}": Robot((f"127.0.0.1:74{place}0",), f"127.0.0.1:74{place}1") for place in (1, 2, 3)}
     robots["robot1"] = replace(robots["robot1"], role=role)
     team.write(directory / "team", Team("lab", robots))
-    sealed.new_key(directory / "team")
+    keys.new_key(directory / "team")
     for name in ("place", "state"):
         (directory / name).mkdir()
     path = directory / "agent.toml"
@@ -224,6 +225,46 @@ def test_the_files_of_a_program_go_along_and_one_that_cannot_be_had_is_told(tmp_
         ]
 
 
+def test_when_a_member_goes_what_it_could_open_is_sealed_anew_for_those_who_stay(tmp_path: Path) -> None:
+    content = os.urandom(100_000)
+
+    async def opening(component: str, need: Need) -> int:
+        return memfd_holding(content, "file")
+
+    with member(tmp_path, bring=True, opening=opening) as one:
+        before = team.read(tmp_path / "team")
+        with_keys = {name: replace(robot, public_key=new_keys()[0]) for name, robot in before.robots.items() if name != "robot1"}
+        robots = before.robots | with_keys
+        team.write(tmp_path / "team", replace(before, robots=robots))
+        made = snapshot({1: page("x")})
+        executable = type(made.process.executable)("/opt/mapper", size=len(content), digest=blake3(content).digest())
+        state = msgspec.structs.replace(made, process=msgspec.structs.replace(made.process, executable=executable))
+        one.put(msgspec.structs.replace(state, position=chain.position_of(state, 1, 1)))
+        one.running.add(COMPONENT)
+
+        def sealed_for(*names: str) -> bool:
+            """Whether the newest copy, and the file that the program needs, are for these alone."""
+            stay = replace(before, robots={name: robots[name] for name in names})
+            wanted = keys.ids_of(keys.read_keys(tmp_path / "team", stay).readers)
+            newest = [tmp_path / "place" / copy.name for copy in one.archive().copies()[:1]]
+            found = [*newest, *(tmp_path / "place").rglob("contents/*.sealed")]
+            return len(found) == 2 and all(readers_of(path) == wanted for path in found)
+
+        async def work() -> None:
+            await until(lambda: sealed_for("robot1", "robot2", "robot3"))
+            team.write(tmp_path / "team", replace(before, robots={name: robots[name] for name in ("robot1", "robot2")}))
+            await until(lambda: sealed_for("robot1", "robot2"))
+
+        run(one, work)
+        assert one.archived() == [1, 1] and one.archive().holds_whole(executable.digest)
+
+
+def readers_of(path: Path) -> frozenset[bytes]:
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:  # it may be replaced meanwhile
+        return sealed.readers_in(sealed.read_head(path.name, file))
+    return frozenset()
+
+
 def test_a_chain_is_folded_in_steps_where_its_deltas_are_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     together: list[int] = []
 
@@ -255,9 +296,10 @@ def test_a_key_that_is_replaced_seals_all_anew(tmp_path: Path) -> None:
 
         async def work() -> None:
             await until(lambda: one.archived() == [1])
-            path = sealed.key_path(tmp_path / "team")
+            path = keys.key_path(tmp_path / "team")
             path.rename(path.with_suffix(".old"))
-            sealed.new_key(tmp_path / "team")
+            keys.recovery_path(tmp_path / "team").unlink()
+            keys.new_key(tmp_path / "team")
             await until(lambda: one.archived() == [1, 1])
 
         run(one, work)

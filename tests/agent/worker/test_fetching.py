@@ -21,7 +21,7 @@ from checkpoint.model import Snapshot
 from checkpoint.snapshot import format
 from checkpoint.store.chain import position_of
 from checkpoint.store.store import open_store
-from failover.archive import sealed
+from failover.archive import keys
 from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
 from failover.config import team
@@ -42,7 +42,7 @@ class Member:
     def __init__(self, directory: Path, bring: bool = False, components: str = "") -> None:
         robots = {f"robot{place}": Robot((f"127.0.0.1:74{place}0",), f"127.0.0.1:74{place}1") for place in (1, 2)}
         team.write(directory / "team", Team("lab", robots))
-        sealed.new_key(directory / "team")
+        keys.new_key(directory / "team")
         for name in ("place", "state"):
             (directory / name).mkdir()
         path = directory / "agent.toml"
@@ -64,8 +64,8 @@ class Member:
 
     def put(self, snapshot: Snapshot) -> str:
         """Another robot puts a copy; the object's name."""
-        key = sealed.read_key(self.directory / "team")
-        archive = Archive(FolderObjects(self.directory / "place"), key, "lab", self.directory, by_epoch=True)
+        known = keys.read_keys(self.directory / "team", team.read(self.directory / "team"))
+        archive = Archive(FolderObjects(self.directory / "place"), known, "lab", self.directory, by_epoch=True)
         descriptor = memfd_holding(format.encode_bytes(snapshot), "snapshot")
         with os.fdopen(descriptor, "rb") as file:
             return archive.put(file, "robot2", msgspec.msgpack.encode(SPEC))[0]

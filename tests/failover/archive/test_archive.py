@@ -24,8 +24,9 @@ from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import Need
 from checkpoint.store import chain
 from checkpoint.store.chain_files import fold_to
-from failover.archive import sealed
+from failover.archive import keys, sealed
 from failover.archive.archive import STAMP_MS_MAX, Archive
+from failover.archive.keys import keys_without_members
 from failover.archive.objects import FolderObjects
 from failover.core.types import ComponentSpec
 from failover.errors import ArchiveError
@@ -34,6 +35,8 @@ from tests.checkpoint.snapshots import COMPONENT, family, history, page, pages_o
 pytest.importorskip("cryptography")
 
 KEY = bytes(range(32))
+HEAD_SIZE = sealed.HEAD_SIZE_LEAST + keys.WRAP_SIZE
+"""Bytes of the head of an object for one reader."""
 NAME = "lab/@x/1.base.sealed"
 
 
@@ -53,7 +56,7 @@ def place(tmp_path: Path) -> Path:
 
 
 def archive(place: Path, key: bytes = KEY, team: str = "lab") -> Archive:
-    return Archive(FolderObjects(place), key, team, place.parent)
+    return Archive(FolderObjects(place), keys_without_members(key), team, place.parent)
 
 
 def put(archive: Archive, made: Snapshot, spec: bytes = b"") -> str:
@@ -72,18 +75,19 @@ def fetched(archive: Archive, number: int = 0, component: str = COMPONENT) -> Sn
 
 def seal(content: bytes, name: str = NAME, key: bytes = KEY) -> bytes:
     with io.BytesIO() as file:
-        size = sealed.seal(key, name, iter([content[:7], content[7:]]), file)
+        size = sealed.seal(keys_without_members(key), name, iter([content[:7], content[7:]]), file)
         assert size == len(file.getvalue())
         return file.getvalue()
 
 
 def opened(content: bytes, name: str = NAME, key: bytes = KEY) -> bytes:
-    return b"".join(sealed.unsealed(key, name, io.BytesIO(content)))
+    return b"".join(sealed.unsealed(keys_without_members(key), name, io.BytesIO(content)))
 
 
 def check_end(content: bytes) -> None:
-    last = sealed.last_frame(len(content))
-    sealed.check_end(KEY, NAME, content[: sealed.HEAD_SIZE], len(content), content[last:])
+    head = content[:HEAD_SIZE]
+    last = sealed.last_frame(head, len(content))
+    sealed.check_end(keys_without_members(KEY), NAME, sealed.read_head(NAME, io.BytesIO(content)), len(content), content[last:])
 
 
 @pytest.fixture(params=[sealed.AES, sealed.CHACHA], ids=["AES", "ChaCha20"])
@@ -111,7 +115,7 @@ def test_both_ends_of_an_object_do_not_prove_it_where_its_first_bytes_name_no_ci
 
 
 def test_two_seals_of_one_content_share_no_byte_beyond_chance() -> None:
-    assert seal(b"secret")[: sealed.HEAD_SIZE] != seal(b"secret")[: sealed.HEAD_SIZE]
+    assert seal(b"secret")[:HEAD_SIZE] != seal(b"secret")[:HEAD_SIZE]
 
 
 @pytest.mark.parametrize(("flags", "has"), [("flags\t: fpu aes avx", True), ("Features\t: fp asimd", False), (None, False)])
@@ -127,8 +131,8 @@ def test_a_processor_tells_whether_it_has_aes(
 def test_every_change_is_refused(magic: bytes) -> None:
     closed = seal(os.urandom(sealed.FRAME_SIZE + 100))
     frame = sealed.FRAME_SIZE + sealed.TAG_SIZE
-    one, two = closed[sealed.HEAD_SIZE : sealed.HEAD_SIZE + frame], closed[sealed.HEAD_SIZE + frame :]
-    head = closed[: sealed.HEAD_SIZE]
+    one, two = closed[HEAD_SIZE : HEAD_SIZE + frame], closed[HEAD_SIZE + frame :]
+    head = closed[:HEAD_SIZE]
     wrong = {
         "cut at a frame": head + one,
         "cut in a frame": closed[:-1],
@@ -141,7 +145,7 @@ def test_every_change_is_refused(magic: bytes) -> None:
         "another kind of file": b"x" * 5000,
         "the other cipher": (sealed.CHACHA if magic == sealed.AES else sealed.AES) + closed[sealed.MAGIC_SIZE :],
     }
-    for at in [*range(sealed.HEAD_SIZE), *random.Random(1).sample(range(sealed.HEAD_SIZE, len(closed)), 8), len(closed) - 1]:
+    for at in [*range(HEAD_SIZE), *random.Random(1).sample(range(HEAD_SIZE, len(closed)), 8), len(closed) - 1]:
         wrong[f"a bit at {at}"] = closed[:at] + bytes([closed[at] ^ 1]) + closed[at + 1 :]
     for why, content in wrong.items():
         with pytest.raises(ArchiveError):
@@ -150,14 +154,19 @@ def test_every_change_is_refused(magic: bytes) -> None:
 
 def test_another_key_and_another_name_are_refused() -> None:
     closed = seal(b"secret")
-    for name, key in ((NAME, bytes(32)), ("lab/@x/2.base.sealed", KEY)):
-        with pytest.raises(ArchiveError, match="sealed with another archive key"):
+    wrong = ((NAME, bytes(32), "sealed with other keys"), ("lab/@x/2.base.sealed", KEY, "put under another name: its head"))
+    for name, key, said in wrong:
+        with pytest.raises(ArchiveError, match=said):
             opened(closed, name, key)
 
 
 def test_the_end_proves_the_size() -> None:
     closed = seal(os.urandom(2 * sealed.FRAME_SIZE + 100))
-    for wrong in (closed[:-1], closed[: sealed.last_frame(len(closed))], closed[:-1] + bytes([closed[-1] ^ 1])):
+    for wrong in (
+        closed[:-1],
+        closed[: sealed.last_frame(closed[:HEAD_SIZE], len(closed))],
+        closed[:-1] + bytes([closed[-1] ^ 1]),
+    ):
         with pytest.raises(ArchiveError):
             check_end(wrong)
 
@@ -167,19 +176,19 @@ def test_the_end_proves_the_size() -> None:
 
 def test_a_key_is_made_once_and_read_by_its_owner_alone(tmp_path: Path) -> None:
     with pytest.raises(ArchiveError, match="failover archive key makes one"):
-        sealed.read_key(tmp_path)
-    path = sealed.new_key(tmp_path)
-    assert path.stat().st_mode & 0o777 == 0o600 and len(sealed.read_key(tmp_path)) == 32
+        keys.read_key(tmp_path)
+    path = keys.new_key(tmp_path)
+    assert path.stat().st_mode & 0o777 == 0o600 and len(keys.read_key(tmp_path)) == 32
     with pytest.raises(ArchiveError, match="exists"):
-        sealed.new_key(tmp_path)
+        keys.new_key(tmp_path)
     path.chmod(0o640)
     with pytest.raises(ArchiveError, match="chmod 600"):
-        sealed.read_key(tmp_path)
+        keys.read_key(tmp_path)
     path.chmod(0o600)
     for wrong in (b"", b"ab" * 31, b"x" * 64, b"\xff\xfe"):
         path.write_bytes(wrong)
         with pytest.raises(ArchiveError, match="is no archive key"):
-            sealed.read_key(tmp_path)
+            keys.read_key(tmp_path)
 
 
 def test_a_key_that_the_disk_does_not_take_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,8 +197,8 @@ def test_a_key_that_the_disk_does_not_take_leaves_no_file(tmp_path: Path, monkey
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ArchiveError, match="No space left"):
-        sealed.new_key(tmp_path)
-    assert not sealed.key_path(tmp_path).exists()
+        keys.new_key(tmp_path)
+    assert not keys.key_path(tmp_path).exists()
 
 
 # --- Checkpoints -----------------------------------------------------------------------------------------------------
@@ -359,7 +368,7 @@ def test_what_arrived_otherwise_than_it_was_sent_is_found_at_once(place: Path) -
         pytest.raises(ArchiveError, match="does not come back from it: it was sent with"),
         file_of(format.encode_bytes(history(1)[0])) as file,
     ):
-        Archive(Losing(place), KEY, "lab", place.parent).put(file, "r1")
+        Archive(Losing(place), keys_without_members(KEY), "lab", place.parent).put(file, "r1")
     assert archive(place).copies() == []
     assert put(archive(place), history(1)[0]) == archive(place).copies()[0].name, "the next try is a new one"
 
@@ -367,7 +376,7 @@ def test_what_arrived_otherwise_than_it_was_sent_is_found_at_once(place: Path) -
 def test_another_team_and_another_key_read_nothing(place: Path) -> None:
     put(archive(place), history(1)[0])
     assert archive(place, team="other").copies() == []
-    with pytest.raises(ArchiveError, match="another archive key"):
+    with pytest.raises(ArchiveError, match="sealed with other keys"):
         fetched(archive(place, key=bytes(32)))
 
 

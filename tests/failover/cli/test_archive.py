@@ -19,10 +19,11 @@ from msgspec.structs import replace
 from checkpoint.snapshot import format
 from checkpoint.snapshot.required_files import needs
 from checkpoint.store.index import folder_name
-from failover.archive import sealed, signature
+from failover.archive import keys, signature
 from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
 from failover.cli import main
+from failover.config import team as team_directory
 from failover.errors import ArchiveError
 from tests.checkpoint.snapshots import COMPONENT, page, snapshot
 
@@ -42,14 +43,17 @@ def team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 
 
 def test_the_public_half_is_written_beside_a_key_that_has_none(team: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    public, key = signature.public_path(team), sealed.key_path(team).read_bytes()
-    expected = signature.public_of(sealed.read_key(team))
+    public, key = signature.public_path(team), keys.key_path(team).read_bytes()
+    expected = signature.public_of(keys.read_key(team))
     assert signature.read_public(team) == expected and public.stat().st_mode & 0o777 == 0o644
     public.unlink()
     assert main.main(["archive", "key", "--directory", str(team)]) == 0
-    assert signature.read_public(team) == expected and sealed.key_path(team).read_bytes() == key
+    assert signature.read_public(team) == expected and keys.key_path(team).read_bytes() == key
     assert f"{public} opens nothing: carry it" in capsys.readouterr().out
-    sealed.key_path(team).unlink()
+    keys.key_path(team).unlink()
+    assert main.main(["archive", "key", "--directory", str(team)]) == main.FAILED
+    assert f"{keys.recovery_path(team)} exists, and opens what was sealed with it" in capsys.readouterr().err
+    keys.recovery_path(team).unlink()
     assert main.main(["archive", "key", "--directory", str(team)]) == main.FAILED
     assert "belongs to another archive key: remove it" in capsys.readouterr().err
     for spoiled in ("", "ab", "x" * 64):
@@ -62,7 +66,7 @@ def test_the_public_half_is_written_beside_a_key_that_has_none(team: Path, capsy
 
 
 def archive(team: Path) -> Archive:
-    return Archive(FolderObjects(team.parent / "place"), sealed.read_key(team), "lab", team.parent)
+    return Archive(FolderObjects(team.parent / "place"), keys.read_keys(team, team_directory.read(team)), "lab", team.parent)
 
 
 def put(team: Path, content: bytes) -> None:
@@ -168,7 +172,7 @@ def test_a_folder_of_contents_that_is_there_already_is_not_used(
     contents.rmdir()
     (harmed,) = (team.parent / "place").rglob("contents/*.sealed")
     whole = harmed.read_bytes()
-    harmed.write_bytes(whole[:100] + bytes([whole[100] ^ 1]) + whole[101:])
+    harmed.write_bytes(whole[:2000] + bytes([whole[2000] ^ 1]) + whole[2001:])
     assert asked(team, "fetch", "mapper", "--output", str(output)) == main.FAILED
     assert not output.exists() and not contents.exists()
     harmed.write_bytes(whole[:-1])

@@ -369,18 +369,20 @@ def vote_record() -> Decoder:
 def _archived(content: bytes) -> bytes:
     """An object of an archive that holds this content."""
     from failover.archive import sealed
+    from failover.archive.keys import keys_without_members
 
     with io.BytesIO() as file:
-        sealed.seal(bytes(32), "lab/@x/1.base.sealed", iter([content]), file)
+        sealed.seal(keys_without_members(bytes(32)), "lab/@x/1.base.sealed", iter([content]), file)
         return file.getvalue()
 
 
 @target("the owner of an archive's bucket: an object", needs="cryptography")
 def archive_object() -> Decoder:
     from failover.archive import sealed
+    from failover.archive.keys import keys_without_members
 
     def call(content: bytes) -> object:
-        return b"".join(sealed.unsealed(bytes(32), "lab/@x/1.base.sealed", io.BytesIO(content)))
+        return b"".join(sealed.unsealed(keys_without_members(bytes(32)), "lab/@x/1.base.sealed", io.BytesIO(content)))
 
     return Decoder([_archived(b""), _archived(b"a snapshot" * 100)], call)
 
@@ -393,6 +395,7 @@ def archive_label() -> Decoder:
     from checkpoint.store.index import file_name, folder_name
     from failover.archive import sealed
     from failover.archive.archive import Archive, Copy, Label
+    from failover.archive.keys import keys_without_members
     from failover.archive.objects import FolderObjects
     from tests.checkpoint import snapshots
 
@@ -402,11 +405,14 @@ def archive_label() -> Decoder:
     folder = folder_name(header.component)
     name = f"lab/{folder}/1-{file_name(header)}.sealed"
     (place / name).parent.mkdir(parents=True)
-    archive = Archive(FolderObjects(place), bytes(32), "lab", place)
+    keys = keys_without_members(bytes(32))
+    archive = Archive(FolderObjects(place), keys, "lab", place)
 
     def call(content: bytes) -> object:
         with (place / name).open("wb") as file:
-            sealed.seal(bytes(32), name, iter([len(content).to_bytes(4, "little") + content + snapshot]), file)
+            sealed.seal(
+                keys_without_members(bytes(32)), name, iter([len(content).to_bytes(4, "little") + content + snapshot]), file
+            )
         with (place / "fetched").open("w+b") as file:
             return archive.fetch(Copy(name, folder, file_name(header), 1, 1, 1, 1, 0), file)
 
