@@ -6,7 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -27,20 +27,33 @@ def why_not() -> str:
 
 
 class EtcdServer:
-    """One member, which is a cluster. ``before``: words of the command line in front of etcd's; ``options``: behind them."""
+    """One member. ``before``: words of the command line in front of etcd's; ``options``: behind them.
+
+    ``cluster``: name → address for the other members, of all of them; none: this one alone is a cluster.
+    """
 
     def __init__(
-        self, place: Path, host: str, port: int, peer_port: int, *, before: Sequence[str] = (), options: Sequence[str] = ()
+        self,
+        place: Path,
+        host: str,
+        port: int,
+        peer_port: int,
+        *,
+        before: Sequence[str] = (),
+        options: Sequence[str] = (),
+        name: str = "one",
+        cluster: Mapping[str, str] | None = None,
     ) -> None:
         self._place, self._before = place, before
         self.scheme = "https" if "--cert-file" in options else "http"
         self.endpoint = f"{self.scheme}://{host}:{port}"
-        peer = f"http://127.0.0.1:{peer_port}"
+        peers = cluster or {name: f"http://127.0.0.1:{peer_port}"}
         listens = f"{self.scheme}://0.0.0.0:{port}" if before else self.endpoint
         self._options = (
-            *("--name", "one", "--data-dir", str(place / "data"), "--logger", "zap"),
+            *("--name", name, "--data-dir", str(place / "data"), "--logger", "zap"),
             *("--listen-client-urls", listens, "--advertise-client-urls", self.endpoint),
-            *("--listen-peer-urls", peer, "--initial-advertise-peer-urls", peer, "--initial-cluster", f"one={peer}"),
+            *("--listen-peer-urls", peers[name], "--initial-advertise-peer-urls", peers[name]),
+            *("--initial-cluster", ",".join(f"{one}={url}" for one, url in peers.items())),
             *options,
         )
         self.process: subprocess.Popen[bytes] | None = None
@@ -68,3 +81,14 @@ class EtcdServer:
         """Let it run again."""
         assert self.process is not None
         self.process.send_signal(signal.SIGCONT)
+
+
+def three_members(place: Path, hosts: Sequence[str], ports: Sequence[int], before: Sequence[Sequence[str]]) -> list[EtcdServer]:
+    """One cluster of three; of ``ports`` two for each, of ``before`` the words for each."""
+    place.mkdir(exist_ok=True)
+    pairs = list(zip(ports[::2], ports[1::2], strict=True))
+    cluster = {str(number): f"http://{host}:{pair[1]}" for number, (host, pair) in enumerate(zip(hosts, pairs, strict=True))}
+    return [
+        EtcdServer(place / name, host, *pair, before=words, name=name, cluster=cluster)
+        for name, host, pair, words in zip(cluster, hosts, pairs, before, strict=True)
+    ]

@@ -18,7 +18,7 @@ from agent.coordinator_config import CoordinatorConfig
 from agent.errors import CoordinatorError
 from failover.cli.demo.robots import free_ports
 from failover.core.election.coordinator import VOTES_MAX, Grant, KeepAlive, Leased, Put, Swap, Swapped
-from tests.agent.coordinator.etcd_server import EtcdServer, why_not
+from tests.agent.coordinator.etcd_server import EtcdServer, three_members, why_not
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "etcd is here")
 
@@ -310,3 +310,59 @@ def test_certificates_are_checked_on_both_sides(tmp_path: Path) -> None:
 def test_what_reaches_no_etcd_is_refused(keys: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"write endpoints|at most|belong together|in the clear"):
         CoordinatorConfig(**keys)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def members(tmp_path: Path) -> Iterator[list[EtcdServer]]:
+    three = three_members(tmp_path / "etcd", ["127.0.0.1"] * 3, free_ports(6), [()] * 3)
+    for one in three:
+        one.start()
+    yield three
+    for one in three:
+        one.kill()
+
+
+def asks(*servers: EtcdServer, patience_s: float = 5.0) -> Etcd:
+    return Etcd(CoordinatorConfig([one.endpoint for one in servers]), patience_s)
+
+
+def until_answered(etcd: Etcd, compared: dict[str, int], puts: dict[str, bytes]) -> Swapped:
+    """A cluster without a leader answers nothing for a while."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            return swap(etcd, compared, puts)
+        except CoordinatorError:
+            assert time.monotonic() < deadline
+
+
+def test_a_member_that_does_not_reach_the_two_others_gives_no_old_answer(members: list[EtcdServer]) -> None:
+    """The last one stands still while a vote is cast, and the others do when it goes on: what it has is old."""
+    key = f"{PREFIX}component/lab/mapper"
+    until_answered(asks(*members), {}, {key: b"robot1"})
+    behind = asks(members[2], patience_s=2.0)
+    assert until_answered(behind, {}, {}).found[key][0] == b"robot1"
+
+    members[2].stop()
+    until_answered(asks(*members[:2]), {}, {key: b"robot2"})
+    for one in members[:2]:
+        one.stop()
+    members[2].go_on()
+    for request in (Swap(PREFIX, ()), Swap(PREFIX, (Put(f"{PREFIX}word/r1", b"mine", ()),))):
+        with pytest.raises(CoordinatorError, match="no etcd answers"):
+            behind.answer(request)
+    for one in members[:2]:
+        one.go_on()
+    assert until_answered(behind, {}, {}).found[key][0] == b"robot2"
+
+
+def test_a_request_that_a_frozen_member_did_not_answer_is_carried_out_by_another_one(members: list[EtcdServer]) -> None:
+    etcd, key = asks(*members, patience_s=1.0), f"{PREFIX}component/lab/mapper"
+    until_answered(etcd, {}, {key: b"robot1"})
+    asked = next(one for one in members if one.endpoint == etcd._endpoints[0])
+    revision = until_answered(etcd, {}, {}).found[key][1]
+    asked.stop()
+    until_answered(etcd, {key: revision}, {key: b"robot2"})
+    asked.go_on()
+    told = until_answered(asks(asked), {key: revision}, {key: b"robot3"})
+    assert not told.is_done and told.found[key][0] == b"robot2"
