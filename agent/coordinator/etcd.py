@@ -119,7 +119,10 @@ class Etcd:
                 troubles.append(f"{self._endpoints[0]}: {_words(error)}")
             self.close()
             self._endpoints.append(self._endpoints.pop(0))
-        raise CoordinatorError(f"no etcd answers ({'; '.join(troubles)}); check [coordinator] endpoints and the network")
+        raise CoordinatorError(
+            f"no etcd answers ({'; '.join(troubles)}); check [coordinator] endpoints, the network, and that a majority of etcd's "
+            "members runs"
+        )
 
     def _asked(self, method: str, body: dict[str, Any]) -> dict[str, Any]:
         had_token = bool(self._token)

@@ -122,10 +122,15 @@ class Site:
 
     def acts(self) -> list[Act]:
         """All that any program did, in the order in which it was done."""
-        if not self.record.exists():
-            return []
-        words = (line.split() for line in self.record.read_text().splitlines())
-        return [Act(life, int(number), int(at_ns)) for life, number, at_ns in words]
+        return acts_in(self.record)
+
+
+def acts_in(record: Path) -> list[Act]:
+    """What `ACTS` wrote there."""
+    if not record.exists():
+        return []
+    words = (line.split() for line in record.read_text().splitlines())
+    return [Act(life, int(number), int(at_ns)) for life, number, at_ns in words]
 
 
 def tc_command() -> str:

@@ -73,9 +73,10 @@ class EtcdServer:
         self.process = None
 
     def stop(self) -> None:
-        """Stop all of it, as a machine that is overloaded does."""
+        """Stop all of it, as a machine that is overloaded does; no thread of it runs on."""
         assert self.process is not None
         self.process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 
     def go_on(self) -> None:
         """Let it run again."""
