@@ -38,8 +38,8 @@ from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.index import folder_name
 from failover.archive.archive import Copy, Label
 from failover.core.acts import Accept
-from failover.core.events import Event, Fetched, Looked, Noticed
-from failover.core.types import ENDED, ComponentSpec, State, StatusView
+from failover.core.events import Damaged, Event, Fetched, Looked, Noticed
+from failover.core.types import ENDED, ComponentSpec, ComponentView, State, StatusView
 
 ANSWER_S: Final = 30.0
 """For a list, and for a copy besides its bytes; the start of the process on a busy machine is in it."""
@@ -97,6 +97,7 @@ class Fetching:
         self._refused: dict[str, int] = {}
         self._troubles: dict[str, str] = {}
         self._lost: dict[str, str] = {}
+        self._damaged: dict[str, str] = {}
         self._silent = ""
         self._answered_s = time.monotonic()
         self._arrived: dict[tuple[str, Position], Arrived] = {}
@@ -139,7 +140,7 @@ class Fetching:
         if self._silent:
             since_s = time.monotonic() - self._answered_s
             return [f"the archive has not answered for {since_s:.0f} s: no checkpoints come from there: {self._silent}"]
-        return [*self._lost.values(), *self._troubles.values()]
+        return [*self._damaged.values(), *self._lost.values(), *self._troubles.values()]
 
     async def _round(self, number: int) -> None:
         begun_ns = clock.now_ns()
@@ -158,6 +159,8 @@ class Fetching:
         if view is None:
             return
         names = self._names(view)
+        for one in view.components:
+            self._look_for_damage(one, view)
         wanted: dict[str, list[Copy]] = {}
         for folder, group in itertools.groupby(copies, key=lambda copy: copy.folder):
             found = list(group)
@@ -202,11 +205,25 @@ class Fetching:
         else:
             self._lost.pop(name, None)
 
+    def _look_for_damage(self, component: ComponentView, view: StatusView) -> None:
+        """What the core counts as held here, and the store has found damaged, is not held: it may come again."""
+        name, there = component.name, self._store.positions(component.name)
+        newest = component.positions[0] if component.positions else None
+        if newest is None or newest in there or not _takes(name, view):
+            return
+        self._damaged[name] = (
+            f"{name}: checkpoint {newest.sequence} is damaged on this robot's disk; it, or a later one, comes from the archive"
+        )
+        self._tell(Damaged(name, component.epoch, newest))
+
     def _newer(self, name: str, found: list[Copy], view: StatusView) -> list[Copy]:
-        """The copies that are newer than what the core counts as held here, the newest first."""
-        held = (position for one in view.components if one.name == name for position in one.positions)
+        """The copies that are newer than what the core counts as held here, and the store has; the newest first."""
+        held, there = (
+            (position for one in view.components if one.name == name for position in one.positions),
+            self._store.positions(name),
+        )
         had = self._fetched.get(found[0].folder)
-        ours = max(((one.generation, one.sequence) for one in (*held, had) if one is not None), default=(0, 0))
+        ours = max(((one.generation, one.sequence) for one in (*held, had) if one in there), default=(0, 0))
         return [copy for copy in found if (copy.generation, copy.sequence) > ours]
 
     async def _fetch(self, name: str, newer: list[Copy], begun_ns: int, number: int) -> None:
@@ -244,6 +261,7 @@ class Fetching:
         finally:
             os.close(descriptor)
         self._fetched[copy.folder] = header.position
+        self._damaged.pop(header.component, None)
         self._arrived = {key: one for key, one in self._arrived.items() if key[0] != header.component}
         self._arrived[header.component, header.position] = Arrived(spec, snapshot, copy.size)
         age_ns = max(time.time_ns() - copy.stamp_ms * 1_000_000, 0)

@@ -131,6 +131,10 @@ class SnapshotStore(Protocol):
         """Make room for so many bytes, as far as checkpoints that are kept for people can give it."""
         ...
 
+    def check(self, component: str, position: Position | None = None) -> None:
+        """Read what leads to a position again: after a restore found damage. What was altered is offered no more."""
+        ...
+
     # Forgetting
 
     def is_prune_due(self, component: str, oldest: Position) -> bool:

@@ -276,6 +276,18 @@ class Store:
                 f"a snapshot of {component} that this delta needs is damaged here: {error}; ask for a base"
             ) from error
 
+    def check(self, component: str, position: Position | None = None) -> None:
+        """Read each file that leads to a position (the newest, if none is named); a damaged one is set out of use and noted.
+
+        Raises:
+            StoreError: there is no such position.
+        """
+        for entry in self.chain_of(component, position):
+            try:
+                format.verify(entry.path)
+            except FormatError as error:
+                self._set_out_of_use(component, entry, str(error))
+
     # Forgetting
 
     def is_prune_due(self, component: str, oldest: Position) -> bool:

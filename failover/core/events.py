@@ -223,6 +223,14 @@ class Fetched(Struct, frozen=True):
     keeps_state: bool = False
 
 
+class Damaged(Struct, frozen=True):
+    """A checkpoint that counts as held here cannot be restored: this robot's store found it damaged, or what it needs."""
+
+    component: str
+    epoch: int
+    position: Position
+
+
 class Archived(Struct, frozen=True):
     """The archive has a copy of the component that runs here, as it was at ``begun_ns`` or a moment before; None: no more."""
 
@@ -434,6 +442,7 @@ Event = (
     | StoreFailed
     | Looked
     | Fetched
+    | Damaged
     | Archived
     | Recovered
     | SitesHeard

@@ -23,6 +23,7 @@ from failover.core.events import (
     CaptureFailed,
     Command,
     Committed,
+    Damaged,
     Drain,
     Event,
     Exited,
@@ -555,6 +556,8 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             standby.store_failed(component, turn, event)
         case Fetched():
             archived.fetched(component, turn, event)
+        case Damaged():
+            archived.damaged(component, turn, event)
         case Archived():
             archived.archived(component, event)
         case Recovered():

@@ -24,7 +24,7 @@ from agent.worker.components import launch
 from agent.worker.components.component import Component
 from agent.worker.components.context import Surroundings, program_of
 from agent.worker.components.statistics import CopyFigures, Figures
-from checkpoint.errors import UnsupportedError
+from checkpoint.errors import FormatError, StoreError, UnsupportedError
 from checkpoint.keeper import messages
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import Position, Snapshot
@@ -151,6 +151,9 @@ class ReadyCopy:
                 failures = 0 if time.monotonic() - laid_s >= STEADY_S else failures
                 pause_s, failures, laid_s = PAUSES_S[min(failures, len(PAUSES_S) - 1)], failures + 1, math.inf
                 log.info("%s: its ready copy must be built again: %s", self._name, trouble)
+                if isinstance(trouble, FormatError):
+                    with contextlib.suppress(StoreError):  # it is known already
+                        await asyncio.to_thread(self._around.store.check, self._name, self._newest())
                 await self._end(str(trouble))
             if told != (self._ready is not None):
                 told = not told

@@ -32,7 +32,15 @@ from agent.worker.components.snapshots import Snapshots, newest_of
 from agent.worker.components.statistics import NOT_WANTED, Commits, CopyFigures, Figures, Resumed, shortened
 from agent.worker.components.warm_program import Standby
 from checkpoint.engine import COOPERATIVE, LASTING_NOTES
-from checkpoint.errors import CheckpointError, NothingCommittedError, ProcessGoneError, UnsupportedError
+from checkpoint.errors import (
+    ChainError,
+    CheckpointError,
+    FormatError,
+    NothingCommittedError,
+    ProcessGoneError,
+    StoreError,
+    UnsupportedError,
+)
 from checkpoint.keeper.messages import close_all
 from checkpoint.model import Position
 from checkpoint.snapshot import format
@@ -302,6 +310,9 @@ class Supervisor:
                 guest = isinstance(act, acts.Start) and act.spec.launch.pid != 0
                 with contextlib.suppress(*TROUBLE):
                     await (self._let_go() if guest else self._stop())
+                if isinstance(act, acts.Restore) and isinstance(trouble, FormatError | ChainError):
+                    with contextlib.suppress(StoreError):  # it is known already
+                        await asyncio.to_thread(self.around.store.check, self.name, act.position)
                 self.figures.reasons = reasons
                 self.around.tell(events.ActFailed(self.name, act.epoch, message))
 

@@ -5,6 +5,7 @@ counts. Invariants:
 
 * A robot takes nothing from the archive of a component that it runs, whose primary it hears, or that has ended.
 * A checkpoint from there never takes the place of a later one.
+* A checkpoint that the store found damaged is held no more: this robot looks into the archive again before it takes over.
 * Once etcd would vote for another robot, this robot looks into the archive again before it claims the component. What was put
   there before is in its store then, and it claims without the wait for the old primary (``fresh``). Where the archive does not
   answer, that wait (``patience_ms``) is the limit.
@@ -18,7 +19,7 @@ from __future__ import annotations
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
-from failover.core.events import Archived, Fetched, Looked
+from failover.core.events import Archived, Damaged, Fetched, Looked
 from failover.core.types import ENDED, MS, PEERS_MAX, State
 from failover.core.wire.messages import FREE
 
@@ -50,6 +51,20 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
     turn.order(acts.Accept(component.name, component.epoch, event.position))
     turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
     turn.say(component, f"{turn.me} has its checkpoint {event.position.sequence} from the archive")
+
+
+def damaged(component: Component, turn: Turn, event: Damaged) -> None:
+    """It is held here no more: look into the archive, which may have it, before this robot goes on from an older one."""
+    if not turn.config.copies_ms or component.state not in _IDLE or event.position not in component.held:
+        return
+    component.begun = component.has_begun
+    component.held = [position for position in component.held if position != event.position]
+    if not component.held and turn.me in (component.primary, *component.entrusted):
+        component.bare = component.begun
+    if gave(component, event.position):
+        component.fetched = None
+    component.lags, component.looked_ns, component.fresh = True, 0, False
+    turn.say(component, f"its checkpoint {event.position.sequence} is damaged on the disk of {turn.me}, which takes it again")
 
 
 def _takes(component: Component, turn: Turn, position: Position) -> bool:

@@ -26,7 +26,7 @@ from failover.archive.archive import Archive
 from failover.archive.objects import FolderObjects
 from failover.config import team
 from failover.config.team import Robot, Team
-from failover.core.events import Event, Fetched, Looked
+from failover.core.events import Damaged, Event, Fetched, Looked
 from failover.core.types import ComponentSpec, ComponentView, Protection, State, StatusView
 from tests.checkpoint.snapshots import COMPONENT, history
 
@@ -225,5 +225,57 @@ def test_what_the_core_does_not_count_as_held_is_taken_again_and_an_emptied_arch
         member.seen = (ComponentView(COMPONENT, State.STANDBY, 1, "robot2", "", Protection.NONE, -1, 0, (first.position,), ""),)
         (member.directory / "place" / name).unlink()
         await member.until(lambda: "lost all copies" in " ".join(member.fetching.complaints()))
+
+    run(tmp_path, work)
+
+
+def the_file(member: Member) -> Path:
+    (entry,) = member.store.chain_of(COMPONENT)
+    return entry.path
+
+
+def test_a_checkpoint_that_is_damaged_on_this_robots_disk_is_fetched_again_and_said_to_be_damaged_meanwhile(
+    tmp_path: Path,
+) -> None:
+    """The archive gives nothing for a while; then the same copy comes once more, and is read whole."""
+
+    async def work(member: Member) -> None:
+        (first,) = bases(1)
+        name = member.put(first)
+        await member.until(lambda: member.fetched() == [1])
+        member.seen = (ComponentView(COMPONENT, State.STANDBY, 1, "robot2", "", Protection.NONE, -1, 0, (first.position,), ""),)
+        away = (member.directory / "place" / name).rename(member.directory / "away")
+        harm(the_file(member))
+        member.store.check(COMPONENT, first.position)
+        await member.until(lambda: "damaged on this robot's disk" in " ".join(member.fetching.complaints()))
+        assert Damaged(COMPONENT, 1, first.position) in member.events
+        assert member.store.newest(COMPONENT) is None
+        away.rename(member.directory / "place" / name)
+        await member.until(lambda: member.fetched() == [1, 1])
+        assert not any("damaged" in one for one in member.fetching.complaints())
+        assert format.verify(the_file(member)).position == first.position
+
+    run(tmp_path, work)
+
+
+def test_a_checkpoint_that_was_damaged_while_the_agent_was_off_is_fetched_again(tmp_path: Path) -> None:
+    async def work(member: Member) -> None:
+        (first,) = bases(1)
+        member.put(first)
+        await member.until(lambda: member.fetched() == [1])
+        harm(the_file(member))
+        path = the_file(member)
+        member.store.close()
+        member.store = open_store(member.directory / "state" / "store")
+        assert any("it is not used" in notice for notice in member.store.notices)
+        assert member.store.newest(COMPONENT) is None
+        again = Fetching(member.fetching._settings, member.store, member.told, member.events.append, member.kept)
+        taking = asyncio.create_task(again.run())
+        try:
+            await member.until(lambda: member.fetched() == [1, 1])
+        finally:
+            taking.cancel()
+            await asyncio.gather(taking, return_exceptions=True)
+        assert format.verify(path).position == first.position
 
     run(tmp_path, work)

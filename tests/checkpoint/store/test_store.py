@@ -169,6 +169,24 @@ def damage(path: Path) -> None:
     path.write_bytes(content)
 
 
+def test_a_chain_that_is_checked_again_loses_what_is_damaged_and_what_continues_it(tmp_path: Path) -> None:
+    made = history(4)
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+        store.check(COMPONENT)
+        assert store.newest(COMPONENT) == made[3].position
+        damaged = store.chain_of(COMPONENT)[2].path
+        damage(damaged)
+        store.check(COMPONENT, made[1].position)
+        assert store.newest(COMPONENT) == made[3].position, "nothing of that chain is damaged"
+        store.check(COMPONENT)
+        assert store.newest(COMPONENT) == made[1].position
+        assert any(str(damaged) in notice for notice in store.notices)
+        with pytest.raises(StoreError, match="does not hold"):
+            store.check(COMPONENT, made[3].position)
+
+
 def test_a_snapshot_that_was_damaged_and_sent_again_survives_pruning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("checkpoint.store.fold_rules.FOLD_DELTA_PART", 1000)  # a chain that is folded would not need the file
     made = history(4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +25,12 @@ from agent.worker.components.supervisor import Supervisor
 from agent.worker.components.warm_program import Standby
 from agent.worker.control.verbs import Verbs
 from checkpoint.errors import StoreError
+from checkpoint.keeper.messages import memfd_holding
 from checkpoint.model import Position
-from failover.core import acts
+from checkpoint.snapshot import format
+from checkpoint.store.store import open_store
+from failover.core import acts, events
+from tests.checkpoint.snapshots import COMPONENT, history
 
 NAME = "/lab/robot1/mapper"
 LATE_NS, NEWER_NS = 100, 200
@@ -359,3 +364,45 @@ def test_what_is_lacking_is_looked_at_once_the_copy_that_was_here_has_ended(
             task.cancel()
 
     asyncio.run(run())
+
+
+def test_a_checkpoint_that_a_takeover_finds_damaged_is_offered_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chain is read where the program would be made of it; then the store itself looks which file is harmed."""
+    store, told, none = open_store(tmp_path / "store"), list[events.Event](), cast(Any, None)
+    first, second = history(2)
+    for one in (first, second):
+        descriptor = memfd_holding(format.encode_bytes(one), "snapshot")
+        store.put(descriptor)
+        os.close(descriptor)
+    path = store.chain_of(COMPONENT)[-1].path
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+    async def soon(*_: object) -> int:
+        return 0
+
+    async def brought_back(_around: object, _act: object, chain: list[int], *_: object) -> Component:
+        for descriptor in chain:
+            format.decode(descriptor)
+        raise AssertionError("it was read as if it were whole")
+
+    monkeypatch.setattr(resume, "brought_back", brought_back)
+
+    async def run() -> None:
+        around = Surroundings(none, store, Records(tmp_path), told.append, soon, soon, lambda _: ComponentConfig())
+        supervisor = Supervisor(COMPONENT, around, epoch=3)
+        monkeypatch.setattr(type(supervisor._occasions), "before_resume", soon)
+        supervisor.begin()
+        supervisor.order(acts.Restore(COMPONENT, 3, second.position, None))
+        while not told:
+            await asyncio.sleep(0.001)
+        for task in tuple(supervisor._tasks):
+            task.cancel()
+
+    asyncio.run(run())
+    (event,) = told
+    assert isinstance(event, events.ActFailed)
+    assert store.positions(COMPONENT) == (first.position,)
+    assert any(str(path) in notice for notice in store.notices)
+    store.close()

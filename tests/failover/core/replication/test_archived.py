@@ -9,7 +9,7 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.acts import Ready
 from failover.core.election.consent import STATES
-from failover.core.events import Archived, Event, Fetched, Handover, Looked, Received, Restored, Started, Tick
+from failover.core.events import Archived, Damaged, Event, Fetched, Handover, Looked, Received, Restored, Started, Tick
 from failover.core.node import Node
 from failover.core.types import (
     COORDINATOR,
@@ -294,3 +294,41 @@ def test_a_primary_whose_copy_the_archive_has_lost_is_not_said_to_be_protected_b
     (shown,) = robot.node.status(robot.now_ns).components
     assert shown.protection is Protection.NONE
     assert any("NOT PROTECTED" in note for note in shown.notes)
+
+
+def test_a_damaged_checkpoint_is_held_no_more_and_the_one_before_it_waits_for_the_archive() -> None:
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.fetched(1, 6)
+    robot.live(100)
+    robot.flags = FREE
+    robot.live(100)
+    robot.step(Damaged(NAME, 1, position(1, 6)))
+    assert robot.held == [position(1, 5)]
+    robot.step(Looked(robot.now_ns, (NAME,)))
+    robot.live(500)
+    assert not robot.claims(), "the archive has a newer one, on its way"
+    robot.fetched(1, 6)
+    robot.live(100)
+    assert robot.held == [position(1, 6), position(1, 5)] and robot.claims()
+
+
+def test_the_only_checkpoint_that_is_damaged_begins_nothing_anew_before_the_archive_has_answered() -> None:
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.live(100)
+    robot.step(Looked(robot.now_ns))
+    robot.step(Damaged(NAME, 1, position(1, 5)))
+    robot.flags = FREE
+    robot.live(20_000)
+    assert not robot.held and not robot.claims() and robot.looks()
+    robot.fetched(1, 5)
+    robot.live(100)
+    assert robot.claims()
+
+
+def test_damage_of_what_is_not_held_changes_nothing() -> None:
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.step(Damaged(NAME, 1, position(1, 4)))
+    assert robot.held == [position(1, 5)]
