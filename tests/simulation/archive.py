@@ -32,7 +32,7 @@ class SimulatedArchive:
 
     Attributes:
         down: nothing is answered. cut: robots out of its reach. slow: everything takes so many times as long.
-        aged: it gives what it had when that began.
+        aged: it gives what it had when that began; true_since_ns: when that was over the last time.
     """
 
     def __init__(self, world: World, random: Random) -> None:
@@ -43,6 +43,7 @@ class SimulatedArchive:
         self.cut: set[str] = set()
         self.slow = 1.0
         self.aged: dict[str, list[Position]] | None = None
+        self.true_since_ns = 0
         self.puts = self.taken = self.late = 0
 
     def begin(self) -> None:
@@ -52,8 +53,13 @@ class SimulatedArchive:
 
     def heal(self) -> None:
         """From now on it answers, soon."""
-        self.down, self.slow, self.aged = False, 1.0, None
+        self.down, self.slow = False, 1.0
+        self._be_true()
         self.cut.clear()
+
+    def copies_of(self, component: str) -> list[Position]:
+        """All that it has of a component now, whatever it shows."""
+        return list(self._copies.get(component, ()))
 
     def look(self, robot: Robot) -> None:
         """A robot's worker lists the copies, and takes what is newer than its own."""
@@ -107,7 +113,9 @@ class SimulatedArchive:
             own = robot.store.get(component, [])
             if copies and self._takes(robot, component) and (not own or max(own) < max(copies)):
                 wanted[component] = max(copies)
-        self._world.feed(robot, Looked(begun_ns, tuple(wanted)))
+        looked = Looked(begun_ns, tuple(wanted))
+        self._world.tell(robot.name, looked)
+        self._world.feed(robot, looked)
         for component, newest in wanted.items():
             position, proves_ns = newest, begun_ns
             if self._random.random() < FAILS:  # the newest does not come: the one before it does, and proves nothing
@@ -159,7 +167,11 @@ class SimulatedArchive:
     def _age(self, _robot: str, for_ns: int) -> None:
         self._world.note(f"the archive shows what it has now, and nothing newer, for {for_ns / MS:.0f} ms")
         self.aged = {component: list(copies) for component, copies in self._copies.items()}
-        self._world.after(for_ns, lambda: setattr(self, "aged", None))
+        self._world.after(for_ns, self._be_true)
+
+    def _be_true(self) -> None:
+        if self.aged is not None:
+            self.aged, self.true_since_ns = None, self._world.now_ns
 
 
 def _epoch(position: Position) -> int:

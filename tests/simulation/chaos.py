@@ -12,6 +12,7 @@ from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Restart, Rule, Rules, WhenAlone
 from tests.simulation import planned
 from tests.simulation.coordinator import Fault
+from tests.simulation.freshness import Freshness
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
@@ -132,7 +133,8 @@ def _live(
     votes = configs[0].rule is not Rule.PAIR
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
     invariants = Invariants(safe=safe, votes=votes)
-    world = World(seed, configs, (invariants,), random.choice(DRIFTS))
+    freshness = (Freshness(invariants),) if configs[0].copies_ms else ()
+    world = World(seed, configs, (invariants, *freshness), random.choice(DRIFTS))
     _weather(world, random)
     world.unchanged = 0.8 if seed % SELDOM == SELDOM - 2 else 0.0
     if votes and not seed % HARSH:
@@ -146,6 +148,8 @@ def _live(
     if world.coordination is not None:
         faulty = world.coordination.faults() + (2 * world.archive.faults() if world.archive is not None else ())
         _trouble_etcd(world, faulty, Random(seed ^ 0xE7CD), trouble_ns, faults, apart=apart)
+    if apart:
+        _die_ahead(world, specs[0].name, Random(seed ^ 0xF2E5), trouble_ns)
     if liars:
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3:
@@ -208,6 +212,30 @@ def _trouble_etcd(world: World, faulty: tuple[Fault, ...], random: Random, until
             fault(acting[0] if acting and for_ns % 2 else name, for_ns)
 
         world.at(random.randrange(until_ns), happen)
+
+
+def _die_ahead(world: World, component: str, random: Random, until_ns: int) -> None:
+    """The robot that runs a component loses its power while the others do not reach the archive, which has newer copies."""
+
+    def cut() -> None:
+        acting = world.acting(component)
+        if not acting or world.archive is None:
+            return
+        world.faults += 1
+        others, ahead_ns = set(world.robots) - set(acting), random.randrange(300, 600) * MS
+        world.note(f"{' and '.join(sorted(others))} do not reach the archive, and {acting[0]} is about to lose its power")
+        world.archive.cut |= others
+        world.after(ahead_ns, lambda: world.power_off(acting[0]))
+        world.after(ahead_ns + random.randrange(50, 400) * MS, lambda: _reach_again(world, others))
+        world.after(ahead_ns + random.randrange(500, 1_500) * MS, lambda: world.power_on(acting[0]))
+
+    world.at(random.randrange(until_ns // 3), cut)
+    world.at(random.randrange(until_ns // 2, until_ns - 600 * MS), cut)
+
+
+def _reach_again(world: World, robots: set[str]) -> None:
+    assert world.archive is not None
+    world.archive.cut -= robots
 
 
 def _let_one_lie(world: World, invariants: Invariants, random: Random, until_ns: int) -> None:

@@ -190,6 +190,7 @@ class Coordination:
         client.is_busy = False
         beat = client.dialogue.beat(said)
         if beat is not None:
+            self._world.tell(robot.name, said)
             self._world.feed(robot, Received(beat, "etcd", paces=False))
         self._world.at(robot.clock.true(client.dialogue.next_ns()), lambda: self.look(robot))
 

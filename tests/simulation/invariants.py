@@ -79,7 +79,7 @@ class Invariants:
                 self._durable_before_said(world, robot, what)
             case acts.Capture():
                 if what.component in world.robots[robot].capturing:
-                    raise _broken(world, f"{robot}: a second capture of {what.component} at once")
+                    raise broken(world, f"{robot}: a second capture of {what.component} at once")
             case acts.Ship():
                 self.shipped[what.component] = what.position
             case acts.Acknowledge():
@@ -102,7 +102,7 @@ class Invariants:
                 self._after_what_was_seen(world, robot, what, world.values[what.position])
             case acts.Warm():
                 if what.component in world.robots[robot].programs:
-                    raise _broken(world, f"{robot}: {what.component} is to wait where it runs")
+                    raise broken(world, f"{robot}: {what.component} is to wait where it runs")
             case acts.ReportExit():
                 if what.acknowledged:
                     self.last.add(what.component)
@@ -114,20 +114,20 @@ class Invariants:
             if len(where) > 1:
                 self.split.add(component)
                 if component in self.safe:
-                    raise _broken(world, f"{component} acts at {' and '.join(where)} at once")
+                    raise broken(world, f"{component} acts at {' and '.join(where)} at once")
 
     def _nothing_waits_in_vain(self, world: World, component: str, standby: str) -> None:
         waiting = [name for name, robot in world.robots.items() if component in robot.warm]
         if waiting != ([standby] if standby else []):
-            raise _broken(world, f"{component} should wait at {standby or 'no robot'}: it waits at {waiting}")
+            raise broken(world, f"{component} should wait at {standby or 'no robot'}: it waits at {waiting}")
 
     def _one_primary(self, world: World, robot: str, act: acts.Start | acts.Restore) -> None:
         others = [name for name in world.acting(act.component) if name not in (robot, self.liar)]
         if others and act.component in self.safe:
-            raise _broken(world, f"{robot} is to run {act.component} while the lease of {' and '.join(others)} is valid")
+            raise broken(world, f"{robot} is to run {act.component} while the lease of {' and '.join(others)} is valid")
         owner = self.owners.setdefault((act.component, act.epoch), robot)
         if owner != robot and act.component in self.safe:
-            raise _broken(world, f"epoch {act.epoch} of {act.component} is {owner}'s and {robot}'s")
+            raise broken(world, f"epoch {act.epoch} of {act.component} is {owner}'s and {robot}'s")
 
     def _silence_is_no_sound(self, world: World, robot: str, act: acts.Restore) -> None:
         """Under pair nothing is taken over beside a robot from which there comes what was never authenticated."""
@@ -136,13 +136,13 @@ class Invariants:
             return
         for other, at_ns in here.unread_ns.items():
             if other not in here.read and world.now_ns - at_ns < SURELY_UNREAD_NS:
-                raise _broken(world, f"{robot} takes {act.component} over, and receives from {other} what it cannot authenticate")
+                raise broken(world, f"{robot} takes {act.component} over, and receives from {other} what it cannot authenticate")
 
     def _epochs_grow(self, world: World, robot: str, vote_record: VoteRecord) -> None:
         kept = {record.name: record.epoch for record in vote_record.records}
         for (name, component), epoch in self.epochs.items():
             if name == robot and kept.get(component, 0) < epoch:
-                raise _broken(world, f"{robot}: the epoch of {component} fell from {epoch} to {kept.get(component, 0)}")
+                raise broken(world, f"{robot}: the epoch of {component} fell from {epoch} to {kept.get(component, 0)}")
         self.epochs.update({(robot, component): epoch for component, epoch in kept.items()})
 
     def _one_vote_an_epoch(self, world: World, robot: str, vote_record: VoteRecord) -> None:
@@ -160,7 +160,7 @@ class Invariants:
                 self.given[key] = record.primary  # its own claim was in vain: it follows the one that was elected
             elif before != record.primary:
                 story = f"{robot} votes for {before} and {record.primary} in epoch {record.epoch} of {record.name}"
-                raise _broken(world, story)
+                raise broken(world, story)
 
     def _forget(self, robot: str, loss: NewDisk) -> None:
         self.gone.update(loss.lost)
@@ -174,7 +174,7 @@ class Invariants:
             if entry.flags & ORDERED:
                 self.ordered.add((entry.name, entry.epoch))
             if entry.epoch > durable.get(entry.name, 0):
-                raise _broken(world, f"{robot} says epoch {entry.epoch} of {entry.name} before its disk knows it")
+                raise broken(world, f"{robot} says epoch {entry.epoch} of {entry.name} before its disk knows it")
 
     def _acknowledged(self, world: World, robot: str, act: acts.Acknowledge) -> None:
         elsewhere = any(
@@ -183,7 +183,7 @@ class Invariants:
         elsewhere = elsewhere or act.position in self.gone
         is_told = act.is_safe and bool(world.robots[robot].config.peers)
         if not elsewhere and (is_told or self.shipped.get(act.component) == act.position):
-            raise _broken(world, f"{robot} acknowledges {act.position} of {act.component}, which no other robot holds")
+            raise broken(world, f"{robot} acknowledges {act.position} of {act.component}, which no other robot holds")
         if elsewhere:
             before = self.acknowledged.get(act.component)
             self.acknowledged[act.component] = act.position if before is None else max(before, act.position)
@@ -191,15 +191,13 @@ class Invariants:
     def _shown(self, world: World, robot: str, act: acts.Show) -> None:
         """Readers see what was written up to there: it is in the past of every later copy, and of every copy that there is."""
         if act.position not in world.robots[robot].store.get(act.component, []):
-            raise _broken(world, f"{robot} shows what {act.component} wrote up to {act.position}, which it does not hold")
+            raise broken(world, f"{robot} shows what {act.component} wrote up to {act.position}, which it does not hold")
         if act.position in self.former.get(act.component, ()):
             return
         epoch, value = epoch_of(act.position), world.values[act.position]
         for later, begin in self.begun.get(act.component, {}).items():
             if later > epoch and value > begin and act.component not in self.split:
-                raise _broken(
-                    world, f"{robot} shows {act.position} of {act.component}, which is not in the past of epoch {later}"
-                )
+                raise broken(world, f"{robot} shows {act.position} of {act.component}, which is not in the past of epoch {later}")
         seen = self.seen.setdefault(act.component, {})
         seen[epoch] = max(act.position, seen.get(epoch, act.position), key=world.values.__getitem__)
 
@@ -213,7 +211,7 @@ class Invariants:
         for epoch, position in self.seen.get(act.component, {}).items():
             is_before = epoch < act.epoch and world.values[position] > begin
             if is_before and self._is_held(world, act.component, position):
-                raise _broken(world, f"{robot} begins {act.component} before {position}, of which readers have seen the output")
+                raise broken(world, f"{robot} begins {act.component} before {position}, of which readers have seen the output")
         self.begun.setdefault(act.component, {}).setdefault(act.epoch, begin)
 
     def _is_held(self, world: World, component: str, position: Position) -> bool:
@@ -236,19 +234,19 @@ class Invariants:
         if safe_from is None or (act.component, act.epoch) in self.ordered or act.component in self.split:
             return
         if self._is_held(world, act.component, safe_from):
-            raise _broken(world, f"{robot} begins {act.component} anew, of which {safe_from} was acknowledged")
+            raise broken(world, f"{robot} begins {act.component} anew, of which {safe_from} was acknowledged")
         del self.acknowledged[act.component]
 
     def _not_older(self, world: World, robot: str, act: acts.Restore) -> None:
         if act.component in self.last:
-            raise _broken(world, f"{robot} runs {act.component} again, whose end was reported")
+            raise broken(world, f"{robot} runs {act.component} again, whose end was reported")
         if (act.component, act.epoch) in self.ordered:
             self.acknowledged.pop(act.component, None)
         safe_from = self.acknowledged.get(act.component)
         former = self.former.get(act.component, set())
         at_work = world.robots[robot].programs.get(act.component)
         if act.position in former and ((safe_from is not None and safe_from not in former) or at_work is not None):
-            raise _broken(world, f"{robot} resumes {act.component} from {act.position}, of a program that has ended")
+            raise broken(world, f"{robot} resumes {act.component} from {act.position}, of a program that has ended")
         in_place = (
             any(
                 record.name == act.component and record.state is State.PRIMARY and record.primary == robot
@@ -258,7 +256,7 @@ class Invariants:
         )
         comparable = act.component not in self.split and not in_place
         if comparable and safe_from is not None and world.values[act.position] < world.values[safe_from]:
-            raise _broken(world, f"{robot} resumes {act.component} from {act.position}, older than the acknowledged {safe_from}")
+            raise broken(world, f"{robot} resumes {act.component} from {act.position}, older than the acknowledged {safe_from}")
 
     def ended_well(self, world: World) -> None:
         """After healing: each component that goes on acts at one robot, and the other protects it."""
@@ -270,7 +268,7 @@ class Invariants:
             states = {name: state_at(world, name, component) for name in world.robots}
             if any(state in (State.FINISHED, State.FAILED, State.RELEASED) for state in states.values()):
                 if len(set(states.values())) > 1:
-                    raise _broken(world, f"{component} has ended for some only: {states}")
+                    raise broken(world, f"{component} has ended for some only: {states}")
                 self._nothing_waits_in_vain(world, component, "")
                 continue
             self._lives_well(world, component, states)
@@ -278,16 +276,16 @@ class Invariants:
     def _lives_well(self, world: World, component: str, states: dict[str, State]) -> None:
         primaries = [name for name, state in states.items() if state is State.PRIMARY]
         if len(primaries) != 1 or world.acting(component) != primaries:
-            raise _broken(world, f"{component} should act at one robot: {states}, acts at {world.acting(component)}")
+            raise broken(world, f"{component} should act at one robot: {states}, acts at {world.acting(component)}")
         seen = seen_at(world, primaries[0], component)
         if seen.protection != "protected" or not 0 <= seen.lag_ns < 1_000_000_000:
-            raise _broken(
+            raise broken(
                 world, f"{component} at {primaries[0]} is {seen.protection}, its checkpoint {seen.lag_ns / 1e6:.0f} ms old"
             )
         waits = _waits_at_a_standby(world, component)
         self._nothing_waits_in_vain(world, component, seen.standby if waits else "")
         if waits != seen.warm:
-            raise _broken(world, f"{primaries[0]} says of the standby of {component}: warm {seen.warm}")
+            raise broken(world, f"{primaries[0]} says of the standby of {component}: warm {seen.warm}")
 
 
 def state_at(world: World, robot: str, component: str) -> State:
@@ -311,7 +309,8 @@ def _views(world: World, robot: str) -> tuple[ComponentView, ...]:
     return node.status(world.local(world.robots[robot])).components
 
 
-def _broken(world: World, sentence: str) -> Broken:
+def broken(world: World, sentence: str) -> Broken:
+    """The sentence, and what happened before."""
     story = "\n".join(world.log[-60:])
     return Broken(f"{sentence}\n(at {world.now_ns / 1e6:.3f} ms; the story so far)\n{story}")
 

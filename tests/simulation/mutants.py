@@ -13,8 +13,9 @@ from failover.core import acts, node, peer_claims
 from failover.core.component import Component, Turn
 from failover.core.election import lease, majority, pair, votes
 from failover.core.election.coordinator import Arbiter
+from failover.core.events import Looked
 from failover.core.membership import UNREAD_NS, Membership, Peer
-from failover.core.replication import servers, standby, warm_standby
+from failover.core.replication import archived, servers, standby, warm_standby
 from failover.core.transitions import drain, exits, handover, restarts
 from failover.core.types import MS, Config, Restart, State
 from failover.core.wire.messages import Entry
@@ -630,6 +631,34 @@ ETCD_MUTANTS: tuple[tuple[Mutant, int], ...] = (
     (shares_an_epoch, 237),
 )
 """Mistakes that lives with etcd catch, and the seed that caught each last."""
+
+
+# Mistakes about the archive
+
+
+def no_last_look() -> Any:
+    """A robot takes over from the copy that it has, and does not look into the archive once more."""
+    honest = archived.review
+
+    def hasty(component: Component, turn: Turn) -> None:
+        honest(component, turn)
+        if component.freed_ns and component.held:
+            component.looked_ns, component.fresh = max(component.looked_ns, component.freed_ns), True
+
+    return patch.object(archived, "review", hasty)
+
+
+def content_with_less() -> Any:
+    """A look counts, though the archive has a newer copy, which has not come."""
+
+    def content(component: Component, event: Looked) -> None:
+        component.lags, component.looked_ns = False, max(component.looked_ns, event.begun_ns)
+
+    return patch.object(archived, "looked", content)
+
+
+APART_MUTANTS: tuple[tuple[Mutant, int], ...] = ((no_last_look, 11), (content_with_less, 11))
+"""Mistakes that lives of robots which never hear each other catch, and the seed that caught each last."""
 
 
 SPOILERS: tuple[tuple[Mutant, str], ...] = (

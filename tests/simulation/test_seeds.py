@@ -8,12 +8,22 @@ import pytest
 
 from failover.core.types import Restart
 from tests.simulation import planned
-from tests.simulation.__main__ import FAULTS_A_LIFE, RESTARTS_A_LIFE
+from tests.simulation.__main__ import FAULTS_A_LIFE, RESTARTS_A_LIFE, play
 from tests.simulation.chaos import TEAMS, life
 from tests.simulation.invariants import Broken
-from tests.simulation.mutants import AS_THE_SEED_SAYS, CAUGHT_BY, ELECTIVE_MUTANTS, ETCD_MUTANTS, MUTANTS, Mutant, mistaken
+from tests.simulation.mutants import (
+    APART_MUTANTS,
+    AS_THE_SEED_SAYS,
+    CAUGHT_BY,
+    ELECTIVE_MUTANTS,
+    ETCD_MUTANTS,
+    MUTANTS,
+    Mutant,
+    mistaken,
+)
 
 SEEDS = int(os.environ.get("FAILOVER_SEEDS", "300"))
+APART_SHARE = 6
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
@@ -58,6 +68,26 @@ def test_a_mistake_in_the_rule_of_etcd_is_caught_by_some_seed(mutant: Mutant, fi
             try:
                 life(seed, etcd=True)
             except AssertionError:
+                return
+    pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
+
+
+@pytest.mark.parametrize("first", range(0, SEEDS // APART_SHARE, BLOCK))
+def test_every_promise_holds_where_robots_share_only_etcd_and_an_archive(first: int) -> None:
+    for seed in range(first, first + BLOCK):
+        try:
+            life(seed, apart=True)
+        except Broken as story:
+            raise Broken(f"seed {seed} (again: python -m tests.simulation --apart --first {seed} --seeds 1): {story}") from None
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("mutant", "first"), APART_MUTANTS, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_takeover_from_an_older_copy_than_the_archive_had_is_caught_by_some_seed(mutant: Mutant, first: int) -> None:
+    with mistaken(mutant):
+        for seed in sorted(range(SEEDS_TO_CATCH), key=lambda seed: (seed != first, seed)):
+            _, story = play(seed, 0, apart=True)
+            if "when etcd would vote for it" in story:
                 return
     pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
 

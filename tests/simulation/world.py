@@ -96,14 +96,15 @@ class World:
         while self._agenda and self._agenda[0][0] <= until_ns:
             self.now_ns, _, happen = heapq.heappop(self._agenda)
             happen()
-            self._tell("", None)
+            self.tell("", None)
         self.now_ns = until_ns
 
     def note(self, sentence: str) -> None:
         """Something for the log that a failed seed prints."""
         self.log.append(f"{self.now_ns / MS:10.3f}  {sentence}")
 
-    def _tell(self, robot: str, what: object) -> None:
+    def tell(self, robot: str, what: object) -> None:
+        """Tell the watchers of something that happened at a robot."""
         for watcher in self._watchers:
             watcher(self, robot, what)
 
@@ -184,7 +185,7 @@ class World:
         """A rename, or a new file, that was on its way to the disk: it got there and nobody was told, or it did not."""
         if robot.pending is not None and self.random.random() < TORN:
             robot.vote_record = encode(robot.pending)
-            self._tell(robot.name, robot.pending)
+            self.tell(robot.name, robot.pending)
         for component, position in robot.writing:
             if self.random.random() < TORN:
                 robot.store.setdefault(component, []).append(position)
@@ -198,7 +199,7 @@ class World:
         robot.store.clear()
         robot.vote_record = robot.vote_record if not vote_record else b""
         self.note(f"{name} gets a new disk{', and forgets its votes' if vote_record else ''}")
-        self._tell(name, NewDisk(vote_record, lost))
+        self.tell(name, NewDisk(vote_record, lost))
 
     def later(self, name: str, epochs: int) -> None:
         """Switch a robot off; so many epochs more have passed when it comes back, as its disk says."""
@@ -303,7 +304,7 @@ class World:
         robot.pending = None
         if ready.persist is not None:
             robot.vote_record = encode(ready.persist)
-            self._tell(robot.name, ready.persist)
+            self.tell(robot.name, ready.persist)
         wait_ns = self.soon(0, 0.2) if ready.persist is not None else 0
         self.after(wait_ns, lambda: self._obey(robot, life, ready))
 
@@ -313,10 +314,10 @@ class World:
         robot.busy = False
         robot.told += ready.told
         for beat in ready.send:
-            self._tell(robot.name, beat)
+            self.tell(robot.name, beat)
             self._send(robot, beat)
         for act in ready.act:
-            self._tell(robot.name, act)
+            self.tell(robot.name, act)
             self._deeds.carry_out(robot, act)
         if robot.away_ns is not None and robot.node is not None and robot.node.may_go(self.local(robot)):
             self._leave(robot, robot.away_ns)
