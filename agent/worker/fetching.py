@@ -143,6 +143,7 @@ class Fetching:
         return [*self._damaged.values(), *self._lost.values(), *self._troubles.values()]
 
     async def _round(self, number: int) -> None:
+        looked_for, self._looked_for = self._looked_for, set()
         begun_ns = clock.now_ns()
         try:
             copies = (await self._process.ask(ListCopies(), limit_s=ANSWER_S)).copies
@@ -151,6 +152,7 @@ class Fetching:
             if not self._silent:
                 self._tell(Noticed("", f"the archive does not answer: {error}"))
             self._silent = str(error)
+            self._looked_for |= looked_for
             return
         if self._silent:
             self._tell(Noticed("", "the archive answers again"))
@@ -162,17 +164,18 @@ class Fetching:
         for one in view.components:
             self._look_for_damage(one, view)
         wanted: dict[str, list[Copy]] = {}
+        skipped = []
         for folder, group in itertools.groupby(copies, key=lambda copy: copy.folder):
             found = list(group)
             name = names.get(folder, found[0].component)
             self._look_for_a_rollback(name, found[0])
-            if not _takes(name, view):
+            if not _takes(name, view, is_looked_for=name in looked_for):
                 self._fetched.pop(folder, None)
+                skipped.append(name)
             elif newer := self._newer(name, found, view):
                 wanted[name] = newer
         self._look_for_an_empty_archive({copy.folder for copy in copies}, names, view)
-        self._tell(Looked(begun_ns, tuple(wanted)))
-        looked_for, self._looked_for = self._looked_for, set()
+        self._tell(Looked(begun_ns, tuple(wanted), tuple(skipped)))
         for name in sorted(wanted, key=lambda one: (one not in looked_for, wanted[one][0].size)):
             self._in_advance = "" if name in looked_for else name
             await self._fetch(name, wanted[name], begun_ns, number)
@@ -290,13 +293,13 @@ class Fetching:
                 os.close(file)
 
 
-def _takes(name: str, view: StatusView) -> bool:
-    """Whether this robot may have to run a component whose primary it does not hear."""
+def _takes(name: str, view: StatusView, *, is_looked_for: bool = False) -> bool:
+    """Whether this robot may have to run a component: it does not hear the primary, or the core looks for it to take it over."""
     known = next((one for one in view.components if one.name == name), None)
     if known is None:
         return True
     is_heard = any(peer.robot == known.primary and peer.state in ("alive", "suspect", "restarting") for peer in view.peers)
-    return known.state in _IDLE and not is_heard
+    return known.state in _IDLE and (is_looked_for or not is_heard)
 
 
 def _spec(copy: Copy, label: Label | None) -> ComponentSpec:

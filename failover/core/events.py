@@ -199,10 +199,12 @@ class Looked(Struct, frozen=True):
 
     Attributes:
         behind: components of which it has not: one is on its way, or was refused.
+        skipped: components that were not compared: this robot runs them, or heard their primary.
     """
 
     begun_ns: int
     behind: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
 
 
 class Fetched(Struct, frozen=True):

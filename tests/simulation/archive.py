@@ -61,13 +61,13 @@ class SimulatedArchive:
         """All that it has of a component now, whatever it shows."""
         return list(self._copies.get(component, ()))
 
-    def look(self, robot: Robot) -> None:
+    def look(self, robot: Robot, wanted: str = "") -> None:
         """A robot's worker lists the copies, and takes what is newer than its own."""
         life, begun_ns = robot.life, self._world.local(robot)
         if robot.node is None or not self._reaches(robot):
             return
         given = {name: list(kept) for name, kept in (self._copies if self.aged is None else self.aged).items()}
-        self._world.after(self._while_ns(), lambda: self._listed(robot, life, begun_ns, given))
+        self._world.after(self._while_ns(), lambda: self._listed(robot, life, begun_ns, given, wanted))
 
     def _turn(self, robot: Robot) -> None:
         for component in list(robot.programs):
@@ -105,15 +105,17 @@ class SimulatedArchive:
 
         self._world.after(self._while_ns() + late_ns, arrive)
 
-    def _listed(self, robot: Robot, life: int, begun_ns: int, given: dict[str, list[Position]]) -> None:
+    def _listed(self, robot: Robot, life: int, begun_ns: int, given: dict[str, list[Position]], looked_for: str) -> None:
         if robot.life != life or robot.node is None or not self._reaches(robot):
             return
-        wanted = {}
+        wanted, skipped = {}, []
         for component, copies in given.items():
             own = robot.store.get(component, [])
-            if copies and self._takes(robot, component) and (not own or max(own) < max(copies)):
+            if not self._takes(robot, component, looked_for):
+                skipped.append(component)
+            elif copies and (not own or max(own) < max(copies)):
                 wanted[component] = max(copies)
-        looked = Looked(begun_ns, tuple(wanted))
+        looked = Looked(begun_ns, tuple(wanted), tuple(skipped))
         self._world.tell(robot.name, looked)
         self._world.feed(robot, looked)
         for component, newest in wanted.items():
@@ -126,12 +128,14 @@ class SimulatedArchive:
                 position, proves_ns = older[-1], 0
             self._world.after(self._while_ns(), lambda c=component, p=position, b=proves_ns: self._come(robot, life, b, c, p))  # type: ignore[misc]
 
-    def _takes(self, robot: Robot, component: str) -> bool:
+    def _takes(self, robot: Robot, component: str, looked_for: str) -> bool:
         assert robot.node is not None
         view = robot.node.status(self._world.local(robot))
         known = next((one for one in view.components if one.name == component), None)
         heard = {peer.robot for peer in view.peers if peer.state in ("alive", "suspect", "restarting")}
-        return known is None or (known.state in (State.ABSENT, State.STANDBY) and known.primary not in heard)
+        return known is None or (
+            known.state in (State.ABSENT, State.STANDBY) and (component == looked_for or known.primary not in heard)
+        )
 
     def _come(self, robot: Robot, life: int, begun_ns: int, component: str, position: Position) -> None:
         if robot.life != life or robot.node is None or not self._reaches(robot):

@@ -82,7 +82,7 @@ class Deeds:
                 self._inquire(robot, act)
             case acts.Look():
                 if self._world.archive is not None:
-                    self._world.archive.look(robot)
+                    self._world.archive.look(robot, act.component)
             case acts.Answer():
                 self._world.note(f"{robot.name} answers: {'; '.join((act.sentence, *act.risks))}")
 

@@ -3,7 +3,8 @@
 The worker of such a robot copies the newest checkpoint from the archive into this robot's store, in advance; here is when that
 counts. Invariants:
 
-* A robot takes nothing from the archive of a component that it runs, whose primary it hears, or that has ended.
+* A robot takes nothing from the archive of a component that it runs, that has ended, or whose primary it hears while etcd is
+  bound to that one.
 * A checkpoint from there never takes the place of a later one.
 * A checkpoint that the store found damaged is held no more: this robot looks into the archive again before it takes over.
 * Once etcd would vote for another robot, this robot looks into the archive again before it claims the component. What was put
@@ -70,12 +71,14 @@ def damaged(component: Component, turn: Turn, event: Damaged) -> None:
 def _takes(component: Component, turn: Turn, position: Position) -> bool:
     newest = component.held[-1] if component.held else None
     is_late = position.generation in component.lost or position.generation // (PEERS_MAX + 1) <= component.void
-    is_ours_alone = component.state in _IDLE and not turn.alive(component.primary)
+    is_ours_alone = component.state in _IDLE and (component.freed_ns > 0 or not turn.alive(component.primary))
     return is_ours_alone and not is_late and (newest is None or newest < position)
 
 
 def looked(component: Component, event: Looked) -> None:
     """All that the archive had of this component when that look began is in our store; or it has something newer (``lags``)."""
+    if component.name in event.skipped:
+        return
     component.lags = component.name in event.behind
     if not component.lags:
         component.looked_ns = max(component.looked_ns, event.begun_ns)

@@ -332,3 +332,16 @@ def test_damage_of_what_is_not_held_changes_nothing() -> None:
     robot.fetched(1, 5)
     robot.step(Damaged(NAME, 1, position(1, 4)))
     assert robot.held == [position(1, 5)]
+
+
+def test_a_look_that_skipped_the_component_is_none() -> None:
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.flags = FREE
+    robot.live(100)
+    robot.step(Looked(robot.now_ns, (), (NAME,)))
+    robot.live(500)
+    assert not robot.claims(), "its primary was heard then, and nothing was compared"
+    robot.step(Looked(robot.now_ns))
+    robot.live(100)
+    assert robot.claims()
