@@ -31,7 +31,7 @@ from checkpoint.snapshot.required_files import needs
 from checkpoint.store.contract import SnapshotStore
 from checkpoint.store.store import open_store
 from failover.archive.archive import Archive, Copy, Label, object_store
-from failover.archive.keys import read_keys
+from failover.archive.keys import read_keys, recovery_path
 from failover.archive.objects import ObjectStore
 from failover.archive.witness import WitnessObjects
 from failover.core import vote_record as core_vote_record
@@ -103,6 +103,8 @@ def _recover(settings: Settings, name: str, archive: Archive, directory: Path) -
     print(f"{robot} holds {component} as {label.robot} archived it, epoch {epoch}; start the agent, and see failover status")
     age_s = max(time.time() - label.at_s, 0)
     print(f"this copy was sealed at {_instant(label)}, {age_s:.0f} s ago by the clock of {robot}: the work since then is lost")
+    if (recovery := recovery_path(Path(settings.config.team_directory))).exists():
+        print(f"{recovery} opens every copy: move it to where no robot is again")
     for path in missing:
         print(f"{component} needs {path}, which is neither here nor whole in the archive: install it before it goes on here")
     return 0

@@ -10,10 +10,8 @@ import contextlib
 import os
 import socket
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import msgspec
 
@@ -37,10 +35,8 @@ from agent.main_loop.vote_record import VoteRecordFile
 from checkpoint.errors import CheckpointError
 from checkpoint.keeper.messages import Channel, ChannelError, close_all
 from checkpoint.sentences import in_words
-from checkpoint.snapshot import format
-from checkpoint.store.chain_files import fold_to
-from checkpoint.store.fold_rules import count_at_once
-from failover.archive.archive import Archive, object_store
+from checkpoint.store.chain_files import folded_in_steps
+from failover.archive.archive import Archive, Last, object_store
 from failover.archive.keys import read_keys
 from failover.archive.objects import require_room
 from failover.archive.witness import Witness, WitnessObjects
@@ -85,6 +81,7 @@ class Archivist:
         self._settings = settings
         self._witness = witness
         self._aside = Path(settings.config.state_directory)
+        self._last: dict[str, Last] = {}
 
     def answer(self, request: Request, descriptors: tuple[int, ...]) -> Done:
         """Do what is asked, or say why it cannot be done."""
@@ -104,7 +101,10 @@ class Archivist:
                 with open(descriptors[0], "rb", buffering=0, closefd=False) as content:
                     return Done(size=archive.put_content(request.digest, content))
             case KeepCheckpoint():
-                with self._whole(descriptors) as checkpoint:
+                require_room(
+                    self._aside, 2 * sum(os.fstat(one).st_size for one in descriptors)
+                )  # folded, and sealed or folded again
+                with folded_in_steps(descriptors, self._aside) as checkpoint:
                     name, size = archive.put(checkpoint, self._settings.config.robot, self._spec(request.component))
                 archive.thin(request.component, self._settings.config.store.s3_keep, but=name)
                 return Done(name=name, size=size)
@@ -126,24 +126,7 @@ class Archivist:
         keys = read_keys(directory, team)
         witness = self._witness
         objects = WitnessObjects(witness, keys.shared) if witness is not None else object_store(store.s3, store.s3_endpoint)
-        return Archive(objects, keys, team.team, self._aside, by_epoch=fetches(self._settings))
-
-    @contextlib.contextmanager
-    def _whole(self, chain: tuple[int, ...]) -> Iterator[BinaryIO]:
-        """A file of the state that a chain leads to, as one base; of its deltas no more are in memory than when a store folds."""
-        require_room(self._aside, 2 * sum(os.fstat(one).st_size for one in chain))  # folded, and sealed or folded again
-        deltas, sizes = list(chain[1:]), [_pages_size(one) for one in chain[1:]]
-        with contextlib.ExitStack() as files:
-            base: BinaryIO = files.enter_context(open(chain[0], "rb", buffering=0, closefd=False))
-            while deltas:
-                count = count_at_once([_pages_size(base.fileno()), *sizes]) - 1
-                folded = files.enter_context(tempfile.TemporaryFile(dir=self._aside))
-                fold_to(folded, base.fileno(), *deltas[:count])
-                folded.flush()
-                base.close()
-                base = folded
-                del deltas[:count], sizes[:count]
-            yield base
+        return Archive(objects, keys, team.team, self._aside, by_epoch=fetches(self._settings), last=self._last)
 
     def _spec(self, component: str) -> bytes:
         """How a component is started and by which rules it lives, as this member has it on record."""
@@ -151,10 +134,6 @@ class Archivist:
         records = vote_record.decode(VoteRecordFile(directory, robot).read().core).records
         spec = next((one.spec for one in records if one.name == component), None)
         return msgspec.msgpack.encode(spec) if spec is not None else b""
-
-
-def _pages_size(snapshot: int) -> int:
-    return sum(run.size for run in format.read_outline(snapshot).runs)
 
 
 def main() -> int:

@@ -58,6 +58,7 @@ class _Shelf(Struct):
         epoch: of that one; put_ns: when it was there, by the boot clock.
         since_s: when that was made, or the component was first seen here; monotonic.
         trouble: why the last try failed, wholly or for a file that it needs; "" if it did not.
+        is_stale: the newest copy was sealed for other members than there are now; ``due_s``: since then.
     """
 
     since_s: float
@@ -65,6 +66,8 @@ class _Shelf(Struct):
     epoch: int = 0
     put_ns: int = 0
     trouble: str = ""
+    is_stale: bool = False
+    due_s: float = 0.0
     has: set[bytes] = field(default_factory=set)
     """Digests of the files that it needs and that were found in the archive."""
 
@@ -111,9 +114,11 @@ class Archiving:
         """With another archive key, or for other members, all copies are made again: not all could open those of before."""
         directory = Path(self._settings.config.team_directory)
         found = await asyncio.to_thread(_signs_of, key_path(directory), directory / TEAM_FILE)
-        if found != self._sealed_by:
+        if self._sealed_by and found != self._sealed_by:
             for shelf in self._shelves.values():
-                shelf.position, shelf.has = None, set()
+                shelf.is_stale, shelf.due_s, shelf.has = True, time.monotonic(), set()
+                if found[:1] != self._sealed_by[:1]:
+                    shelf.position = None
         self._sealed_by = found
 
     def listed(self, copies: Collection[Copy], begun_ns: int) -> None:
@@ -136,7 +141,7 @@ class Archiving:
         for name in self._wanted():
             shelf = self._shelves.setdefault(name, _Shelf(now_s))
             age_s = now_s - shelf.since_s
-            is_late = age_s > BEHIND_ROUNDS * every_s and not self._is_current(name, shelf)
+            is_late = now_s - max(shelf.since_s, shelf.due_s) > BEHIND_ROUNDS * every_s and not self._is_current(name, shelf)
             if not (shelf.trouble or is_late):
                 continue
             since = f"its newest copy is {age_s:.0f} s old" if shelf.position else f"it has had no copy for {age_s:.0f} s"
@@ -163,7 +168,7 @@ class Archiving:
         return [name for name in held if name in running]
 
     def _is_current(self, name: str, shelf: _Shelf) -> bool:
-        return shelf.position is not None and shelf.position == self._store.newest(name)
+        return not shelf.is_stale and shelf.position is not None and shelf.position == self._store.newest(name)
 
     async def _copy(self, name: str) -> None:
         """Make one copy of a component, unless it is as it was; never raises."""
@@ -173,7 +178,10 @@ class Archiving:
         try:
             if self._courier is not None:
                 self._courier.check_way()
-            if fetches(self._settings) and not self._is_current(name, shelf):  # robots that have the files wait for it
+            is_new = shelf.position != self._store.newest(
+                name
+            )  # else it goes last: robots that can open the former one wait for nothing
+            if fetches(self._settings) and is_new:
                 await self._copy_checkpoint(name, shelf)
             lacking = await self._copy_files(name, shelf) if self._settings.config.bring else []
             if not self._is_current(name, shelf):
@@ -200,7 +208,7 @@ class Archiving:
             done = await self._process.ask(KeepCheckpoint(name), chain)
         finally:
             close_all(chain)
-        shelf.position, shelf.since_s = header.position, begun_s
+        shelf.position, shelf.since_s, shelf.is_stale = header.position, begun_s, False
         shelf.epoch, shelf.put_ns = header.epoch, clock.now_ns()
         if fetches(self._settings):
             self._tell(Archived(name, header.epoch, header.position, begun_ns))

@@ -231,7 +231,7 @@ class Fetching:
 
     async def _fetch(self, name: str, newer: list[Copy], begun_ns: int, number: int) -> None:
         """Take the newest copy that is whole; never raises. Where it is not the newest of all, the core looks again."""
-        tried = [copy for copy in newer if self._refused.get(copy.name, 0) <= number]
+        tried = [copy for copy in _spread(newer) if self._refused.get(copy.name, 0) <= number]
         for copy in tried[:TRIES_MAX]:
             try:
                 await self._take(copy, begun_ns if copy is newer[0] else 0)
@@ -291,6 +291,14 @@ class Fetching:
                 self._absent.add(need.digest)
             finally:
                 os.close(file)
+
+
+def _spread(copies: list[Copy]) -> list[Copy]:
+    """The newest copy, then those that harm of it is the least likely to reach: its base, the newest of another base."""
+    newest = copies[0]
+    base = [copy for copy in copies[1:] if copy.name == newest.base]
+    other = [copy for copy in copies if copy.base != newest.base][:1]
+    return [newest, *base, *other, *(copy for copy in copies[1:] if copy not in (*base, *other))]
 
 
 def _takes(name: str, view: StatusView, *, is_looked_for: bool = False) -> bool:

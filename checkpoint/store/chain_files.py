@@ -6,10 +6,11 @@ A file that turns out to be damaged is set out of use. The answer is None then; 
 from __future__ import annotations
 
 import contextlib
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 from msgspec.structs import replace
 
@@ -25,7 +26,7 @@ from checkpoint.store import chain
 from checkpoint.store.atomic_files import WholeFiles
 from checkpoint.store.base_on_disk import stored_base, stored_chain
 from checkpoint.store.disk import DiskFile
-from checkpoint.store.fold_rules import newest_output
+from checkpoint.store.fold_rules import count_at_once, newest_output
 from checkpoint.store.folding import Folding
 from checkpoint.store.index import Entry, file_name, folder_name
 
@@ -162,6 +163,34 @@ def fold_to(file: Sink, *sources: Source) -> None:
     else:
         whole = chain.fold([format.decode(source) for source in sources])
         format.encode(replace(whole, output=newest_output(whole.output)), file)
+
+
+@contextlib.contextmanager
+def folded_in_steps(chain: Sequence[int], aside: Path) -> Iterator[BinaryIO]:
+    """A file of the state that a chain of open files leads to, as one base; no more deltas at once in memory than a store folds.
+
+    Args:
+        aside: a folder for files without a name.
+
+    Raises:
+        FormatError, ChainError, OSError: as `fold_to`.
+    """
+    deltas, sizes = list(chain[1:]), [_pages_size(one) for one in chain[1:]]
+    with contextlib.ExitStack() as files:
+        base: BinaryIO = files.enter_context(open(chain[0], "rb", buffering=0, closefd=False))
+        while deltas:
+            count = count_at_once([_pages_size(base.fileno()), *sizes]) - 1
+            folded = files.enter_context(tempfile.TemporaryFile(dir=aside))
+            fold_to(folded, base.fileno(), *deltas[:count])
+            folded.flush()
+            base.close()
+            base = folded
+            del deltas[:count], sizes[:count]
+        yield base
+
+
+def _pages_size(snapshot: int) -> int:
+    return sum(run.size for run in format.read_outline(snapshot).runs)
 
 
 def entry_of(path: Path, snapshot: Snapshot, size: int) -> Entry:

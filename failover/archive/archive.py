@@ -1,4 +1,9 @@
-"""One team's archive: whole checkpoints, and the files that their programs need, each a sealed object (``ARCHIVE.md``)."""
+"""One team's archive: checkpoints, and the files that their programs need, each a sealed object (``ARCHIVE.md``).
+
+A copy is a base, or a delta to the copy before it: what has changed since. Whoever fetches one fetches those before it, too,
+back to a base, and folds them. A chain stays short, and its deltas together smaller than half of the base. A delta is made only
+by the process that has put the copy before it, as long as that is the newest one, is whole, and was sealed for the same readers.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +21,16 @@ import msgspec
 from blake3 import blake3
 from msgspec import Struct
 
-from checkpoint.errors import UNDECODABLE, FormatError
+from checkpoint.errors import UNDECODABLE, CheckpointError, FormatError
 from checkpoint.snapshot import format
 from checkpoint.snapshot.canonical_state import Header
 from checkpoint.snapshot.required_files import Need
+from checkpoint.store.chain_files import folded_in_steps
 from checkpoint.store.content_store import digest_of_descriptor
-from checkpoint.store.index import BASE_SUFFIX, FOLDER_PREFIX, file_name, folder_name, order_of_name
+from checkpoint.store.difference import Known, difference, known_of
+from checkpoint.store.index import BASE_SUFFIX, DELTA_SUFFIX, FOLDER_PREFIX, file_name, folder_name, order_of_name
 from failover.archive import sealed
-from failover.archive.keys import Keys, ids_of
+from failover.archive.keys import Keys, check_own, ids_of
 from failover.archive.objects import FULL, FolderObjects, ObjectStore, PutRefusedError, require_room
 from failover.config.store import S3
 from failover.errors import ArchiveError
@@ -33,6 +40,26 @@ CONTENTS: Final = "contents"
 PART_SIZE: Final = 1 << 20
 LABEL_SIZE_MAX: Final = sealed.FRAME_SIZE - 4
 """Bytes: it lies in the first frame."""
+
+PARENT: Final = "~"
+"""In the name of a delta, before the stamp of the copy that it follows."""
+
+DELTAS_MAX: Final = 15
+"""Deltas that may follow one base."""
+
+DELTAS_PART: Final = 0.5
+"""How large they may be together, as a part of the base."""
+
+CHANGED_MAX: Final = 64 << 20
+"""Bytes of changed pages of one delta: they are in memory while it is made."""
+
+LAST_MAX: Final = 64
+"""Components of which the last copy is remembered."""
+
+NUMBER_MAX: Final = (1 << 63) - 1
+
+SIZE_MAX: Final = 1 << 50
+"""Bytes of an object: what a place says beyond that is no truth."""
 
 STAMP_MS_MAX: Final = 253_402_300_799_999
 """The last millisecond of the year 9999."""
@@ -76,7 +103,8 @@ class Copy(Struct, frozen=True):
         stamp_ms: when it was sealed, since 1970; at least 1 more than the newest copy before it has. A new life of a component
             begins at epoch 1, and is newer all the same.
         epoch, generation, sequence: of the checkpoint.
-        size: bytes of the object.
+        size: bytes of all objects that it takes to have it: this one, and those before it back to a base.
+        before: names of those others, the base first.
     """
 
     name: str
@@ -87,11 +115,17 @@ class Copy(Struct, frozen=True):
     generation: int
     sequence: int
     size: int
+    before: tuple[str, ...] = ()
 
     @property
     def component(self) -> str:
         """Its name; one that was too long for an object's is cut."""
         return unquote(self.folder.removeprefix(FOLDER_PREFIX))
+
+    @property
+    def base(self) -> str:
+        """The object of the base that it takes."""
+        return (*self.before, self.name)[0]
 
     @property
     def order(self) -> tuple[int, int, int, int]:
@@ -109,6 +143,18 @@ class Copy(Struct, frozen=True):
         return self.stamp_ms / 1000
 
 
+class Last(Struct, frozen=True, eq=False):
+    """What is remembered of the newest copy that this process has put of a component: a delta may follow it.
+
+    Attributes:
+        name: of the object; ``known``: of the state; ``keys``: for whose readers it was sealed.
+    """
+
+    name: str
+    known: Known
+    keys: Keys
+
+
 class Archive:
     """The objects of one team.
 
@@ -116,9 +162,20 @@ class Archive:
         keys: what is sealed here is for their readers.
         aside: a folder for files without a name that are sealed, or that arrive.
         by_epoch: the newest copy is that of the latest epoch, and none of an earlier epoch is put any more.
+        last: component → what was put last, which lasts longer than this object; None: each copy is a base.
     """
 
-    def __init__(self, objects: ObjectStore, keys: Keys, team: str, aside: Path, *, by_epoch: bool = False) -> None:
+    def __init__(
+        self,
+        objects: ObjectStore,
+        keys: Keys,
+        team: str,
+        aside: Path,
+        *,
+        by_epoch: bool = False,
+        last: dict[str, Last] | None = None,
+    ) -> None:
+        self._last = last
         self._by_epoch = by_epoch
         self._objects = objects
         self._keys = keys
@@ -134,7 +191,7 @@ class Archive:
             checkpoint: a file of the disk, of one base.
 
         Returns:
-            The object's name, and its size.
+            The object's name, and the bytes of all objects that it takes to have this copy.
 
         Raises:
             FormatError: it is no whole, unaltered base.
@@ -144,32 +201,65 @@ class Archive:
         header = format.verify(checkpoint.fileno())
         if not header.is_base:
             raise FormatError("a delta is not archived: it is no whole checkpoint")
-        file, before = file_name(header), self.copies(header.component)
+        before, _ = self._found(folder := f"{self._team}/{folder_name(header.component)}")
         if self._by_epoch and before and before[0].epoch > header.epoch:
             raise ArchiveError(
                 f"the archive has {header.component} in epoch {before[0].epoch}, and this copy has epoch {header.epoch}: another "
                 "robot has run it since; if none has, remove the copies of that epoch"
             )
         for copy in before:
-            if copy.file == file and not self._lack(copy.name, copy.size):
+            if _stem(copy.file) == _stem(file_name(header)) and not self._lack_of(copy):
                 return copy.name, copy.size
         try:
-            return self._put_now(checkpoint, header, robot, spec, before)
+            return self._put_now(checkpoint, header, robot, spec, folder)
         except PutRefusedError as error:
             if error.why == FULL:
                 raise
-            return self._put_now(checkpoint, header, robot, spec, self.copies(header.component))  # another member was first
+            return self._put_now(checkpoint, header, robot, spec, folder)  # another member was first
 
-    def _put_now(self, checkpoint: BinaryIO, header: Header, robot: str, spec: bytes, before: list[Copy]) -> tuple[str, int]:
+    def _put_now(self, checkpoint: BinaryIO, header: Header, robot: str, spec: bytes, folder: str) -> tuple[str, int]:
         """Keep a checkpoint as the newest copy, later than those before. Where there is no room, older ones of it go first."""
+        before, found = self._found(folder)
         now_s = time.time()
-        stamp_ms = min(max([int(1000 * now_s), *(copy.stamp_ms + 1 for copy in before)]), STAMP_MS_MAX)
-        name = f"{self._team}/{folder_name(header.component)}/{stamp_ms:012x}-{file_name(header)}{SUFFIX}"
+        stamp_ms = min(max([int(1000 * now_s), *(one.stamp_ms + 1 for one in found)]), STAMP_MS_MAX)
         label = msgspec.msgpack.encode(Label(robot, now_s, spec))
         if len(label) > LABEL_SIZE_MAX:
             raise ArchiveError(f"the specification of {header.component} has {len(spec)} bytes: {LABEL_SIZE_MAX} is the limit")
-        parts = _joined(len(label).to_bytes(4, "little") + label, checkpoint)
-        return name, self._kept(name, parts, _size(checkpoint), spare=[copy.name for copy in before[1:]])
+        with tempfile.TemporaryFile(dir=self._aside) as changed:
+            known = known_of(checkpoint.fileno()) if self._last is not None else None
+            parent = None
+            if known is not None and before and before[0].stamp_ms < stamp_ms:
+                parent = before[0] if self._continues(header.component, before[0], checkpoint, known, changed) else None
+            content: BinaryIO = changed if parent else checkpoint
+            name = f"{folder}/{stamp_ms:012x}-{file_name(format.read_header(content.fileno()))}"
+            name += (f"{PARENT}{parent.stamp_ms:012x}" if parent else "") + SUFFIX
+            parts = _joined(len(label).to_bytes(4, "little") + label, content)
+            size = self._kept(name, parts, _size(content), spare=_spare(before, found))
+        if self._last is not None:
+            self._last.pop(header.component, None)
+        if parent and self._objects.size(parent.name) is None:  # another member has removed it meanwhile
+            self._objects.remove(name)
+            return self._put_now(checkpoint, header, robot, spec, folder)
+        if self._last is not None and known is not None and not known.is_tree:
+            self._last[header.component] = Last(name, known, self._keys)
+            while len(self._last) > LAST_MAX:
+                del self._last[next(iter(self._last))]
+        return name, size + (parent.size if parent else 0)
+
+    def _continues(self, component: str, newest: Copy, checkpoint: BinaryIO, known: Known, file: BinaryIO) -> bool:
+        """Write what has changed since the newest copy to an empty file, where a delta may follow that copy."""
+        assert self._last is not None
+        last = self._last.get(component)
+        if last is None or last.name != newest.name or last.keys != self._keys or len(newest.before) >= DELTAS_MAX:
+            return False
+        if self._lack_of(newest) or (base_size := self._objects.size((*newest.before, newest.name)[0])) is None:
+            return False
+        delta = difference(checkpoint.fileno(), known, last.known, CHANGED_MAX)
+        if delta is None:
+            return False
+        format.encode(delta, file)
+        file.flush()
+        return newest.size + _size(file) <= (1 + DELTAS_PART) * base_size
 
     def holds_whole(self, digest: bytes) -> bool:
         """Whether the content of this digest is here, with both ends of its object unharmed."""
@@ -189,11 +279,8 @@ class Archive:
         An object of it that was harmed, or was sealed for other readers, is replaced.
         """
         name, found = self._content_name(digest), blake3()
-        there = self._objects.size(name)
-        if there is not None:
-            if not self._lack(name, there):
-                return there
-            self._objects.remove(name)
+        if (there := self._objects.size(name)) is not None and not self._lack(name, there):
+            return there
 
         def prove() -> None:
             if found.digest() != digest:
@@ -201,13 +288,27 @@ class Archive:
                     f"a file was to be archived as {digest.hex()}, and has another content; it was changed meanwhile"
                 )
 
-        return self._kept(name, _seen(_joined(b"", content), found.update), _size(content), prove)
+        return self._kept(name, _seen(_joined(b"", content), found.update), _size(content), prove, replaces=True)
 
     def thin(self, component: str, keep: int, but: str = "") -> int:
-        """Remove all but the newest checkpoints of a component, and never the object of this name; how many went."""
-        gone = [copy for copy in self.copies(component)[keep:] if copy.name != but]
-        for copy in reversed(gone):
-            self._objects.remove(copy.name)
+        """Remove all but the newest checkpoints of a component and what these need, and never the object of this name.
+
+        Where two copies at least are kept, they have two bases.
+
+        Returns:
+            How many objects went.
+        """
+        copies, found = self._found(f"{self._team}/{folder_name(component)}")
+        newest_of = {_stem(copy.file): copy for copy in reversed(copies)}  # of a checkpoint that was sealed anew, the newest copy
+        wanted = [copy for copy in copies if newest_of[_stem(copy.file)] is copy]
+        kept = [*wanted[:keep], *(copy for copy in copies if copy.name == but)]
+        if len({copy.base for copy in kept}) == 1 < keep:  # harm to one object is not to reach all copies
+            kept += [copy for copy in wanted[keep:] if copy.base != kept[0].base][:1]
+        needed = {name for copy in kept for name in (copy.name, *copy.before)}
+        newest = max((copy.stamp_ms for copy in copies), default=0)
+        gone = [one for one in found if one.name not in needed and one.stamp_ms <= newest]
+        for one in sorted(gone, key=lambda one: one.stamp_ms, reverse=True):  # a delta goes before what it follows
+            self._objects.remove(one.name)
         return len(gone)
 
     def _kept(
@@ -216,18 +317,26 @@ class Archive:
         parts: Iterator[bytes],
         size: int,
         prove: Callable[[], None] = lambda: None,
-        spare: Sequence[str] = (),
+        spare: Sequence[_Object] = (),
+        *,
+        replaces: bool = False,
     ) -> int:
         """Seal parts of so many bytes, prove them, and put them; the size of the object.
 
         Args:
             spare: objects that give way where the place is full, the last one first.
+            replaces: an object of this name goes at the last moment, if it still lacks something (`_lack`).
         """
+        check_own(self._keys)
         require_room(self._aside, size)
         with tempfile.TemporaryFile(dir=self._aside) as file:
             there = sealed.seal(self._keys, name, parts, file)
             prove()
             file.flush()
+            if replaces and (found := self._objects.size(name)) is not None:
+                if not self._lack(name, found):
+                    return found  # another member was first
+                self._objects.remove(name)
             is_ours = self._put_in_room(name, file, spare)
             if not is_ours:  # another member was first
                 there = self._objects.size(name) or 0
@@ -238,59 +347,91 @@ class Archive:
             raise ArchiveError(f"{name} was put into the archive, and does not come back from it: {refusal}; it is put again")
         return there
 
-    def _put_in_room(self, name: str, file: BinaryIO, spare: Sequence[str]) -> bool:
+    def _put_in_room(self, name: str, file: BinaryIO, spare: Sequence[_Object]) -> bool:
         """Put an object; whether it is ours."""
-        for older in reversed(spare):
+        rest = list(spare)
+        while True:
             try:
                 return self._objects.put(name, file)
             except PutRefusedError as error:
-                if error.why != FULL:
+                if error.why != FULL or not rest or error.lacks > sum(one.size for one in rest):
                     raise
-            self._objects.remove(older)
-        return self._objects.put(name, file)
+            self._objects.remove(rest.pop().name)
 
     def _refusal(self, name: str, size: int) -> str:
-        """Why an object is not whole; "" where its size and its two ends prove it: these keys, this name, the last frame."""
-        try:
-            self._proved(name, size)
-        except ArchiveError as error:
-            return str(error)
-        return ""
+        """Why an object is not whole; "" where its size and its two ends prove it: these keys, this name, the last frame.
+
+        Raises:
+            ArchiveError: its place does not answer.
+        """
+        return self._looked_at(name, size)[0]
 
     def _lack(self, name: str, size: int) -> str:
         """The same; or that it was sealed for others than those who are to open it."""
-        try:
-            readers = sealed.readers_in(self._proved(name, size))
-        except ArchiveError as error:
-            return str(error)
-        return "" if readers == ids_of(self._keys.readers) else f"{name} was sealed for other members"
+        refusal, readers = self._looked_at(name, size)
+        return refusal or ("" if readers == ids_of(self._keys.readers) else f"{name} was sealed for other members")
 
-    def _proved(self, name: str, size: int) -> bytes:
-        """The head of an object that is whole."""
+    def _lack_of(self, copy: Copy) -> str:
+        """The same of each object that it takes to have a copy."""
+        lacks = (self._lack(name, self._objects.size(name) or 0) for name in (copy.name, *copy.before))
+        return next(filter(None, lacks), "")
+
+    def _looked_at(self, name: str, size: int) -> tuple[str, frozenset[bytes]]:
+        """Why it is not whole, and its readers. What its place cannot do is raised, and is no fault of the object."""
+        nobody = frozenset[bytes]()
         found = self._objects.size(name)
-        if found != size:
-            raise ArchiveError(f"it was sent with {size} bytes, and has {found or 0} there")
+        if found != size or not sealed.HEAD_SIZE_LEAST < size <= SIZE_MAX:
+            return f"it was sent with {size} bytes, and has {found or 0} there", nobody
         with closing(self._objects.open(name)) as source:
-            head = sealed.read_head(name, source)
+            first = sealed.exactly(source, sealed.HEAD_SIZE_LEAST)
+            try:
+                head_size = sealed.head_size(name, first)
+            except ArchiveError as error:
+                return str(error), nobody
+            head = first + sealed.exactly(source, head_size - len(first))
+        if len(head) < head_size or size < head_size + sealed.TAG_SIZE:
+            return f"{name} in the archive was cut off in its head", nobody
         with closing(self._objects.open(name, sealed.last_frame(head, size))) as source:
             last = sealed.exactly(source, sealed.FRAME_SIZE + sealed.TAG_SIZE)
-        sealed.check_end(self._keys, name, head, size, last)
-        return head
+        try:
+            sealed.check_end(self._keys, name, head, size, last)
+        except ArchiveError as error:
+            return str(error), nobody
+        return "", sealed.readers_in(head)
 
     # Asking
 
     def copies(self, component: str = "") -> list[Copy]:
         """The checkpoints that are here, of one component or of all; the newest of each first."""
-        below = f"{self._team}/{folder_name(component)}" if component else self._team
+        return self._found(f"{self._team}/{folder_name(component)}" if component else self._team)[0]
+
+    def _found(self, below: str) -> tuple[list[Copy], list[_Object]]:
+        """The same; and the objects of all checkpoints there, also of those that lack what they follow."""
+        found = sorted(self._objects_of(below), key=lambda one: one.stamp_ms)
+        copies: list[Copy] = []
+        whole: dict[tuple[str, int], list[Copy]] = {}
+        for one in found:
+            parent = None
+            if one.parent_ms is not None:
+                parent = next((copy for copy in whole.get((one.folder, one.parent_ms), ()) if _follows(one, copy)), None)
+                if parent is None:
+                    continue
+            before = (*parent.before, parent.name) if parent else ()
+            size = one.size + (parent.size if parent else 0)
+            copies.append(Copy(one.name, one.folder, one.file, one.stamp_ms, *one.number, size, before))
+            whole.setdefault((one.folder, one.stamp_ms), []).append(copies[-1])
+        copies.sort(key=lambda copy: copy.line if self._by_epoch else copy.order, reverse=True)
+        return sorted(copies, key=lambda copy: copy.folder), found
+
+    def _objects_of(self, below: str) -> list[_Object]:
+        """The objects of checkpoints below a place, in no particular order."""
         found = []
         for stored in self._objects.listed(below):
             place, _, words = stored.name.removeprefix(f"{self._team}/").partition("/")
-            stamp, _, file = words.removesuffix(SUFFIX).partition("-")
-            is_one = place.startswith(FOLDER_PREFIX) and "/" not in words and words.endswith(BASE_SUFFIX + SUFFIX)
-            if is_one and (stamp_ms := _stamp(stamp)) is not None and (order := order_of_name(file)) is not None:
-                found.append(Copy(stored.name, place, file, stamp_ms, *order, stored.size))
-        found.sort(key=lambda copy: copy.line if self._by_epoch else copy.order, reverse=True)
-        return sorted(found, key=lambda copy: copy.folder)
+            is_one = place.startswith(FOLDER_PREFIX) and "/" not in words and words.endswith(SUFFIX)
+            if is_one and (one := _object(stored.name, place, words.removesuffix(SUFFIX), stored.size)) is not None:
+                found.append(one)
+        return found
 
     def named(self, name: str) -> list[Copy]:
         """The copies of the component that is named by its name or an end of it, the newest first.
@@ -308,16 +449,38 @@ class Archive:
         """Write a checkpoint to an empty file, which holds it whole and proved afterwards.
 
         Raises:
-            ArchiveError: it was altered, cut off, or sealed with another key; the file is worth nothing.
-            OSError: the file does not take it.
+            ArchiveError: it, or one that it follows, was altered, cut off, or sealed with another key; the file is worth nothing.
+            OSError: the file, or the disk, does not take it.
         """
-        with closing(self._objects.open(copy.name)) as source:
-            parts = sealed.unsealed(self._keys, copy.name, source)
+        if not copy.before:
+            return self._fetch_one(copy.name, copy.folder, copy.file, file)
+        require_room(self._aside, 3 * copy.size)  # the objects, folded, and the file
+        try:
+            with contextlib.ExitStack() as files:
+                chain = []
+                for name in (*copy.before, copy.name):
+                    chain.append(files.enter_context(tempfile.TemporaryFile(dir=self._aside)))
+                    label = self._fetch_one(name, copy.folder, _file_of(name), chain[-1])
+                with folded_in_steps([one.fileno() for one in chain], self._aside) as folded:
+                    for part in _joined(b"", folded):
+                        file.write(part)
+            file.flush()
+            header = format.verify(file.fileno())
+        except CheckpointError as error:
+            raise ArchiveError(f"{copy.name} in the archive does not continue the copy before it: {error}") from error
+        if _stem(file_name(header)) != _stem(copy.file):
+            raise ArchiveError(f"{copy.name} in the archive leads to another checkpoint than its name says")
+        return label
+
+    def _fetch_one(self, name: str, folder: str, named: str, file: BinaryIO) -> Label:
+        """One object of a checkpoint."""
+        with closing(self._objects.open(name)) as source:
+            parts = sealed.unsealed(self._keys, name, source)
             first = next(parts, b"")
             size = int.from_bytes(first[:4], "little")
-            label = _label(copy.name, first[4 : 4 + size]) if size <= LABEL_SIZE_MAX else None
+            label = _label(name, first[4 : 4 + size]) if size <= LABEL_SIZE_MAX else None
             if label is None:
-                raise ArchiveError(f"{copy.name} in the archive holds no checkpoint of this version of failover")
+                raise ArchiveError(f"{name} in the archive holds no checkpoint of this version of failover")
             file.write(first[4 + size :])
             for part in parts:
                 file.write(part)
@@ -325,9 +488,9 @@ class Archive:
         try:
             header = format.verify(file.fileno())
         except FormatError as error:
-            raise ArchiveError(f"{copy.name} in the archive is no whole checkpoint: {error}") from error
-        if file_name(header) != copy.file or folder_name(header.component) != copy.folder:
-            raise ArchiveError(f"{copy.name} in the archive holds another checkpoint than its name says")
+            raise ArchiveError(f"{name} in the archive is no whole checkpoint: {error}") from error
+        if file_name(header) != named or folder_name(header.component) != folder:
+            raise ArchiveError(f"{name} in the archive holds another checkpoint than its name says")
         return label
 
     def fetch_content(self, need: Need, file: BinaryIO) -> None:
@@ -345,6 +508,55 @@ class Archive:
     def _content_name(self, digest: bytes) -> str:
         keyed = blake3(self._keys.shared + digest, derive_key_context=_NAMES).hexdigest()
         return f"{self._team}/{CONTENTS}/{keyed}{SUFFIX}"
+
+
+class _Object(Struct, frozen=True):
+    """An object of a checkpoint, as its name says. ``parent_ms``: the stamp of the copy that a delta follows; None: a base."""
+
+    name: str
+    folder: str
+    file: str
+    stamp_ms: int
+    parent_ms: int | None
+    number: tuple[int, int, int]
+    size: int
+
+
+def _object(name: str, folder: str, words: str, size: int) -> _Object | None:
+    """None where the name is none of a checkpoint."""
+    stamp, _, rest = words.partition("-")
+    file, mark, parent = rest.partition(PARENT)
+    stamp_ms, parent_ms, number = _stamp(stamp), _stamp(parent) if mark else None, order_of_name(file)
+    is_delta = file.endswith(DELTA_SUFFIX)
+    if stamp_ms is None or number is None or is_delta != (parent_ms is not None) or not (is_delta or file.endswith(BASE_SUFFIX)):
+        return None
+    if (parent_ms is not None and parent_ms >= stamp_ms) or max(number) > NUMBER_MAX or size > SIZE_MAX:
+        return None
+    return _Object(name, folder, file, stamp_ms, parent_ms, number, size)
+
+
+def _follows(delta: _Object, copy: Copy) -> bool:
+    """Whether a delta may follow a copy, as their names say."""
+    is_later = delta.number[1:] > (copy.generation, copy.sequence)
+    return is_later and delta.number[0] == copy.epoch and len(copy.before) < DELTAS_MAX
+
+
+def _spare(copies: list[Copy], found: list[_Object]) -> list[_Object]:
+    """What may go where there is no room, the last one first: what is no copy, then copies from the oldest one on."""
+    newest = {name for copy in copies[:1] for name in (copy.name, *copy.before)}
+    whole = {copy.name for copy in copies}
+    spare = [one for one in found if one.name not in newest]
+    return sorted(spare, key=lambda one: (one.name in whole, one.stamp_ms), reverse=True)
+
+
+def _file_of(name: str) -> str:
+    """The file of a store that an object of a checkpoint holds."""
+    return name.rpartition("/")[2].removesuffix(SUFFIX).partition("-")[2].partition(PARENT)[0]
+
+
+def _stem(file: str) -> str:
+    """A file's name without the word that says whether it stands alone."""
+    return file.removesuffix(BASE_SUFFIX).removesuffix(DELTA_SUFFIX)
 
 
 def _stamp(word: str) -> int | None:

@@ -6,8 +6,8 @@ the archive key it opens each copy, also when the robots and their keys are no m
 
 Each object has a content key of its own, random. Its head has that key once for each reader, sealed by what only the two ends of
 a Diffie-Hellman exchange know: a fresh pair of the object, and the reader's pair. A member's pair is that of its replication
-link. So a member that was taken out reads nothing that is sealed later, and a stolen archive key alone reads nothing. The byte
-table is in ``ARCHIVE.md``.
+link. So a member that was taken out reads nothing that is sealed later, and a stolen archive key alone reads nothing: that holds
+while each member of the team has a key. The byte table is in ``ARCHIVE.md``.
 
 Sources: RFC 7748 (X25519), RFC 5869 (HKDF), RFC 8439 (ChaCha20-Poly1305). The exchange is that of RFC 9180 (HPKE, base mode) in
 shape, with several readers of one content key.
@@ -27,8 +27,8 @@ from blake3 import blake3
 from msgspec import Struct
 
 from checkpoint.store.whole_file import write_new
-from failover.config.team import Team, read_secret_key
-from failover.errors import ArchiveError
+from failover.config.team import Z85, Team, read_secret_key
+from failover.errors import ArchiveError, TeamFileError
 
 KEY_SIZE: Final = 32
 KEY_FILE: Final = "archive.key"
@@ -45,9 +45,8 @@ _WITHOUT_KEYS: Final = "failover-archive-2 members without keys"
 
 _IDS: Final = "failover-archive-2 readers"
 _WRAP: Final = b"failover-archive-2 wrap\0"
-_Z85: Final = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
 _B85: Final = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%&()*+-;<=>?@^_`{|}~"
-_FROM_Z85: Final = str.maketrans(_Z85, _B85)
+_FROM_Z85, _TO_Z85 = str.maketrans(Z85, _B85), str.maketrans(_B85, Z85)
 
 
 class Keys(Struct, frozen=True):
@@ -87,7 +86,7 @@ def new_key(team: Path) -> Path:
     for there in (path, recovery):
         if there.exists():
             raise ArchiveError(
-                f"{there} exists, and opens what was sealed with it: move it to where no robot is if you want another"
+                f"{there} exists, and what was sealed with it needs it: move it to where no robot is if you want another"
             )
     secret = secrets.token_bytes(KEY_SIZE)
     shared = secrets.token_bytes(KEY_SIZE)
@@ -113,12 +112,40 @@ def read_keys(directory: Path, team: Team) -> Keys:
         TeamFileError: the same of a secret key of a member.
     """
     shared, recovery = _read_lines(key_path(directory), 2, "archive key")
-    at_hand = [_from_z85(read_secret_key(directory, path.stem)) for path in sorted((directory / "keys").glob("*.secret"))]
+    at_hand = _secrets_of_members(directory)
     with contextlib.suppress(FileNotFoundError):
         recovery_path(directory).lstat()
-        at_hand += _read_lines(recovery_path(directory), 1, "recovery key", "bring it again, or remove it")
+        (secret,) = _read_lines(recovery_path(directory), 1, "recovery key", "bring it again, or remove it")
+        if _public_of(secret) != recovery:
+            raise ArchiveError(
+                f"{recovery_path(directory)} was made with another archive key than {key_path(directory)}: bring the two that "
+                "failover archive key made together"
+            )
+        at_hand.append(secret)
     readers = sorted({recovery, *_members(team, shared)})
     return Keys(shared, tuple(readers), (*at_hand, _secret_without_keys(shared)))
+
+
+def check_own(keys: Keys) -> None:
+    """See that who seals here could open it. Raises ArchiveError: none of the secret keys here is a reader's."""
+    if ids_of(map(_public_of, keys.secrets)).isdisjoint(ids_of(keys.readers)):
+        raise ArchiveError(
+            "no secret key in keys of the team directory belongs to a robot or server of team.toml: nothing is sealed that could "
+            "not be opened here; failover-agent check says which key is meant"
+        )
+
+
+def _secrets_of_members(directory: Path) -> list[bytes]:
+    """Those that can be used. Raises TeamFileError: there are some, and none can."""
+    found, troubles = list[bytes](), list[TeamFileError]()
+    for path in sorted((directory / "keys").glob("*.secret")):
+        try:
+            found.append(_from_z85(read_secret_key(directory, path.stem)))
+        except TeamFileError as error:
+            troubles.append(error)
+    if troubles and not found:
+        raise troubles[0]
+    return found
 
 
 def keys_without_members(shared: bytes) -> Keys:
@@ -136,7 +163,12 @@ def _members(team: Team, shared: bytes) -> Iterable[bytes]:
 
 def ids_of(readers: Iterable[bytes]) -> frozenset[bytes]:
     """By what an object's head tells its readers apart."""
-    return frozenset(blake3(reader, derive_key_context=_IDS).digest(ID_SIZE) for reader in readers)
+    return frozenset(map(reader_id, readers))
+
+
+def reader_id(reader: bytes) -> bytes:
+    """Of one public key."""
+    return blake3(reader, derive_key_context=_IDS).digest(ID_SIZE)
 
 
 def wrapped(content_key: bytes, readers: Iterable[bytes], name: str) -> bytes:
@@ -150,9 +182,8 @@ def wrapped(content_key: bytes, readers: Iterable[bytes], name: str) -> bytes:
     fresh = pair.public_key().public_bytes_raw()
     parts = []
     for reader in readers:
-        (sign,) = ids_of((reader,))
         sealing = _key_between(pair, reader, fresh, reader, name)
-        parts.append(sign + cipher(sealing).encrypt(bytes(12), content_key, None))
+        parts.append(reader_id(reader) + cipher(sealing).encrypt(bytes(12), content_key, None))
     assert len(parts) <= READERS_MAX, "a team is smaller"
     return b"".join((fresh, len(parts).to_bytes(COUNT_SIZE, "little"), *parts))
 
@@ -173,17 +204,17 @@ def unwrapped(wraps: bytes, at_hand: Iterable[bytes], name: str) -> bytes:
     for secret in at_hand:
         pair = x25519.X25519PrivateKey.from_private_bytes(secret)
         public = pair.public_key().public_bytes_raw()
-        (sign,) = ids_of((public,))
-        if sign not in sealed_keys:
+        if (own := reader_id(public)) not in sealed_keys:
             continue
         try:
             opening = _key_between(pair, fresh, fresh, public, name)
-            return bytes(cipher(opening).decrypt(bytes(12), sealed_keys[sign], None))
+            return bytes(cipher(opening).decrypt(bytes(12), sealed_keys[own], None))
         except (InvalidTag, ArchiveError) as error:
             raise ArchiveError(f"{name} in the archive was altered, or put under another name: its head is refused") from error
     raise ArchiveError(
-        f"{name} in the archive was sealed with other keys than those that are here: bring {RECOVERY_FILE}, which failover "
-        "archive key made, to keys of the team directory, or ask a robot that was in the team when it was sealed"
+        f"{name} in the archive was sealed with other keys than those that are here: for a new member the robot that runs it "
+        f"seals it anew, within some s3_every_s; where no robot is left, bring {RECOVERY_FILE}, which failover archive key made, "
+        "to keys of the team directory"
     )
 
 
@@ -207,7 +238,8 @@ def _key_between(pair: Any, other: bytes, fresh: bytes, reader: bytes, name: str
     try:
         agreed = pair.exchange(x25519.X25519PublicKey.from_public_bytes(other))
     except ValueError as error:
-        raise ArchiveError(f"{other.hex()} is no public key of X25519: see the keys of team.toml") from error
+        text = base64.b85encode(other).decode().translate(_TO_Z85)
+        raise ArchiveError(f"{text} is no public key of X25519: see the keys of team.toml") from error
     derived: bytes = HKDF(SHA256(), KEY_SIZE, fresh + reader, _WRAP + name.encode()).derive(agreed)
     return derived
 
@@ -243,7 +275,9 @@ def _read_lines(path: Path, count: int, what: str, cure: str = CURE) -> list[byt
     except ValueError:
         lines = []
     if [len(line) for line in lines] != [KEY_SIZE] * count:
-        raise ArchiveError(f"{path} is no {what}: it is not {count} times {2 * KEY_SIZE} hexadecimal digits; {cure}")
+        raise ArchiveError(
+            f"{path} is no {what}: it is not {count} times {2 * KEY_SIZE} hexadecimal digits; move it away; {cure}"
+        )
     return lines
 
 

@@ -35,11 +35,12 @@ class PutRefusedError(ArchiveError):
 
     Attributes:
         why: `FULL`: it would if older copies of this component were gone; `OLDER`: a newer copy of it came meanwhile.
+        lacks: how many bytes have to go, where it is full.
     """
 
-    def __init__(self, why: str, message: str) -> None:
+    def __init__(self, why: str, message: str, lacks: int = 0) -> None:
         super().__init__(message)
-        self.why = why
+        self.why, self.lacks = why, lacks
 
 
 class Stored(Struct, frozen=True):

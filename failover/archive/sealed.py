@@ -97,14 +97,20 @@ def last_frame(head: bytes, size: int) -> int:
 
 def read_head(name: str, source: Readable) -> bytes:
     """An object's bytes before its frames. Raises ArchiveError: there is no head."""
-    head = exactly(source, HEAD_SIZE_LEAST)
-    count = int.from_bytes(head[-COUNT_SIZE:], "little")
-    if head[:MAGIC_SIZE] not in (AES, CHACHA) or len(head) < HEAD_SIZE_LEAST or not 0 < count <= READERS_MAX:
-        raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
-    wraps = exactly(source, count * WRAP_SIZE)
-    if len(wraps) < count * WRAP_SIZE:
+    first = exactly(source, HEAD_SIZE_LEAST)
+    size = head_size(name, first)
+    head = first + exactly(source, size - len(first))
+    if len(head) < size:
         raise ArchiveError(f"{name} in the archive was cut off in its head")
-    return head + wraps
+    return head
+
+
+def head_size(name: str, first: bytes) -> int:
+    """How long a head is, by its first `HEAD_SIZE_LEAST` bytes. Raises ArchiveError: they begin none."""
+    count = int.from_bytes(first[-COUNT_SIZE:], "little")
+    if first[:MAGIC_SIZE] not in (AES, CHACHA) or len(first) < HEAD_SIZE_LEAST or not 0 < count <= READERS_MAX:
+        raise ArchiveError(f"{name} in the archive is no sealed object of this version of failover")
+    return HEAD_SIZE_LEAST + count * WRAP_SIZE
 
 
 def readers_in(head: bytes) -> frozenset[bytes]:

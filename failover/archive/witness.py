@@ -21,7 +21,7 @@ from failover.errors import ArchiveError
 READ_MAX: Final = 192 << 10
 """Bytes of one answer: it travels as one message."""
 
-HEAD: Final = 1 << 10
+HEAD: Final = 8 << 10
 """Bytes that are asked for first: who looks at an object's head needs no more."""
 
 LISTED_MAX: Final = 500
@@ -80,7 +80,7 @@ class Answer(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
     """What a witness answers.
 
     Attributes:
-        size: of the object; None: there is none.
+        size: of the object; None: there is none. Where there is no room for a `Put`: how many bytes are too much.
         content: at most `READ_MAX` bytes; b"" at the object's end.
         found: of a `Put`; ``why``: the sentence, where it is not taken.
         objects: (name, size, seconds since 1970), in the order of names, at most `LISTED_MAX`; ``more``: there are more.
@@ -123,7 +123,7 @@ class WitnessObjects:
         request = Put(name, size, digest, signature.sign(self._key, signature.PUT, name, size, digest))
         answer = self._ask(request)
         if answer.found in (FULL, OLDER):
-            raise PutRefusedError(answer.found, answer.why)
+            raise PutRefusedError(answer.found, answer.why, answer.size or 0)
         if answer.found != WANTED:
             return False
         try:

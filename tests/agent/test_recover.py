@@ -66,6 +66,7 @@ def test_the_newest_copy_is_in_the_store_and_on_record(config: Path, place: Path
     said = capsys.readouterr().out
     assert said.startswith(f"robot1 holds {COMPONENT} as robot9 archived it, epoch 1; start the agent")
     assert "needs /usr/bin/mapper, which is neither here nor whole in the archive" in said
+    assert f"{keys.recovery_path(config.parent / 'team')} opens every copy: move it to where no robot is again" in said
     *others, record = records(config)
     assert tuple(others) == before
     assert record == Record(COMPONENT, 1, state=State.STANDBY, spec=SPEC, begun=True)
@@ -99,7 +100,7 @@ def test_a_checkpoint_from_the_archive_is_as_old_as_its_state(
         ("nothing named", "recover needs a component"),
         ("not there", "has no checkpoint of mapper"),
         ("altered", "was altered, cut off or sealed with another archive key"),
-        ("another key", "was sealed with other keys than those that are here: bring archive.recovery"),
+        ("another key", "was sealed with other keys than those that are here: for a new member"),
         ("no key", "failover archive key makes one"),
         ("no place", "mount the disk"),
         ("store in use", "another process has it open"),

@@ -94,11 +94,10 @@ class TwoSites(TeamStage):
         self._give_keys()
 
     def _give_keys(self) -> None:
-        """Of the archive: all to each robot, and its public half to the witness."""
+        """The archive key to each robot, which opens copies by its own key, and its public half to the witness."""
         first = self.directory / "robot1" / "team"
-        own = keys.new_key(first)
-        for path in own.parent.glob("archive.*"):
-            shutil.copy2(path, self.directory / "robot3" / "team" / "keys")
+        shutil.copy2(keys.new_key(first), self.directory / "robot3" / "team" / "keys")
+        keys.recovery_path(first).unlink()
         signature.write_public(self.directory / "gate" / "team", keys.read_key(first))
 
 

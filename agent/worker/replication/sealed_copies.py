@@ -225,7 +225,7 @@ class SealedCopies:
         if (lacks := self._lacks(put.size)) > 0:
             older = sorted(name for name in self._kept if name.startswith(_folder(put.name) or "\0"))[:-1]
             if lacks <= sum(self._kept[name].size for name in older):
-                return Answer(found=FULL, why=self._no_room(put))
+                return Answer(found=FULL, why=self._no_room(put), size=lacks)
             raise RefusedError(self._no_room(put))
         awaited = self._awaited.setdefault(peer, {})
         while len(awaited) >= AWAITED_MAX:

@@ -42,10 +42,11 @@ def key(arguments: argparse.Namespace) -> int:
     signature.write_public(team, keys.read_key(team))
     public = signature.public_path(team)
     if arguments.json:
-        render.as_json({"file": str(path), "recovery": str(recovery), "public": str(public)})
+        render.as_json({"file": str(path), "recovery": str(recovery) if recovery.exists() else "", "public": str(public)})
     else:
         print(f"{path} is the archive key: carry it to the same place at every robot and server, and keep a copy elsewhere")
-        print(f"{recovery} opens each copy when no robot's own key is left: move it, with that copy, to where no robot is")
+        if recovery.exists():
+            print(f"{recovery} opens each copy when no robot's own key is left: move it, with that copy, to where no robot is")
         print(f"{public} opens nothing: carry it to the same place at a witness that is to keep sealed copies")
     return 0
 
@@ -128,7 +129,8 @@ def _archive(arguments: argparse.Namespace) -> tuple[str, Archive]:
         raise ArchiveError(f"no archive is named: {CONFIG} has no s3 in [store]; name it by --place s3://BUCKET/PREFIX")
     directory = Path(arguments.directory)
     team = team_directory.read(directory)
-    return place, Archive(object_store(place, endpoint or ""), keys.read_keys(directory, team), team.team, Path("."))
+    aside = Path(getattr(arguments, "output", "")).parent
+    return place, Archive(object_store(place, endpoint or ""), keys.read_keys(directory, team), team.team, aside)
 
 
 def _meant(archive: Archive, place: str, arguments: argparse.Namespace) -> Copy:

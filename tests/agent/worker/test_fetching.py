@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import os
+import random
 import signal
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import msgspec
@@ -22,13 +23,13 @@ from checkpoint.snapshot import format
 from checkpoint.store.chain import position_of
 from checkpoint.store.store import open_store
 from failover.archive import keys
-from failover.archive.archive import Archive
+from failover.archive.archive import Archive, Last
 from failover.archive.objects import FolderObjects
 from failover.config import team
 from failover.config.team import Robot, Team
 from failover.core.events import Damaged, Event, Fetched, Looked
 from failover.core.types import ComponentSpec, ComponentView, Protection, State, StatusView
-from tests.checkpoint.snapshots import COMPONENT, history
+from tests.checkpoint.snapshots import COMPONENT, PAGE, history, snapshot
 
 pytest.importorskip("cryptography")
 
@@ -62,10 +63,10 @@ class Member:
     def kept(self, arrived: Arrived) -> None:
         raise AssertionError("no core accepts it here")
 
-    def put(self, snapshot: Snapshot) -> str:
-        """Another robot puts a copy; the object's name."""
+    def put(self, snapshot: Snapshot, last: dict[str, Last] | None = None) -> str:
+        """Another robot puts a copy; the object's name. ``last``: what it remembers, so that a delta may follow."""
         known = keys.read_keys(self.directory / "team", team.read(self.directory / "team"))
-        archive = Archive(FolderObjects(self.directory / "place"), known, "lab", self.directory, by_epoch=True)
+        archive = Archive(FolderObjects(self.directory / "place"), known, "lab", self.directory, by_epoch=True, last=last)
         descriptor = memfd_holding(format.encode_bytes(snapshot), "snapshot")
         with os.fdopen(descriptor, "rb") as file:
             return archive.put(file, "robot2", msgspec.msgpack.encode(SPEC))[0]
@@ -156,6 +157,46 @@ def test_a_success_of_one_component_does_not_have_the_harmed_copy_of_another_tri
         assert member.fetching._refused == refused
 
     run(tmp_path, work)
+
+
+def test_where_the_chain_of_the_newest_copy_is_harmed_the_copies_of_which_most_are_whole_are_tried(tmp_path: Path) -> None:
+    some = random.Random(1)
+    state = {number: some.randbytes(PAGE) for number in range(100)}
+    made = []
+    for sequence in range(1, 9):
+        state[sequence] = some.randbytes(PAGE)
+        made.append(snapshot(state, sequence=sequence))
+
+    async def work(member: Member) -> None:
+        last: dict[str, Last] = {}
+        names = [member.put(one, last) for one in made[:2]]
+        last.clear()
+        names += [member.put(one, last) for one in made[2:]]
+        assert [".delta~" in name for name in names] == [False, True, False, True, True, True, True, True]
+        place = member.directory / "place"
+        whole = (place / names[3]).read_bytes()
+        (place / names[3]).write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        taking = asyncio.create_task(member.fetching.run())
+        await member.until(lambda: member.fetched() == [3])
+        assert sum(isinstance(event, Looked) for event in member.events) == 1, "in the first round"
+        assert names[7] in " ".join(member.fetching.complaints()) or names[3] in " ".join(member.fetching.complaints())
+        taking.cancel()
+        await asyncio.gather(taking, return_exceptions=True)
+
+    with_no_round(tmp_path, work)
+
+
+def with_no_round(tmp_path: Path, work: Callable[[Member], Awaitable[None]]) -> None:
+    """Do some work before anything is fetched."""
+
+    async def both() -> None:
+        member = Member(tmp_path)
+        try:
+            await work(member)
+        finally:
+            member.store.close()
+
+    asyncio.run(both())
 
 
 def test_a_component_whose_name_is_too_long_for_an_object_is_told_of_by_its_whole_name(tmp_path: Path) -> None:

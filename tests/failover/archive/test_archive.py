@@ -400,3 +400,87 @@ def test_files_that_a_program_needs_are_kept_once_under_names_that_tell_nothing(
     with pytest.raises(ArchiveError, match="changed meanwhile"), file_of(b"changed") as file:
         archive(place).put_content(digest, file)
     assert archive(place).copies() == []
+
+
+class Breaking(FolderObjects):
+    """A place whose connection breaks: each read of an object fails while ``is_broken``."""
+
+    is_broken = False
+
+    def open(self, name: str, first: int = 0) -> BinaryIO:
+        if self.is_broken:
+            raise ArchiveError("the archive's place does not answer: connection reset")
+        return super().open(name, first)
+
+    def put(self, name: str, content: BinaryIO) -> bool:
+        is_new = super().put(name, content)
+        self.is_broken = True
+        return is_new
+
+
+def test_a_place_that_does_not_answer_for_a_moment_is_no_fault_of_an_object(place: Path) -> None:
+    objects = Breaking(place)
+    there = Archive(objects, keys_without_members(KEY), "lab", place.parent)
+    content = b"a file"
+    digest = blake3(content).digest()
+    with pytest.raises(ArchiveError, match="connection reset"), file_of(content) as file:
+        there.put_content(digest, file)
+    assert archive(place).holds_whole(digest), "it arrived"
+    for act in (there.holds_whole, there.holds_for_all):
+        with pytest.raises(ArchiveError, match="connection reset"):
+            act(digest)
+    with pytest.raises(ArchiveError, match="connection reset"), file_of(content) as file:
+        there.put_content(digest, file)
+    assert archive(place).holds_whole(digest)
+    with pytest.raises(ArchiveError, match="connection reset"):
+        put(there, history(1)[0])
+    assert len(archive(place).copies()) == 1 and fetched(archive(place)).position == history(1)[0].position
+
+
+def test_a_file_that_is_sealed_for_other_readers_stays_until_its_successor_is_ready(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = os.urandom(10_000)
+    digest = blake3(content).digest()
+    with file_of(content) as file:
+        archive(place).put_content(digest, file)
+    wanted = replace(keys_without_members(KEY), readers=(*keys_without_members(KEY).readers, bytes(range(1, 33))))
+    joined = Archive(FolderObjects(place), wanted, "lab", place.parent)
+    assert joined.holds_whole(digest) and not joined.holds_for_all(digest)
+    with monkeypatch.context() as patch, file_of(content) as file:
+        patch.setattr("failover.archive.objects.RESERVE_SIZE", 1 << 60)
+        with pytest.raises(ArchiveError, match="MB free"):
+            joined.put_content(digest, file)
+    with file_of(b"another content") as file, pytest.raises(ArchiveError, match="was changed meanwhile"):
+        joined.put_content(digest, file)
+    assert archive(place).holds_whole(digest)
+    with file_of(content) as file:
+        joined.put_content(digest, file)
+    assert joined.holds_for_all(digest) and archive(place).holds_whole(digest)
+
+
+def test_a_file_that_another_member_has_sealed_anew_meanwhile_is_not_replaced(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = os.urandom(10_000)
+    digest = blake3(content).digest()
+    with file_of(content) as file:
+        archive(place).put_content(digest, file)
+    wanted = replace(keys_without_members(KEY), readers=(*keys_without_members(KEY).readers, bytes(range(1, 33))))
+    first, second = (Archive(FolderObjects(place), wanted, "lab", place.parent) for _ in range(2))
+    real = sealed.seal
+
+    def seal_after_the_other(*arguments: Any) -> int:
+        monkeypatch.setattr(sealed, "seal", real)
+        with file_of(content) as file:
+            second.put_content(digest, file)
+        (found,) = place.rglob("contents/*.sealed")
+        made.append(found.read_bytes())
+        return real(*arguments)
+
+    made: list[bytes] = []
+    monkeypatch.setattr(sealed, "seal", seal_after_the_other)
+    with file_of(content) as file:
+        first.put_content(digest, file)
+    (found,) = place.rglob("contents/*.sealed")
+    assert [found.read_bytes()] == made

@@ -49,10 +49,16 @@ def test_the_public_half_is_written_beside_a_key_that_has_none(team: Path, capsy
     public.unlink()
     assert main.main(["archive", "key", "--directory", str(team)]) == 0
     assert signature.read_public(team) == expected and keys.key_path(team).read_bytes() == key
-    assert f"{public} opens nothing: carry it" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{public} opens nothing: carry it" in said and f"{keys.recovery_path(team)} opens each copy when" in said
+    aside = keys.recovery_path(team).rename(team / "aside")
+    public.unlink()
+    assert main.main(["archive", "key", "--directory", str(team)]) == 0
+    assert "archive.recovery" not in capsys.readouterr().out
+    aside.rename(keys.recovery_path(team))
     keys.key_path(team).unlink()
     assert main.main(["archive", "key", "--directory", str(team)]) == main.FAILED
-    assert f"{keys.recovery_path(team)} exists, and opens what was sealed with it" in capsys.readouterr().err
+    assert f"{keys.recovery_path(team)} exists, and what was sealed with it needs it" in capsys.readouterr().err
     keys.recovery_path(team).unlink()
     assert main.main(["archive", "key", "--directory", str(team)]) == main.FAILED
     assert "belongs to another archive key: remove it" in capsys.readouterr().err

@@ -18,7 +18,7 @@ from checkpoint.snapshot import format
 from checkpoint.store.index import folder_name
 from failover.archive import sealed, signature
 from failover.archive.archive import Archive
-from failover.archive.keys import keys_without_members
+from failover.archive.keys import WRAP_SIZE, keys_without_members
 from failover.archive.objects import OLDER, FolderObjects, PutRefusedError
 from failover.archive.witness import WANTED, Listed, Put, Read, Size, WitnessObjects
 from failover.errors import ArchiveError
@@ -352,8 +352,9 @@ def test_who_reads_the_head_of_an_object_is_sent_little(gate: Gate, content: Bin
         return answer
 
     gate.ask = ask  # type: ignore[method-assign]
-    assert sealed.exactly(objects.open(FIRST), HEAD) == os.pread(content.fileno(), HEAD, 0)
-    assert sum(sent) <= 1 << 10
+    size = HEAD + 64 * WRAP_SIZE
+    assert sealed.exactly(objects.open(FIRST), size) == os.pread(content.fileno(), size, 0)
+    assert len(sent) == 1 and sent[0] < 10_000, "the head of an object for 64 members, in one answer"
 
 
 def test_a_name_with_a_line_break_forges_no_line_of_the_log(gate: Gate, caplog: pytest.LogCaptureFixture) -> None:
