@@ -124,7 +124,7 @@ def test_nothing_of_a_program_is_readable_on_the_disk_or_in_the_memory_of_a_witn
             found = [is_in_memory(pid) for pid in gate.processes()]
             assert not any(is_found for is_found, _ in found) and sum(size for _, size in found) > 10 << 20
         print(f"searched {sum(size for _, size in found) >> 20} MB of memory of {len(found)} processes, after {len(seen)} copies")
-        until(lambda: len(copies(gate)) <= 2, "older copies to go")
+        until(lambda: min(seen) not in {path.name for path in copies(gate)}, "older copies to go")
         component = robots.component(first, "count")
         assert component["standby"] == "robot2" and component["protection"] == "protected"
         assert sealed_of(first)["at"] == "gate" and sealed_of(first)["copies"] is None
@@ -142,9 +142,9 @@ def test_nothing_of_a_program_is_readable_on_the_disk_or_in_the_memory_of_a_witn
 def test_a_team_that_lost_every_disk_goes_on_from_the_witness_which_is_refused_where_it_alters_one(tmp_path: Path) -> None:
     with team(tmp_path) as stage:
         first, second, gate = (stage.members[name] for name in ROLES)
-        until(lambda: sealed_of(gate).get("copies") == 2, "two copies")
+        until(lambda: sealed_of(gate).get("copies", 0) >= 2, "two copies")
         number, newest = counted(first)[-1], copies(gate)[-1].name
-        until(lambda: copies(gate)[0].name > newest, "later copies alone")
+        until(lambda: copies(gate)[-1].name > newest, "a later copy")
         stage.cut_power("robot1", "robot2")
         for robot in (first, second):
             until(lambda robot=robot: is_gone(robot), "everything of it to have ended")  # type: ignore[misc]
