@@ -8,7 +8,7 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.election.coordinator import Said
 from failover.core.events import Looked
-from failover.core.types import MS, Resumption
+from failover.core.types import MS, Resumption, State
 from failover.core.wire.messages import FREE
 from tests.simulation.deeds import epoch_of
 from tests.simulation.invariants import Invariants, broken
@@ -35,6 +35,7 @@ class Freshness:
     Attributes:
         chances: by robot and component; looked: when the last list that a robot got was asked for, by its clock.
         former: copies of a component's program before it was begun anew.
+        claims: takeovers that a robot has claimed, and whether it then had to have what the archive had.
         compared: takeovers for which there was a copy in the archive, and it had to be that one or a later one.
     """
 
@@ -42,10 +43,13 @@ class Freshness:
     chances: dict[tuple[str, str], Chance] = field(default_factory=dict)
     looked: dict[str, int] = field(default_factory=dict)
     former: dict[str, set[Position]] = field(default_factory=dict)
+    claims: dict[tuple[str, str], bool] = field(default_factory=dict)
     compared: int = 0
 
     def __call__(self, world: World, robot: str, what: object) -> None:
         """Look at one thing that happened."""
+        if robot in world.robots:
+            self._note_claims(world, robot)
         match what:
             case Said():
                 self._said(world, robot, what)
@@ -67,6 +71,17 @@ class Freshness:
                 newest = max(valid, default=None)
                 self.chances[robot, component] = Chance(world.now_ns, world.local(world.robots[robot]), newest)
 
+    def _note_claims(self, world: World, robot: str) -> None:
+        """What was known when a robot claimed is what counts: a list that comes afterwards changes nothing."""
+        node = world.robots[robot].node
+        claimed = {name for name, one in node._components.items() if one.state is State.CLAIMING} if node is not None else set()
+        for component in claimed - {name for of, name in self.claims if of == robot}:
+            chance = self.chances.get((robot, component))
+            self.claims[robot, component] = chance is not None and not self._is_excused(world, robot, chance)
+        for of, name in [one for one in self.claims if one[0] == robot and one[1] not in claimed]:
+            if node is None or node._components[name].state is not State.TAKING_OVER:
+                del self.claims[of, name]
+
     def _may_resume(self, world: World, robot: str, component: str, position: Position) -> bool:
         """Whether it is neither of a life of the component that has ended, nor of a line that lost."""
         record = next((one for one in vote_record_of(world.robots[robot]).records if one.name == component), None)
@@ -76,7 +91,7 @@ class Freshness:
     def _resumes(self, world: World, robot: str, act: acts.Restore) -> None:
         chance = self.chances.get((robot, act.component))
         is_lost = (act.component, act.epoch) in self.invariants.ordered
-        if chance is None or chance.newest is None or is_lost or self._is_excused(world, robot, chance):
+        if chance is None or chance.newest is None or is_lost or not self.claims.get((robot, act.component), False):
             return
         self.compared += 1
         if act.position < chance.newest and self._may_resume(world, robot, act.component, chance.newest):

@@ -7,9 +7,9 @@ counts. Invariants:
   bound to that one.
 * A checkpoint from there never takes the place of a later one.
 * A checkpoint that the store found damaged is held no more: this robot looks into the archive again before it takes over.
-* Once etcd would vote for another robot, this robot looks into the archive again before it claims the component. What was put
-  there before is in its store then, and it claims without the wait for the old primary (``fresh``). Where the archive does not
-  answer, that wait (``patience_ms``) is the limit.
+* Once etcd would vote for another robot, or the old primary lives and lets go (it may have lost its disk), this robot looks into
+  the archive again before it claims the component. What was put there before is in its store then, and it claims without the
+  wait for the old primary (``fresh``). Where the archive does not answer, that wait (``patience_ms``) is the limit.
 * A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
 * Where the archive alone tells of a component, and no member of the team, it may have ended, or have been released and run on:
   no robot claims it by itself.
@@ -116,7 +116,8 @@ def review(component: Component, turn: Turn) -> None:
     """Note since when a takeover is possible, and have the archive looked into since then."""
     if component.state is State.CLAIMING:
         return
-    if component.state not in _IDLE or not component.free or not _would_coordinator(component, turn):
+    is_let_go = _would_coordinator(component, turn) or (turn.alive(component.primary) and not turn.gone(component.primary))
+    if component.state not in _IDLE or not component.free or not is_let_go:
         component.freed_ns, component.fresh = 0, False
         return
     component.freed_ns = component.freed_ns or turn.now_ns

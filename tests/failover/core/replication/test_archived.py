@@ -345,3 +345,26 @@ def test_a_look_that_skipped_the_component_is_none() -> None:
     robot.step(Looked(robot.now_ns))
     robot.live(100)
     assert robot.claims()
+
+
+def test_where_the_old_primary_lives_and_has_lost_its_disk_the_archive_is_looked_into_before_a_claim() -> None:
+    """The two of them are a majority; etcd is bound to the old primary still."""
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.live(1_000)
+    robot.acts.clear()
+
+    def heard(ms: int) -> None:
+        for _ in range(ms // 20):
+            robot.live(20)
+            counter = robot.node.word().counter
+            nothing = Entry(NAME, STATES.index(State.STANDBY), 1, "robot1", flags=FREE | OPEN)
+            beat = Beat("robot1", 2, robot.counter, 1, total=1, echoes=(Echo("robot2", 1, counter),), entries=(nothing,))
+            robot.step(Received(msgspec.structs.replace(beat, rule=RULES.index(Rule.ETCD)), "cable"))
+
+    heard(1_000)
+    assert robot.looks() and not robot.claims()
+    robot.fetched(1, 9)
+    robot.step(Looked(robot.now_ns, ()))
+    heard(1_000)
+    assert robot.claims() and robot.held[0] == position(1, 9)
