@@ -39,7 +39,7 @@ from checkpoint.store.index import folder_name
 from failover.archive.archive import Copy, Label
 from failover.core.acts import Accept
 from failover.core.events import Damaged, Event, Fetched, Looked, Noticed
-from failover.core.types import ENDED, ComponentSpec, ComponentView, State, StatusView
+from failover.core.types import ENDED, ComponentSpec, State, StatusView
 
 ANSWER_S: Final = 30.0
 """For a list, and for a copy besides its bytes; the start of the process on a busy machine is in it."""
@@ -55,6 +55,11 @@ _IDLE: Final = (State.ABSENT, State.STANDBY)
 log = logging.getLogger("failover.archive")
 
 Line = tuple[int, int]
+
+
+DAMAGED: Final = (
+    "{}: checkpoint {} is damaged on this robot's disk; it, or a later one, comes from the archive; see that the disk is sound"
+)
 
 
 class Arrived(Struct, frozen=True):
@@ -97,7 +102,7 @@ class Fetching:
         self._refused: dict[str, int] = {}
         self._troubles: dict[str, str] = {}
         self._lost: dict[str, str] = {}
-        self._damaged: dict[str, str] = {}
+        self._damaged: dict[str, Position] = {}
         self._silent = ""
         self._answered_s = time.monotonic()
         self._arrived: dict[tuple[str, Position], Arrived] = {}
@@ -140,7 +145,8 @@ class Fetching:
         if self._silent:
             since_s = time.monotonic() - self._answered_s
             return [f"the archive has not answered for {since_s:.0f} s: no checkpoints come from there: {self._silent}"]
-        return [*self._damaged.values(), *self._lost.values(), *self._troubles.values()]
+        damaged = [DAMAGED.format(name, position.sequence) for name, position in self._damaged.items()]
+        return [*damaged, *self._lost.values(), *self._troubles.values()]
 
     async def _round(self, number: int) -> None:
         looked_for, self._looked_for = self._looked_for, set()
@@ -153,6 +159,8 @@ class Fetching:
                 self._tell(Noticed("", f"the archive does not answer: {error}"))
             self._silent = str(error)
             self._looked_for |= looked_for
+            with contextlib.suppress(*TROUBLE):
+                self._look_for_damage((await self._told()).status)
             return
         if self._silent:
             self._tell(Noticed("", "the archive answers again"))
@@ -161,8 +169,7 @@ class Fetching:
         if view is None:
             return
         names = self._names(view)
-        for one in view.components:
-            self._look_for_damage(one, view)
+        self._look_for_damage(view)
         wanted: dict[str, list[Copy]] = {}
         skipped = []
         for folder, group in itertools.groupby(copies, key=lambda copy: copy.folder):
@@ -208,16 +215,17 @@ class Fetching:
         else:
             self._lost.pop(name, None)
 
-    def _look_for_damage(self, component: ComponentView, view: StatusView) -> None:
+    def _look_for_damage(self, view: StatusView | None) -> None:
         """What the core counts as held here, and the store has found damaged, is not held: it may come again."""
-        name, there = component.name, self._store.positions(component.name)
-        newest = component.positions[0] if component.positions else None
-        if newest is None or newest in there or not _takes(name, view):
-            return
-        self._damaged[name] = (
-            f"{name}: checkpoint {newest.sequence} is damaged on this robot's disk; it, or a later one, comes from the archive"
-        )
-        self._tell(Damaged(name, component.epoch, newest))
+        shown = {one.name: one for one in view.components} if view is not None else {}
+        for name, one in shown.items():
+            newest = one.positions[0] if one.positions else None
+            is_awaited = view is not None and _takes(name, view)
+            if name in self._damaged and (not is_awaited or (newest is not None and newest >= self._damaged[name])):
+                del self._damaged[name]
+            if is_awaited and newest is not None and newest not in self._store.positions(name):
+                self._damaged[name] = newest
+                self._tell(Damaged(name, one.epoch, newest))
 
     def _newer(self, name: str, found: list[Copy], view: StatusView) -> list[Copy]:
         """The copies that are newer than what the core counts as held here, and the store has; the newest first."""

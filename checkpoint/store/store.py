@@ -284,9 +284,15 @@ class Store:
         """
         for entry in self.chain_of(component, position):
             try:
-                format.verify(entry.path)
+                descriptor = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC)
+            except OSError:
+                continue  # folded or forgotten meanwhile, or no descriptor is left: that says nothing of the file
+            try:
+                format.verify(descriptor)
             except FormatError as error:
-                self._set_out_of_use(component, entry, str(error))
+                self._set_out_of_use(component, entry, f"snapshot {entry.path}: {error}")
+            finally:
+                os.close(descriptor)
 
     # Forgetting
 

@@ -33,6 +33,7 @@ from failover.archive import sealed
 from failover.archive.keys import Keys, check_own, ids_of
 from failover.archive.objects import FULL, FolderObjects, ObjectStore, PutRefusedError, require_room
 from failover.config.store import S3
+from failover.core.types import SPAN
 from failover.errors import ArchiveError
 
 SUFFIX: Final = ".sealed"
@@ -128,9 +129,9 @@ class Copy(Struct, frozen=True):
         return (*self.before, self.name)[0]
 
     @property
-    def order(self) -> tuple[int, int, int, int]:
-        """Later is greater."""
-        return self.stamp_ms, self.epoch, self.generation, self.sequence
+    def order(self) -> tuple[int, int, int, int, int]:
+        """Later is greater. What a site puts after an operator gave it up is never the newest: `failover.core.election.sites`."""
+        return self.epoch // SPAN, self.stamp_ms, self.epoch, self.generation, self.sequence
 
     @property
     def line(self) -> tuple[int, int, int, int]:

@@ -65,6 +65,7 @@ def damaged(component: Component, turn: Turn, event: Damaged) -> None:
     if gave(component, event.position):
         component.fetched = None
     component.lags, component.looked_ns, component.fresh = True, 0, False
+    component.unable, component.tries, component.retry_ns = "", 0, 0  # what failed was that checkpoint
     turn.say(component, f"its checkpoint {event.position.sequence} is damaged on the disk of {turn.me}, which takes it again")
 
 
@@ -146,7 +147,7 @@ def waits(component: Component, turn: Turn) -> bool:
         return False
     if component.newest is None and component.epoch > 0:  # our own, of which no checkpoint was ever made, is nowhere else
         return component.primary != turn.me or component.has_begun
-    if component.primary == turn.me and is_own(component, turn):
+    if component.primary == turn.me and is_own(component, turn) and not component.lags:
         return False
     return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
 

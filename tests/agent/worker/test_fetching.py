@@ -294,6 +294,16 @@ def test_a_checkpoint_that_is_damaged_on_this_robots_disk_is_fetched_again_and_s
         away.rename(member.directory / "place" / name)
         await member.until(lambda: member.fetched() == [1, 1])
         assert not any("damaged" in one for one in member.fetching.complaints())
+        harm(the_file(member))
+        member.store.check(COMPONENT, first.position)
+        (member.directory / "place").rename(member.directory / "gone")
+        await member.until(lambda: member.events.count(Damaged(COMPONENT, 1, first.position)) > 1)
+        (member.directory / "gone").rename(member.directory / "place")
+        await member.until(lambda: any("damaged" in one for one in member.fetching.complaints()))
+        member.seen = (msgspec.structs.replace(member.seen[0], state=State.PRIMARY),)
+        await member.until(lambda: not any("damaged" in one for one in member.fetching.complaints()))
+        member.seen = (msgspec.structs.replace(member.seen[0], state=State.STANDBY),)
+        await member.until(lambda: member.fetched() == [1, 1, 1])
         assert format.verify(the_file(member)).position == first.position
 
     run(tmp_path, work)

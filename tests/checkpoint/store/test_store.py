@@ -5,6 +5,7 @@ Power cuts: `tests.checkpoint.store.test_store_power`.
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import signal
@@ -185,6 +186,21 @@ def test_a_chain_that_is_checked_again_loses_what_is_damaged_and_what_continues_
         assert any(str(damaged) in notice for notice in store.notices)
         with pytest.raises(StoreError, match="does not hold"):
             store.check(COMPONENT, made[3].position)
+
+
+def test_a_check_that_can_open_nothing_says_nothing_of_the_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = history(4)
+    with opened(tmp_path / "store") as store:
+        for one in made:
+            put(store, one)
+
+        def full(*_: object) -> int:
+            raise OSError(errno.EMFILE, "Too many open files")
+
+        with monkeypatch.context() as patch:
+            patch.setattr("checkpoint.store.store.os.open", full)
+            store.check(COMPONENT)
+        assert store.newest(COMPONENT) == made[3].position and not store.notices
 
 
 def test_a_snapshot_that_was_damaged_and_sent_again_survives_pruning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

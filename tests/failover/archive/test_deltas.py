@@ -18,6 +18,7 @@ from failover.archive.archive import Archive, Last
 from failover.archive.keys import Keys, keys_without_members
 from failover.archive.objects import FolderObjects
 from failover.archive.witness import WitnessObjects
+from failover.core.types import SPAN
 from failover.errors import ArchiveError
 from tests import witnesses
 from tests.checkpoint.snapshots import COMPONENT, PAGE, pages_of, snapshot
@@ -115,6 +116,17 @@ def test_where_another_member_has_put_meanwhile_or_the_chain_was_harmed_a_base_i
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     assert not is_delta(member.put()), "the base before it does not prove itself"
     assert (member.place / base).exists()
+
+
+def test_what_a_site_that_was_given_up_puts_late_is_not_the_newest(member: Member) -> None:
+    """An operator recovered it at another site, in the first epoch of the next span; the lost one ran on behind a cut."""
+    here = member.put(epoch=SPAN)
+    lost = Member(member.place)
+    late = lost.put(epoch=3)
+    assert late > here and [copy.name for copy in member.archive.copies(COMPONENT)] == [here, late]
+    member.put(epoch=SPAN)
+    member.archive.thin(COMPONENT, 1)
+    assert late not in [copy.name for copy in member.archive.copies(COMPONENT)]
 
 
 @pytest.mark.parametrize("harm", ["a byte", "cut off", "gone"])

@@ -17,6 +17,7 @@ from failover.core.types import (
     PEERS_MAX,
     ComponentSpec,
     Config,
+    Held,
     Launch,
     OnLoss,
     Protection,
@@ -44,12 +45,18 @@ def position(epoch: int, sequence: int) -> Position:
 class Lonely:
     """robot2, and etcd's word about the component: robot1 runs it in this epoch, or is silent (``flags``)."""
 
-    def __init__(self, config: Config = CONFIG, record: VoteRecord = VoteRecord(), seat: str = "robot1") -> None:  # noqa: B008
+    def __init__(
+        self,
+        config: Config = CONFIG,
+        record: VoteRecord = VoteRecord(),  # noqa: B008
+        seat: str = "robot1",
+        held: tuple[Position, ...] = (),
+    ) -> None:
         self.now_ns = 0
         self.seat, self.record = seat, record
         self.epoch, self.flags, self.state = 1, 0, State.STANDBY
         self.counter, self.standby = 0, ""
-        self.node = Node(config, 1, record, 0)
+        self.node = Node(config, 1, record, 0, (Held(NAME, held),) if held else ())
         self.acts: list[acts.Act] = []
         self.said: list[str] = []
         self.live(5_000)
@@ -325,6 +332,40 @@ def test_the_only_checkpoint_that_is_damaged_begins_nothing_anew_before_the_arch
     robot.fetched(1, 5)
     robot.live(100)
     assert robot.claims()
+
+
+@pytest.mark.parametrize("is_damaged", [True, False])
+def test_the_old_primary_whose_newest_checkpoint_is_damaged_waits_for_the_archive_too(is_damaged: bool) -> None:
+    record = Record(NAME, 1, "robot2", State.PRIMARY, spec=SPEC, begun=True)
+    own = [Position(PEERS_MAX + 1 + CONFIG.place, sequence, b"d") for sequence in (5, 6)]
+    robot = Lonely(record=VoteRecord((record,)), seat="robot2", held=tuple(own))
+    if is_damaged:
+        robot.step(Damaged(NAME, 1, own[1]))
+    robot.flags = FREE
+    robot.live(2_000)
+    entry = robot.node.word().entry(NAME)
+    assert entry is not None
+    assert (entry.epoch == 1) == is_damaged, "it claims: its own newest one needs no archive; an older one does"
+    robot.step(Fetched(NAME, 1, own[1], SPEC, robot.now_ns))
+    robot.step(Looked(robot.now_ns))
+    robot.live(200)
+    entry = robot.node.word().entry(NAME)
+    assert entry is not None and entry.epoch > 1
+
+
+def test_a_checkpoint_that_could_not_be_restored_because_it_is_damaged_gives_the_one_before_it_new_tries() -> None:
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.fetched(1, 6)
+    robot.live(100)
+    component = robot.node._components[NAME]
+    component.unable, component.tries, component.retry_ns = "damaged", 3, robot.now_ns + 1_000_000 * MS
+    robot.step(Damaged(NAME, 1, position(1, 6)))
+    robot.flags = FREE
+    robot.live(100)
+    robot.step(Looked(robot.now_ns))
+    robot.live(200)
+    assert not component.unable and robot.claims()
 
 
 def test_damage_of_what_is_not_held_changes_nothing() -> None:
