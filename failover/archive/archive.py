@@ -253,7 +253,7 @@ class Archive:
         last = self._last.get(component)
         if last is None or last.name != newest.name or last.keys != self._keys or len(newest.before) >= DELTAS_MAX:
             return False
-        if self._lack_of(newest) or (base_size := self._objects.size((*newest.before, newest.name)[0])) is None:
+        if self._lack_of(newest) or (base_size := self._objects.size(newest.base)) is None:
             return False
         delta = difference(checkpoint.fileno(), known, last.known, CHANGED_MAX)
         if delta is None:

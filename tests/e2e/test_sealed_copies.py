@@ -124,7 +124,6 @@ def test_nothing_of_a_program_is_readable_on_the_disk_or_in_the_memory_of_a_witn
             found = [is_in_memory(pid) for pid in gate.processes()]
             assert not any(is_found for is_found, _ in found) and sum(size for _, size in found) > 10 << 20
         print(f"searched {sum(size for _, size in found) >> 20} MB of memory of {len(found)} processes, after {len(seen)} copies")
-        until(lambda: min(seen) not in {path.name for path in copies(gate)}, "older copies to go")
         component = robots.component(first, "count")
         assert component["standby"] == "robot2" and component["protection"] == "protected"
         assert sealed_of(first)["at"] == "gate" and sealed_of(first)["copies"] is None
@@ -132,7 +131,7 @@ def test_nothing_of_a_program_is_readable_on_the_disk_or_in_the_memory_of_a_witn
             r"sealed copy at gate, which is no standby: /demo/robot1/count, .* old", robots.failover(first, "status").stdout
         )
         assert re.search(
-            r"sealed copies, which gate cannot open: /demo/robot1/count, \d, .* old", robots.failover(gate, "status").stdout
+            r"sealed copies, which gate cannot open: /demo/robot1/count, \d+, .* old", robots.failover(gate, "status").stdout
         )
         stage.cut_power("robot1")
         robots.until_taken_over(second)
