@@ -214,10 +214,13 @@ def _contend(component: Component, turn: Turn, sender: str, entry: Entry, theirs
 def _heard_end(component: Component, turn: Turn, sender: str, entry: Entry, theirs: State) -> None:
     """A copy that acts, or stands still, gives up to an end as it would to the copy that ended: never to a word alone.
 
-    A voter does not leave its primary for one either: else one stolen key ends what a healthy robot runs.
+    A voter does not leave its primary for one either: else one stolen key ends what a healthy robot runs. A claim of the epoch in
+    which it has ended is in vain.
     """
     if not component.holding or component.state is State.CLAIMING:
         if majority.may_record_end(component, turn, entry):
+            if component.state is State.CLAIMING and entry.epoch == component.epoch:
+                withdraw(component, turn, f"it is {theirs} in that epoch, as {sender} says")
             heard_end(component, turn, sender, entry, theirs)
     elif entry.epoch > component.epoch and majority.leased(component, turn):
         if component.is_settled and turn.config.runs(sender):

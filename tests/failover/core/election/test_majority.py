@@ -12,7 +12,20 @@ from failover.core.election.consent import STATES
 from failover.core.election.pair import placing, vacant
 from failover.core.events import Captured, Handover, Leave, Received, Run, Started, Stored, Tick
 from failover.core.node import Node
-from failover.core.types import MS, ComponentSpec, Config, Held, Launch, Record, Rule, Rules, State, VoteRecord, WhenAlone
+from failover.core.types import (
+    COORDINATOR,
+    MS,
+    ComponentSpec,
+    Config,
+    Held,
+    Launch,
+    Record,
+    Rule,
+    Rules,
+    State,
+    VoteRecord,
+    WhenAlone,
+)
 from failover.core.wire.messages import FREE, RETURNED, SAFE, Beat, Echo, Entry
 from failover.errors import RulesError
 
@@ -155,6 +168,23 @@ def test_a_claim_is_carried_out_once_a_majority_votes_for_it() -> None:
     assert talk.vote() == (1, "robot1") and not talk.orders(acts.Start)
     talk.hear("robot2", entry(State.STANDBY, 1, "robot1"))
     assert talk.orders(acts.Start)
+
+
+def test_a_claim_of_the_epoch_in_which_it_has_ended_elsewhere_records_that_end() -> None:
+    """Two claimed it at once. The other one won and ended; etcd tells of that before it loses its keys."""
+    config = Config("robot1", ("robot2", COORDINATOR), rule=Rule.ETCD, witnesses=(COORDINATOR,), components=(SPEC,))
+    talk = Talk(config)
+    talk.hear(COORDINATOR)
+    while talk.vote() != (1, "robot1"):
+        talk.tick(30)
+        talk.hear(COORDINATOR)
+    talk.hear(COORDINATOR, entry(State.FINISHED, 1, "robot2"))
+    for _ in range(100):
+        talk.tick(30)
+        talk.hear(COORDINATOR)
+    (shown,) = talk.node.status(talk.now_ns).components
+    assert (shown.state, shown.epoch, shown.primary) == (State.FINISHED, 1, "robot2")
+    assert not talk.orders(acts.Start)
 
 
 def test_a_checkpoint_counts_once_a_majority_has_noted_who_holds_it() -> None:
