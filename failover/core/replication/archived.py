@@ -10,6 +10,8 @@ counts. Invariants:
 * Once etcd would vote for another robot, or the old primary lives and lets go (it may have lost its disk), this robot looks into
   the archive again before it claims the component. What was put there before is in its store then, and it claims without the
   wait for the old primary (``fresh``). Where the archive does not answer, that wait (``patience_ms``) is the limit.
+* A robot that had all that was acknowledged, and has lost it with its disk (``bare``), waits for the old primary all the same,
+  which may come back with more than the archive has.
 * A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
 * Where the archive alone tells of a component, and no member of the team, it may have ended, or have been released and run on:
   no robot claims it by itself.
@@ -48,6 +50,7 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
     component.stored_ns = turn.now_ns
     component.fetched = event.position, turn.now_ns - event.age_ns
     component.lags = component.lags and not event.begun_ns
+    component.bare = component.bare and (component.vouched is None or event.position < component.vouched)
     component.unable, component.tries, component.unstored = "", 0, ""
     turn.order(acts.Accept(component.name, component.epoch, event.position))
     turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
@@ -123,7 +126,8 @@ def review(component: Component, turn: Turn) -> None:
         return
     component.freed_ns = component.freed_ns or turn.now_ns
     has_looked = component.looked_ns >= component.freed_ns
-    component.fresh = has_looked and bool(component.held) and not (set(component.entrusted) - {turn.me})
+    is_sole = not component.bare and not (set(component.entrusted) - {turn.me})
+    component.fresh = has_looked and bool(component.held) and is_sole
     if not has_looked and turn.now_ns >= component.asked_ns + turn.config.retry_ms * MS:
         component.asked_ns = turn.now_ns
         turn.order(acts.Look(component.name, component.epoch))

@@ -27,7 +27,7 @@ from failover.core.types import (
     State,
     VoteRecord,
 )
-from failover.core.wire.messages import FREE, FRESH, OPEN, RULES, Beat, Echo, Entry
+from failover.core.wire.messages import FREE, FRESH, OPEN, RULES, SAFE, Beat, Echo, Entry
 
 NAME = "/lab/robot1/mapper"
 SPEC = ComponentSpec(NAME, "robot1", Launch(("mapper",)))
@@ -157,6 +157,39 @@ def test_a_standby_that_heard_its_primary_waits_for_no_patience_once_it_has_look
     robot.live(5_000)
     assert not robot.claims(), "it did not hear its primary lately: the archive may have something newer"
     robot.step(Looked(robot.now_ns))
+    robot.live(100)
+    assert robot.claims()
+
+
+def robot2_with_an_empty_disk() -> Lonely:
+    """It was the standby, so it had all that was acknowledged; robot1, the primary, is silent. The archive has a copy."""
+    robot = Lonely(record=VoteRecord((Record(NAME, 1, "robot1", State.STANDBY, entrusted=("robot2",), spec=SPEC),)))
+    robot.standby, robot.flags = "robot2", FREE
+    robot.live(100)
+    robot.step(Looked(robot.now_ns, (NAME,)))
+    robot.fetched(1, 5)
+    return robot
+
+
+def test_a_standby_that_lost_its_disk_waits_for_the_primary_that_may_have_more_than_the_archive() -> None:
+    robot = robot2_with_an_empty_disk()
+    robot.live(50_000)
+    assert not robot.claims(), "what was acknowledged after that copy is at robot1 still"
+    robot.flags = FREE | OPEN
+    robot.live(12_000)
+    assert robot.claims()
+
+
+def test_a_standby_whose_checkpoint_was_damaged_has_it_again_from_the_archive_and_waits_no_longer() -> None:
+    robot = robot2_with_an_empty_disk()
+    robot.seat = ""
+    told = Entry(NAME, STATES.index(State.PRIMARY), 1, "robot1", PEERS_MAX + 1, 6, b"d", "robot2", flags=SAFE)
+    robot.step(Received(Beat("robot1", 1, 1, 1, total=1, entries=(told,), rule=RULES.index(Rule.ETCD)), "wire"))
+    robot.seat = "robot1"
+    robot.live(6_000)
+    robot.step(Looked(robot.now_ns, (NAME,)))
+    assert not robot.claims()
+    robot.fetched(1, 6)
     robot.live(100)
     assert robot.claims()
 
