@@ -64,12 +64,15 @@ def may_follow(component: Component, turn: Turn, sender: str, entry: Entry) -> b
     bound = not (is_free(component, turn) or sender == component.primary or _gives_way(component, turn, sender))
     if bound:
         return elected(component, turn, sender, entry.epoch)
-    return bool(entry.flags & ORDERED) or _is_fresh(component, sender, entry) or eligible(component, turn, sender, entry.position)
+    is_fresh = bool(entry.flags & FRESH) and is_sole(component, turn, sender, entry.position)
+    return bool(entry.flags & ORDERED) or is_fresh or eligible(component, turn, sender, entry.position)
 
 
-def _is_fresh(component: Component, sender: str, entry: Entry) -> bool:
-    """Whether the sender has all that the archive had, and no robot but the old primary may hold more."""
-    return bool(entry.flags & FRESH) and not set(component.entrusted) - {sender}
+def is_sole(component: Component, turn: Turn, robot: str, position: Position | None) -> bool:
+    """Whether no robot but a primary that is not heard may hold more than this one has, from the archive."""
+    theirs = _position_at(component, turn, component.primary)
+    has_less = theirs is not None and (position is None or position < theirs)
+    return not has_less and not set(component.entrusted) - {robot}
 
 
 def may_record_end(component: Component, turn: Turn, entry: Entry) -> bool:

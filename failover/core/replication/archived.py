@@ -11,7 +11,7 @@ counts. Invariants:
   the archive again before it claims the component. What was put there before is in its store then, and it claims without the
   wait for the old primary (``fresh``). Where the archive does not answer, that wait (``patience_ms``) is the limit.
 * A robot that had all that was acknowledged, and has lost it with its disk (``bare``), waits for the old primary all the same,
-  which may come back with more than the archive has.
+  which may come back with more than the archive has. So does a robot that hears it tell of more.
 * A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
 * Where the archive alone tells of a component, and no member of the team, it may have ended, or have been released and run on:
   no robot claims it by itself.
@@ -22,6 +22,7 @@ from __future__ import annotations
 from checkpoint.model import Position
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
+from failover.core.election import majority
 from failover.core.events import Archived, Damaged, Fetched, Looked
 from failover.core.types import ENDED, MS, PEERS_MAX, State
 from failover.core.wire.messages import FREE
@@ -126,7 +127,7 @@ def review(component: Component, turn: Turn) -> None:
         return
     component.freed_ns = component.freed_ns or turn.now_ns
     has_looked = component.looked_ns >= component.freed_ns
-    is_sole = not component.bare and not (set(component.entrusted) - {turn.me})
+    is_sole = not component.bare and majority.is_sole(component, turn, turn.me, component.newest)
     component.fresh = has_looked and bool(component.held) and is_sole
     if not has_looked and turn.now_ns >= component.asked_ns + turn.config.retry_ms * MS:
         component.asked_ns = turn.now_ns

@@ -55,7 +55,7 @@ class Lonely:
         self.now_ns = 0
         self.seat, self.record = seat, record
         self.epoch, self.flags, self.state = 1, 0, State.STANDBY
-        self.counter, self.standby = 0, ""
+        self.counter, self.standby, self.counter_of_robot1 = 0, "", 0
         self.node = Node(config, 1, record, 0, (Held(NAME, held),) if held else ())
         self.acts: list[acts.Act] = []
         self.said: list[str] = []
@@ -82,6 +82,14 @@ class Lonely:
 
     def fetched(self, epoch: int, sequence: int) -> None:
         self.step(Fetched(NAME, epoch, position(epoch, sequence), SPEC, self.now_ns))
+
+    def hear_robot1(self, sequence: int, state: State = State.STANDBY, epoch: int = 1, flags: int = 0) -> None:
+        """It tells that it holds this checkpoint of epoch 1, and not that it hears robot2."""
+        self.counter_of_robot1 += 1
+        at = position(1, sequence)
+        entry = Entry(NAME, STATES.index(state), epoch, "robot1", at.generation, at.sequence, at.digest, flags=flags | FREE)
+        counter, rule = self.counter_of_robot1, RULES.index(Rule.ETCD)
+        self.step(Received(Beat("robot1", 1, counter, 1, total=1, entries=(entry,), rule=rule), "wire"))
 
     @property
     def held(self) -> list[Position]:
@@ -182,16 +190,37 @@ def test_a_standby_that_lost_its_disk_waits_for_the_primary_that_may_have_more_t
 
 def test_a_standby_whose_checkpoint_was_damaged_has_it_again_from_the_archive_and_waits_no_longer() -> None:
     robot = robot2_with_an_empty_disk()
-    robot.seat = ""
-    told = Entry(NAME, STATES.index(State.PRIMARY), 1, "robot1", PEERS_MAX + 1, 6, b"d", "robot2", flags=SAFE)
-    robot.step(Received(Beat("robot1", 1, 1, 1, total=1, entries=(told,), rule=RULES.index(Rule.ETCD)), "wire"))
-    robot.seat = "robot1"
+    robot.hear_robot1(6, State.PRIMARY, 1, SAFE)
     robot.live(6_000)
     robot.step(Looked(robot.now_ns, (NAME,)))
     assert not robot.claims()
     robot.fetched(1, 6)
     robot.live(100)
     assert robot.claims()
+
+
+@pytest.mark.parametrize("sequence", [5, 6])
+def test_a_robot_goes_on_from_no_copy_of_the_archive_while_it_hears_a_robot_that_claims_it_and_holds_more(sequence: int) -> None:
+    """robot1 does not hear robot2: robot2's vote does not help it, and robot2 may claim above it."""
+    robot = Lonely()
+    robot.fetched(1, 5)
+    robot.hear_robot1(sequence, State.CLAIMING, 2)
+    robot.flags = FREE
+    for _ in range(100):
+        robot.hear_robot1(sequence, State.CLAIMING, 2)
+        robot.live(20)
+        robot.step(Looked(robot.now_ns))
+    assert robot.claims() == (sequence == 5)
+
+
+@pytest.mark.parametrize("sequence", [4, 5])
+def test_a_robot_votes_for_no_copy_of_the_archive_while_it_holds_more_itself(sequence: int) -> None:
+    """robot2 ran it, is back, and has claimed it. robot1 claims it above that, from the newest copy that the archive has."""
+    robot = Lonely(record=VoteRecord((Record(NAME, 1, "robot2", State.STANDBY, spec=SPEC),)), seat="")
+    robot.fetched(1, 5)
+    assert robot.claims() and robot.record.records[0].epoch == 2
+    robot.hear_robot1(sequence, State.CLAIMING, 3, FRESH)
+    assert robot.claims() == (sequence == 4)
 
 
 def test_what_ran_elsewhere_does_not_begin_anew_before_the_archive_has_answered() -> None:
