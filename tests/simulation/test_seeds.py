@@ -34,6 +34,9 @@ LONG_LIVES_TO_CATCH = 60
 ONCE_BROKEN = (98, 161, 368)
 """A robot whose store was lost after a claim in vain began a program anew, of which another one that was just away had all."""
 
+APART_ONCE_BROKEN = (330, 436, 821)
+"""What had ended ran again; a standby with a new disk, and a robot that heard one with more, resumed an older copy at once."""
+
 PAIR = TEAMS[0]
 VOTERS = tuple(team for team in TEAMS if team != PAIR)
 
@@ -79,6 +82,11 @@ def test_every_promise_holds_where_robots_share_only_etcd_and_an_archive(first: 
             life(seed, apart=True)
         except Broken as story:
             raise Broken(f"seed {seed} (again: python -m tests.simulation --apart --first {seed} --seeds 1): {story}") from None
+
+
+@pytest.mark.parametrize("seed", APART_ONCE_BROKEN)
+def test_a_life_with_an_archive_that_broke_a_promise_once_keeps_it_now(seed: int) -> None:
+    life(seed, apart=True)
 
 
 @pytest.mark.timeout(900)
