@@ -54,7 +54,8 @@ def team_config(settings: Settings) -> types.Config:
         boot_patience_ms=config.boot_patience_s * 1_000,
         seat=settings.me.seat,
         restart_grace_ms=_grace_ms(config),
-        far=tuple(sorted(name for name, member in settings.far.items() if member.role == "robot")),
+        site=settings.me.site,
+        far={name: member.site for name, member in sorted(settings.far.items()) if member.role == "robot"},
     )
 
 

@@ -134,7 +134,7 @@ def _checked(file: BinaryIO, before: VoteRecord, settings: Settings) -> str:
     """The component, whose name the object may have cut; it may be recovered here."""
     component = format.read_header(file.fileno()).component
     check_stopped(settings, component)
-    if (known := _known(before, component)) is not None and not settings.is_far(known.primary):
+    if (known := _known(before, component)) is not None and not known.is_elsewhere:
         raise AgentError(
             f"{component} is on record at {settings.config.robot}: its team knows it; start the agent and see failover status, "
             "or failover release it first"

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
-from failover.core.election import majority, sites
+from failover.core.election import majority
 from failover.core.election.pair import claim, drop, exhaustion, vacant
 from failover.core.events import Command, Failback, Handover, Prefer, Promote, Release, Run, Stop
 from failover.core.replication import archived
@@ -99,7 +99,8 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
         again_s = left_ns // (1_000 * MS) + 1
         how = "its agent restarts" if turn.team.peers[component.primary].is_asked else "it is not heard"
         return f"cannot {verb} {name}: {component.primary} has it, and {how}; ask again in {again_s} s"
-    if there := sites.elsewhere(component, turn):
+    if component.is_elsewhere:
+        there = component.primary
         return f"cannot {verb} {name}: {there}, of another site, has it; choose another name, or failover release {name} first"
     for peer in turn.team.living(turn.now_ns):
         entry = peer.entry(name)
@@ -127,7 +128,7 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
     runs_on = waited if restarts.waits(component) else "released: it runs on, unprotected"
     component.reason = "" if component.state in ENDED else runs_on
     component.move(Cause.RELEASE)
-    component.primary = turn.me
+    component.primary, component.elsewhere = turn.me, -abs(component.elsewhere)
     component.flight = None
     drop(component, turn, "an operator released it")
     turn.order(acts.Answer(command.request, True, f"{component.name} is protected no longer"))
@@ -135,7 +136,7 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
 
 
 def _may_be_forgotten(component: Component, turn: Turn) -> bool:
-    return component.state in ENDED or bool(sites.elsewhere(component, turn)) or vacant(component, turn)
+    return component.state in ENDED or component.is_elsewhere or vacant(component, turn)
 
 
 def _stop(component: Component, turn: Turn, command: Stop) -> None:

@@ -17,6 +17,7 @@ from failover.core.types import (
     HISTORY_MAX,
     HOLDING,
     RESTARTS_MAX,
+    SPAN,
     ComponentSpec,
     Config,
     OnLoss,
@@ -203,6 +204,7 @@ class Component(Struct):
     bare: bool = False
     ended: tuple[int, int] = (0, 0)
     void: int = 0
+    elsewhere: int = 0
 
     held: list[Position] = field(default_factory=list)
     autostart: bool = False
@@ -330,6 +332,16 @@ class Component(Struct):
         return self.begun or bool(self.entrusted or self.trusted or self.held)
 
     @property
+    def span(self) -> int:
+        """That of its epoch: how often an operator recovered it at another site."""
+        return self.epoch // SPAN
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether another site has it, by the order of an operator."""
+        return self.elsewhere > 0 and self.elsewhere == self.span
+
+    @property
     def named(self) -> str:
         """The robot that beats tell of as entrusted."""
         if self.unprotected and self.holding:
@@ -385,6 +397,7 @@ class Component(Struct):
             self.bare,
             self.ended,
             self.void,
+            self.elsewhere,
         )
 
     @classmethod
@@ -406,6 +419,7 @@ class Component(Struct):
             record.bare,
             record.ended,
             record.void,
+            record.elsewhere,
             remembered_epoch=record.epoch,
         )
 

@@ -406,7 +406,7 @@ class Node:
         rules = votes if self._config.by_majority else pair
         touched = {name: component for name, component in self._components.items() if component.holding}
         for entry in news:
-            is_hearsay = entry.primary in self._config.far  # of another site, which tells by itself
+            is_hearsay = sites.is_hearsay(self._components.get(entry.name), turn, entry)
             component = None if entry.name in refused or is_hearsay else self._known(entry.name, beat.sender)
             if component is None:
                 continue

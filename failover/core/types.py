@@ -302,7 +302,7 @@ class Config(Struct, frozen=True, dict=True):
             order of names.
         restart_grace_ms: how long the peers are asked to wait for this agent when it restarts, and the most that it waits for
             one of theirs; 0: neither.
-        far: robots of other sites, which are no peers.
+        site: the name of this robot's site. far: robots of other sites, which are no peers, and their sites.
     """
 
     robot: str
@@ -327,7 +327,8 @@ class Config(Struct, frozen=True, dict=True):
     boot_patience_ms: int = 0
     seat: int = -1
     restart_grace_ms: int = 0
-    far: tuple[str, ...] = ()
+    site: str = ""
+    far: dict[str, str] = {}
 
     def __post_init__(self) -> None:
         if self.restart_grace_ms and not self.lease_ms <= self.restart_grace_ms <= GRACE_MS_MAX:
@@ -463,6 +464,7 @@ class Record(Struct, frozen=True):
         bare: this robot was among those that held all that was acknowledged, and has lost its checkpoints: others hold it.
         ended: generation and sequence of the last snapshot of the program before, since when another one was started anew.
         void: epoch of an end after which it began anew: the archive's copies up to that one are of another life of it.
+        elsewhere: the span of epochs in which an operator recovered it at another site; negative once it was released here.
     """
 
     name: str
@@ -480,6 +482,12 @@ class Record(Struct, frozen=True):
     bare: bool = False
     ended: tuple[int, int] = (0, 0)
     void: int = 0
+    elsewhere: int = 0
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether another site has it, by the order of an operator."""
+        return self.elsewhere > 0 and self.elsewhere == self.epoch // SPAN
 
 
 class Awaited(Struct, frozen=True):

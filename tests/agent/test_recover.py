@@ -216,9 +216,8 @@ def test_what_a_robot_of_this_site_ran_keeps_its_epoch(config: Path, place: Path
 def test_what_another_site_has_by_an_operators_order_is_brought_back(
     config: Path, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    enrol_robot9(config, "harbour")
-    other = Record("/lab/robot1/other", 3, "robot1", State.PRIMARY)
-    have_on_record(config, Record(COMPONENT, SPAN + 7, "robot9", State.STANDBY, spec=SPEC, begun=True), other)
+    other = Record("/lab/robot1/other", 3, "robot1", State.PRIMARY)  # robot9 has left the team since
+    have_on_record(config, Record(COMPONENT, SPAN + 7, "robot9", State.STANDBY, spec=SPEC, begun=True, elsewhere=1), other)
     assert recover(config, "planner") == 0
     assert records(config) == (other, Record(COMPONENT, 2 * SPAN, state=State.STANDBY, spec=SPEC, begun=True))
     assert recover(config, "planner") == 1 and "is on record at robot1" in capsys.readouterr().err

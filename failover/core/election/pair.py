@@ -107,8 +107,8 @@ def vacant(component: Component, turn: Turn, *, is_ordered: bool = False) -> boo
         is_ordered: an operator says so of robots whose packets cannot be authenticated.
     """
     is_doubtful = False
-    if component.primary in turn.config.far:
-        return False  # an operator recovered it at another site
+    if component.is_elsewhere:
+        return False
     if component.primary not in ("", turn.me) and component.primary not in turn.team.peers and not turn.dead(component.primary):
         return False  # it was taken out of the team, and may act until the lease that it had here is over
     for robot, peer in turn.team.peers.items():
@@ -445,6 +445,7 @@ def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> 
 def accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
     component.begun, component.bare = component.has_begun, False
     component.epoch, component.primary = epoch, primary
+    component.elsewhere = -abs(component.elsewhere)
     component.entrusted, component.trusted = (), False
     component.ordered = component.claimed = False
     component.unable, component.tries, component.retry_ns = "", 0, 0
@@ -521,6 +522,7 @@ def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, their
     component.reason = f"as {sender} says" if theirs is State.FAILED else ""
     component.move(_END_CAUSES[theirs])
     if theirs is State.RELEASED:
+        component.elsewhere = -abs(component.elsewhere)
         drop(component, turn, f"{sender} released it")
     turn.say(component, f"{turn.me} records that it is {theirs}, as {sender} says")
 
@@ -563,7 +565,7 @@ def _heard_later_epoch(component: Component, turn: Turn, sender: str, entry: Ent
         renew(component, turn, entry.epoch)
     elif not component.holding:
         component.epoch, component.trusted = entry.epoch, False
-        component.primary = entry.primary
+        component.primary, component.elsewhere = entry.primary, -abs(component.elsewhere)
         if entry.primary == turn.me:
             component.entrusted = (sender,)
         if component.state is State.ABSENT and entry.flags & HOLDS:

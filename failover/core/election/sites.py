@@ -29,8 +29,11 @@ def recovered(component: Component, turn: Turn, event: Recovered) -> None:
 
     What is said again changes nothing; nor does an epoch that nobody can have opened yet.
     """
-    is_news = component.epoch // SPAN < event.epoch // SPAN and event.epoch <= epoch_max(component, turn)
-    if not is_news or event.robot not in turn.config.far:
+    span = event.epoch // SPAN
+    if event.robot not in turn.config.far or event.epoch > epoch_max(component, turn) or span < max(component.span, 1):
+        return
+    if span == component.span:
+        _moved_there(component, turn, event)
         return
     turn.say(component, f"an operator recovered it at {event.robot}, of another site, in epoch {event.epoch}")
     if component.holding:
@@ -39,12 +42,28 @@ def recovered(component: Component, turn: Turn, event: Recovered) -> None:
         accept(component, turn, event.robot, event.epoch)
         if component.state is State.ABSENT or component.state in ENDED:
             component.move(Cause.FOLLOW)
+    component.elsewhere = span
     admit(component, turn, "")
 
 
-def elsewhere(component: Component, turn: Turn) -> str:
-    """The robot of another site that has it, by the order of an operator; "" if none has."""
-    return component.primary if component.primary in turn.config.far else ""
+def _moved_there(component: Component, turn: Turn, event: Recovered) -> None:
+    """The same recovery: another robot of that site runs it, or this record names one that has left the team."""
+    is_begun_anew = component.elsewhere == -component.span
+    is_theirs = component.is_elsewhere or not (is_begun_anew or _is_near(component.primary, turn))
+    is_news = event.epoch > component.epoch or not component.is_elsewhere or component.primary not in turn.config.far
+    if is_theirs and is_news and not component.holding and component.state not in ENDED:
+        component.epoch, component.primary = max(component.epoch, event.epoch), event.robot
+        component.elsewhere = component.span
+
+
+def is_hearsay(component: Component | None, turn: Turn, entry: Entry) -> bool:
+    """Whether a member of this site speaks of another one, which tells by itself; also by a robot that has left the team."""
+    is_same = component is not None and component.is_elsewhere and entry.epoch // SPAN == component.span
+    return entry.primary in turn.config.far or (is_same and not _is_near(entry.primary, turn))
+
+
+def _is_near(primary: str, turn: Turn) -> bool:
+    return primary in ("", turn.me, *turn.config.peers)
 
 
 def waits_ns(component: Component, turn: Turn) -> int:

@@ -226,10 +226,10 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
             f"waiting: an operator may have recovered it at another site, and not every site has answered since {turn.me} started"
             f"; {turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
         )
-    if there := sites.elsewhere(component, turn):
+    if component.is_elsewhere:
         notes.append(
-            f"an operator recovered it at {there}, of another site, which has it now: no robot of this site runs it by itself; "
-            f"{sites.CURE.format(component.name)}"
+            f"an operator recovered it at {component.primary}, of another site, which has it now: no robot of this site runs it "
+            f"by itself; {sites.CURE.format(component.name)}"
         )
     if component.state in (State.STANDBY, State.FROZEN) and (unread := _unread(turn)):
         notes.append(f"waiting: {unread}; failover promote does not wait")

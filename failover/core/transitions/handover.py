@@ -38,7 +38,7 @@ def resume_here(component: Component, turn: Turn, request: int) -> None:
     elif component.is_exhausted:
         _answer(turn, request, False, exhaustion(component, turn.me))
     elif not vacant(component, turn) or (turn.config.by_majority and not majority.is_free(component, turn)):
-        cure = f", of another site; {sites.CURE.format(component.name)}" if sites.elsewhere(component, turn) else "; ask there"
+        cure = f", of another site; {sites.CURE.format(component.name)}" if component.is_elsewhere else "; ask there"
         _answer(turn, request, False, f"{component.name} belongs to {component.primary}{cure}")
     elif component.elects and not majority.may_claim(component, turn, component.newest):
         where = " or ".join(one for one in (*component.entrusted, component.primary) if one)

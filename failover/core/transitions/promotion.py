@@ -92,8 +92,8 @@ def _refusal(component: Component, turn: Turn) -> str:
 
 
 def _why_not_vacant(component: Component, turn: Turn) -> str:
-    if there := sites.elsewhere(component, turn):
-        return f"an operator recovered it at {there}, of another site; {sites.CURE.format(component.name)}"
+    if component.is_elsewhere:
+        return f"an operator recovered it at {component.primary}, of another site; {sites.CURE.format(component.name)}"
     if component.primary and turn.alive(component.primary):
         return f"{component.primary} lives and has it; ask there"
     if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):

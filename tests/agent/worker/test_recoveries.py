@@ -58,7 +58,7 @@ class Lines:
             Record("/lab/planner", SPAN + 9, "r5", State.STANDBY, begun=True),  # recovered at the dock, once ours
             Record("/lab/own", 3, "r8", State.STANDBY, begun=True),
         )
-        node = Node(Config("r8", ("r9",), far=("r1", "r2", "r5")), 1, VoteRecord(ours), 0)
+        node = Node(Config("r8", ("r9",), site="hall", far={"r1": "", "r2": "", "r5": "dock"}), 1, VoteRecord(ours), 0)
         return Told(1, 0, node.status(0))
 
 

@@ -6,14 +6,18 @@ import pytest
 from msgspec.structs import replace
 
 from failover.core import acts
-from failover.core.events import Handover, Promote, Recovered, Release, Run, SitesHeard, Started, Stopped
+from failover.core.events import Event, Handover, Promote, Recovered, Release, Run, SitesHeard, Started, Stopped, TeamChanged
 from failover.core.peer_claims import EPOCHS_AWAY_MAX
 from failover.core.types import SPAN, ComponentView, Config, Held, Record, Rule, State, VoteRecord
+from failover.core.wire.messages import HOLDS
 from tests.failover.core.election.test_majority import NAME, NEWEST, SPEC, Talk, entry
 
-ALONE = Config("robot1", grace_ms=300, boot_patience_ms=5_000, far=("robot3",))
-THREE = Config("robot1", ("robot2", "witness1"), rule=Rule.MAJORITY, witnesses=("witness1",), grace_ms=300, far=("robot3",))
-PAIR = Config("robot2", ("robot1",), grace_ms=300, far=("robot3",))
+FAR = {"robot3": "hall"}
+ALONE = Config("robot1", grace_ms=300, boot_patience_ms=5_000, far=FAR)
+THREE = Config(
+    "robot1", ("robot2", "witness1"), rule=Rule.MAJORITY, witnesses=("witness1",), grace_ms=300, far={"robot3": "hall"}
+)
+PAIR = Config("robot2", ("robot1",), grace_ms=300, far=FAR)
 HELD = (Held(NAME, (NEWEST,)),)
 RAN_HERE = Record(NAME, 1, "robot1", State.PRIMARY, spec=SPEC, begun=True)
 THERE = Recovered(NAME, SPAN + 1, "robot3")
@@ -29,7 +33,7 @@ def view(talk: Talk) -> ComponentView:
     return one
 
 
-def tell(talk: Talk, *events: Recovered | SitesHeard | Started | Stopped | Run | Release | Promote | Handover) -> acts.Ready:
+def tell(talk: Talk, *events: Event) -> acts.Ready:
     for event in events:
         ready = talk.node.step(event, talk.now_ns)
         talk.readies.append(ready)
@@ -161,3 +165,39 @@ def test_orders_of_its_former_site_are_refused_with_the_cure_but_release_forgets
     tell(talk, Release(4, NAME), Run(5, SPEC))
     tell(talk, THERE)
     assert view(talk).primary == "robot1" and view(talk).epoch == SPAN + 2, "its operator has begun another one of that name"
+
+
+def test_a_robot_that_has_it_may_leave_its_team_and_the_lost_site_claims_nothing() -> None:
+    talk = booted(RAN_HERE, config=replace(ALONE, far={"robot3": "hall", "robot4": "hall"}))
+    tell(talk, THERE, SitesHeard())
+    talk.tick(1_000)
+    tell(talk, Recovered(NAME, SPAN + 2, "robot4"))  # handed over there
+    assert (view(talk).primary, view(talk).epoch) == ("robot4", SPAN + 2)
+    tell(talk, TeamChanged(replace(ALONE, far=FAR)))
+    talk.tick(20_000)
+    assert not talk.orders(acts.Restore) and "an operator recovered it at robot4" in " ".join(view(talk).notes)
+    assert "recover /lab/x" in refusal(tell(talk, Promote(1, NAME)))
+    tell(talk, Recovered(NAME, SPAN + 3, "robot3"))
+    assert (view(talk).primary, view(talk).epoch) == ("robot3", SPAN + 3)
+
+
+def test_what_ended_at_a_robot_that_is_of_another_site_now_is_not_there() -> None:
+    record = Record(NAME, 3, "robot3", State.STANDBY, spec=SPEC, begun=True)
+    talk = booted(record)
+    tell(talk, SitesHeard())
+    talk.tick(6_000)
+    assert talk.orders(acts.Restore) and not record.is_elsewhere
+
+
+def test_a_robot_of_its_former_site_that_boots_hears_from_no_neighbour_that_it_is_free() -> None:
+    """The robot that had it has left the team; the neighbour knows of a later epoch there."""
+    config = replace(PAIR, far={"robot4": "hall"})
+    talk = Talk(config, VoteRecord((Record(NAME, SPAN + 1, "robot3", State.STANDBY, spec=SPEC, elsewhere=1),)), HELD)
+    for _ in range(300):
+        talk.hear("robot1", entry(State.STANDBY, SPAN + 2, "robot3", NEWEST))
+        talk.tick(20)
+    assert view(talk).epoch == SPAN + 1 and not talk.orders(acts.Restore)
+    unknown = Talk(config, VoteRecord(), HELD)
+    unknown.hear("robot1", entry(State.STANDBY, SPAN + 2, "robot3", NEWEST, flags=HOLDS))
+    tell(unknown, Recovered(NAME, SPAN + 2, "robot4"))
+    assert "an operator recovered it at robot4" in " ".join(view(unknown).notes)
