@@ -147,12 +147,13 @@ def _known(before: VoteRecord, component: str) -> Record | None:
 
 
 def _epoch(settings: Settings, component: str, label: Label, copy: Copy, before: VoteRecord) -> int:
-    """The epoch to have on record; the first of the next span where the component was at another site.
+    """The epoch to have on record: the first of the next span, unless a member of this site made the copy.
 
-    That site may have claimed later epochs than the copy's since. See `failover.core.election.sites`.
+    Another site may have claimed later epochs than the copy's since: also that of a robot that is no member any more. See
+    `failover.core.election.sites`.
     """
     known = _known(before, component)
-    if known is None and not settings.is_far(label.robot):
+    if known is None and label.robot in settings.near:
         return copy.epoch
     return (max(copy.epoch, known.epoch if known is not None else 0) // SPAN + 1) * SPAN
 

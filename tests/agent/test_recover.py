@@ -61,6 +61,7 @@ def recover(config: Path, *words: str) -> int:
 
 
 def test_the_newest_copy_is_in_the_store_and_on_record(config: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    enrol_robot9(config, "")
     before = records(config)
     assert recover(config, "planner") == 0
     said = capsys.readouterr().out
@@ -205,6 +206,13 @@ def test_what_another_site_ran_goes_on_above_each_epoch_that_that_one_can_have_c
     enrol_robot9(config, "harbour")
     assert recover(config, "planner") == 0
     assert records(config)[-1] == Record(COMPONENT, SPAN, state=State.STANDBY, spec=SPEC, begun=True)
+
+
+def test_what_a_robot_ran_that_has_left_the_team_goes_on_in_the_next_span(config: Path, place: Path) -> None:
+    """It may have been of another site, which may run it still."""
+    assert "robot9" not in team.read(config.parent / "team").robots
+    assert recover(config, "planner") == 0
+    assert records(config)[-1].epoch == SPAN
 
 
 def test_what_a_robot_of_this_site_ran_keeps_its_epoch(config: Path, place: Path) -> None:
