@@ -10,6 +10,7 @@ Loaded where there are robots of other sites.
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import Any, Final, Literal, Protocol
 
 import msgspec
@@ -20,13 +21,16 @@ from agent.main_loop.messages import Told
 from agent.system.crash import end_worker_on_mistake
 from agent.worker.network.remote_orders import RECOVERED, Errands
 from failover.core.events import Event, Recovered, SitesHeard
-from failover.core.types import SPAN
+from failover.core.types import COMPONENTS_MAX
 
 ASK_S: Final = 2.0
 """Between two questions to one robot."""
 
 LOOK_S: Final = 0.25
 """Between two looks whether a robot that was not heard is connected: a robot that boots waits for its word."""
+
+AGAIN_S: Final = 30.0
+"""So often the core is told what has not changed."""
 
 PATIENCE_S: Final = 10.0
 """For an answer on a link that loses packets."""
@@ -60,12 +64,16 @@ class Lines(Protocol):
 
 
 class Recoveries:
-    """Both sides: what this robot hears, and what it tells. Lives in the worker's loop."""
+    """Both sides: what this robot hears, and what it tells. Lives in the worker's loop.
+
+    The core is told what has changed since the last answer, and all of it now and then: it may not have known the component.
+    """
 
     def __init__(self, lines: Lines) -> None:
         self._lines = lines
         self._asks: dict[str, asyncio.Task[None]] = {}
         self._heard: set[str] = set()
+        self._told: dict[str, tuple[float, frozenset[Recovery]]] = {}
         self._is_told = False
 
     async def run(self) -> None:
@@ -96,11 +104,20 @@ class Recoveries:
         except (RefusedError, msgspec.ValidationError):
             pass  # the connection was lost, or its release knows no such question
         else:
-            for one in answer.recovered:
-                if one.primary in self._lines.settings.far:
-                    self._lines.tell(Recovered(one.component, one.epoch, one.primary))
+            self._tell(robot, site, frozenset(answer.recovered[:COMPONENTS_MAX]))
             self._heard.add(site)
         await asyncio.sleep(ASK_S)
+
+    def _tell(self, robot: str, site: str, said: frozenset[Recovery]) -> None:
+        """A robot speaks for the robots of its own site."""
+        now_s, (told_s, told) = time.monotonic(), self._told.get(robot, (-AGAIN_S, frozenset()))
+        if now_s - told_s >= AGAIN_S:
+            told_s, told = now_s, frozenset()
+        members = self._lines.settings.team.at_site(site)  # by now
+        for one in said - told:
+            if {robot, one.primary} <= members.keys():
+                self._lines.tell(Recovered(one.component, one.epoch, one.primary))
+        self._told[robot] = (told_s, said)
 
     async def told(self) -> dict[str, Any]:
         """Answer a robot of another site.
@@ -109,9 +126,8 @@ class Recoveries:
             AgentError: the main loop does not answer.
         """
         view = (await self._lines.ask("status")).status
-        if view is None:
-            raise AgentError("this agent is starting")
-        near = self._lines.settings.near
-        found = (one for one in view.components if one.epoch >= SPAN and one.primary in near)
-        answer: dict[str, Any] = msgspec.to_builtins(Answer(tuple(Recovery(one.name, one.epoch, one.primary) for one in found)))
+        if view is None or not view.informed:
+            raise AgentError("this agent is starting, and has not heard each robot of its site")
+        found = (Recovery(one.name, one.epoch, one.primary or view.robot) for one in view.components if one.recovered)
+        answer: dict[str, Any] = msgspec.to_builtins(Answer(tuple(found)))
         return answer

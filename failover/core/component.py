@@ -178,6 +178,7 @@ class Component(Struct):
             robot's store. freed_ns: since when this robot could take it over, 0: it could not; asked_ns: when it last ordered a
             look into the archive for that. fresh: it has looked since then, and holds a checkpoint.
         sealed: on a primary, the position of the newest copy in the archive; sealed_ns: when that was taken, -1 if there is none.
+        contender: a robot of another site where it was recovered, too, and in which span (`failover.core.election.sites`).
         promise: the sentence that the journal has of it, where it differs from the team's.
         undelivered: why the last snapshot did not become a checkpoint; ``unstored``: on a standby, why it was not stored.
         keeps_state: on a standby: to go on from the newest snapshot is to start the program again.
@@ -294,6 +295,7 @@ class Component(Struct):
     fresh: bool = False
     sealed: Position | None = None
     sealed_ns: int = -1
+    contender: tuple[str, int] = ("", 0)
     promise: str = ""
 
     @property

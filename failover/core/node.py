@@ -636,6 +636,7 @@ def _review_idle(component: Component, turn: Turn) -> None:
 
 
 def _review_held(component: Component, turn: Turn) -> None:
+    sites.settle(component, turn)
     lease.watch(component, turn)
     if component.crashed:
         exits.crashed(component, turn, component.crashed)

@@ -582,6 +582,7 @@ class ComponentView(Struct, frozen=True):
         unstored: why the last snapshot that came here was not stored.
         restarting: its program has ended, and is started anew after a pause; restarted: so often in this life of the agent.
         took_ns: from the order of the newest delta until it was a checkpoint; 0: there was none.
+        recovered: an operator recovered it at this site, where it is, will be or ended: other sites are told.
     """
 
     name: str
@@ -608,12 +609,15 @@ class ComponentView(Struct, frozen=True):
     restarting: bool = False
     restarted: int = 0
     took_ns: int = 0
+    recovered: bool = False
 
 
 class StatusView(Struct, frozen=True):
     """Everything ``failover status`` shows, seen from one robot. ``healthy`` is False when anything failed or is degraded.
 
-    ``drained``: an operator has drained this robot.
+    Attributes:
+        drained: an operator has drained this robot.
+        informed: in this life it has heard each robot of its site that does not count as dead.
     """
 
     robot: str
@@ -624,3 +628,4 @@ class StatusView(Struct, frozen=True):
     peers: tuple[PeerView, ...]
     components: tuple[ComponentView, ...]
     drained: bool = False
+    informed: bool = True

@@ -6,6 +6,8 @@ tell each other over the replication link which components were recovered at the
 
 * The later span stays. A robot that hears of one gives its copy up, keeps its state aside, and names the robot of the other site
   as the primary. While that is on record, no robot claims the component, and no order but ``recover`` brings it back.
+* Two sites in the same span, for two persons recovered it: the site whose name sorts first opens the next span while it runs it,
+  and so the other one gives its copy up. Both can tell by the names alone, without a clock and without an answer.
 * A robot that has just started claims nothing before each other site has told what was recovered there, or ``boot_patience_ms``
   are over: its site may be the one that was lost. Nor does it begin anew what agent.toml declares: its disk may be a new one.
 * The word comes from the other site itself. What a robot of this site says of it counts for nothing: one stolen key would end
@@ -15,7 +17,7 @@ tell each other over the replication link which components were recovered at the
 from __future__ import annotations
 
 from failover.core.component import Cause, Component, Turn
-from failover.core.election.pair import accept, admit, lose
+from failover.core.election.pair import accept, admit, lose, renew
 from failover.core.events import Recovered
 from failover.core.peer_claims import epoch_max
 from failover.core.types import ENDED, MS, SPAN, State
@@ -33,7 +35,10 @@ def recovered(component: Component, turn: Turn, event: Recovered) -> None:
     if event.robot not in turn.config.far or event.epoch > epoch_max(component, turn) or span < max(component.span, 1):
         return
     if span == component.span:
-        _moved_there(component, turn, event)
+        if is_ours(component, turn):
+            _contend(component, turn, event.robot)
+        else:
+            _moved_there(component, turn, event)
         return
     turn.say(component, f"an operator recovered it at {event.robot}, of another site, in epoch {event.epoch}")
     if component.holding:
@@ -48,12 +53,42 @@ def recovered(component: Component, turn: Turn, event: Recovered) -> None:
 
 def _moved_there(component: Component, turn: Turn, event: Recovered) -> None:
     """The same recovery: another robot of that site runs it, or this record names one that has left the team."""
-    is_begun_anew = component.elsewhere == -component.span
-    is_theirs = component.is_elsewhere or not (is_begun_anew or _is_near(component.primary, turn))
+    is_theirs = component.elsewhere != -component.span  # else begun anew here, after a release
     is_news = event.epoch > component.epoch or not component.is_elsewhere or component.primary not in turn.config.far
     if is_theirs and is_news and not component.holding and component.state not in ENDED:
         component.epoch, component.primary = max(component.epoch, event.epoch), event.robot
         component.elsewhere = component.span
+
+
+def _contend(component: Component, turn: Turn, rival: str) -> None:
+    if component.contender != (rival, component.span):
+        component.contender = rival, component.span
+        turn.say(component, contention(component, turn))
+
+
+def contention(component: Component, turn: Turn) -> str:
+    """That operators recovered it at two sites, and which one goes on; "" if they did not."""
+    rival, span = component.contender
+    site = turn.config.far.get(rival)
+    if site is None or span != component.span:
+        return ""
+    first = turn.me if turn.config.site < site else rival
+    return (
+        f"operators recovered it here and at {rival}, of another site: two copies may act; the site of {first}, whose name sorts "
+        f"first, goes on"
+    )
+
+
+def settle(component: Component, turn: Turn) -> None:
+    """The copy here goes on above that of a site whose name sorts after ours; a capture under way is waited for."""
+    rival, span = component.contender
+    if span == component.span > 0 and component.is_settled and turn.config.site < turn.config.far.get(rival, ""):
+        renew(component, turn, (span + 1) * SPAN)
+
+
+def is_ours(component: Component, turn: Turn) -> bool:
+    """Whether an operator recovered it at this site, as far as is known here; what began anew after a release is another one."""
+    return component.span > 0 and abs(component.elsewhere) != component.span and _is_near(component.primary, turn)
 
 
 def is_hearsay(component: Component | None, turn: Turn, entry: Entry) -> bool:

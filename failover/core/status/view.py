@@ -39,8 +39,9 @@ def status(components: dict[str, Component], turn: Turn, boot: int, testimony: T
     bad = bad or any(view.cold or view.unstored for view in views) or any(one.is_exhausted for one in components.values())
     bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread or peer.doubted for peer in peers)
     lost = any(peer.state == "dead" for peer in peers)
+    informed = all(not turn.team.unheard(peer.robot) or turn.dead(peer.robot) for peer in peers)
     return StatusView(
-        turn.me, boot, str(turn.config.rule), guarantee.team(turn), not bad and not lost, peers, views, turn.drained
+        turn.me, boot, str(turn.config.rule), guarantee.team(turn), not bad and not lost, peers, views, turn.drained, informed
     )
 
 
@@ -78,6 +79,7 @@ def _component(component: Component, turn: Turn) -> ComponentView:
         restarts.waits(component),
         component.restarted,
         component.took_ns,
+        sites.is_ours(component, turn),
     )
 
 
@@ -226,6 +228,8 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
             f"waiting: an operator may have recovered it at another site, and not every site has answered since {turn.me} started"
             f"; {turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
         )
+    if contention := sites.contention(component, turn):
+        notes.append(contention)
     if component.is_elsewhere:
         notes.append(
             f"an operator recovered it at {component.primary}, of another site, which has it now: no robot of this site runs it "

@@ -17,7 +17,7 @@ from agent.worker.network.remote_orders import RECOVERED
 from agent.worker.recoveries import Answer, Recoveries, Recovery
 from failover.core.events import Event, Recovered, SitesHeard
 from failover.core.node import Node
-from failover.core.types import SPAN, Config, Record, State, VoteRecord
+from failover.core.types import COMPONENTS_MAX, MS, SPAN, Config, Record, State, VoteRecord
 from tests.agent.worker.test_known_sites import settings
 
 SITES = {"r1": "", "r2": "", "r5": "dock", "r8": "hall", "r9": "hall"}
@@ -31,6 +31,7 @@ class Lines:
         self.settings, self.answers = settings, answers
         self.asked: list[str] = []
         self.events: list[Event] = []
+        self.lived_ms = 301
 
     @property
     def errands(self) -> Any:
@@ -55,11 +56,15 @@ class Lines:
         """As `Switchboard.ask`."""
         ours = (
             Record(MAPPER.component, MAPPER.epoch, "r9", State.STANDBY, begun=True),  # r8 protects it
-            Record("/lab/planner", SPAN + 9, "r5", State.STANDBY, begun=True),  # recovered at the dock, once ours
+            Record("/lab/planner", SPAN + 9, "r5", State.STANDBY, begun=True, elsewhere=1),  # recovered at the dock, once ours
+            Record("/lab/anew", SPAN + 9, "r9", State.STANDBY, begun=True, elsewhere=-1),  # as well, and released here
+            Record("/lab/waits", SPAN, "", State.STANDBY, begun=True),  # recovered here, and not claimed yet
             Record("/lab/own", 3, "r8", State.STANDBY, begun=True),
         )
-        node = Node(Config("r8", ("r9",), site="hall", far={"r1": "", "r2": "", "r5": "dock"}), 1, VoteRecord(ours), 0)
-        return Told(1, 0, node.status(0))
+        node = Node(
+            Config("r8", ("r9",), grace_ms=300, site="hall", far={"r1": "", "r2": "", "r5": "dock"}), 1, VoteRecord(ours), 0
+        )
+        return Told(1, 0, node.status(self.lived_ms * MS))
 
 
 def heard(lines: Lines, monkeypatch: pytest.MonkeyPatch, *, asked: int) -> list[Event]:
@@ -111,7 +116,36 @@ def test_a_robot_that_is_of_no_other_site_is_not_told_of(tmp_path: Path, monkeyp
 def test_a_robot_tells_what_was_recovered_at_its_own_site_and_nothing_else(tmp_path: Path) -> None:
     lines = Lines(settings(tmp_path, SITES, me="r8"), {})
     told = asyncio.run(Recoveries(lines).told())
-    assert msgspec.convert(told, Answer) == Answer((MAPPER,))
+    assert set(msgspec.convert(told, Answer).recovered) == {MAPPER, Recovery("/lab/waits", SPAN, "r8")}
+
+
+def test_a_robot_does_not_speak_for_its_site_before_it_has_heard_its_neighbours(tmp_path: Path) -> None:
+    lines = Lines(settings(tmp_path, SITES, me="r8"), {})
+    lines.lived_ms = 200
+    with pytest.raises(AgentError, match="has not heard each robot of its site"):
+        asyncio.run(Recoveries(lines).told())
+
+
+def test_a_robot_speaks_for_the_robots_of_its_own_site_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = Lines(settings(tmp_path, SITES), {"r5": Answer((MAPPER,)), "r9": Answer(())})
+    assert heard(lines, monkeypatch, asked=6) == [SitesHeard()]
+
+
+def test_the_core_is_told_what_has_changed_and_all_of_it_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    both = {"r5": Answer(()), "r9": Answer((MAPPER,))}
+    lines = Lines(settings(tmp_path, SITES), both)
+    heard(lines, monkeypatch, asked=20)
+    assert lines.events.count(Recovered("/lab/mapper", SPAN + 1, "r9")) == 1
+    monkeypatch.setattr(recoveries, "AGAIN_S", 0.002)
+    lines = Lines(settings(tmp_path, SITES), both)
+    heard(lines, monkeypatch, asked=20)
+    assert lines.events.count(Recovered("/lab/mapper", SPAN + 1, "r9")) > 1
+
+
+def test_of_one_answer_no_more_is_read_than_a_robot_can_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flood = Answer(tuple(Recovery(f"/lab/c{number}", SPAN, "r9") for number in range(COMPONENTS_MAX + 5)))
+    lines = Lines(settings(tmp_path, SITES), {"r5": Answer(()), "r9": flood})
+    assert len(heard(lines, monkeypatch, asked=6)) == COMPONENTS_MAX + 1
 
 
 def test_a_robot_whose_agent_is_starting_gives_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

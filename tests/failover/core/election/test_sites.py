@@ -6,7 +6,19 @@ import pytest
 from msgspec.structs import replace
 
 from failover.core import acts
-from failover.core.events import Event, Handover, Promote, Recovered, Release, Run, SitesHeard, Started, Stopped, TeamChanged
+from failover.core.events import (
+    Event,
+    Handover,
+    Promote,
+    Recovered,
+    Release,
+    Restored,
+    Run,
+    SitesHeard,
+    Started,
+    Stopped,
+    TeamChanged,
+)
 from failover.core.peer_claims import EPOCHS_AWAY_MAX
 from failover.core.types import SPAN, ComponentView, Config, Held, Record, Rule, State, VoteRecord
 from failover.core.wire.messages import HOLDS
@@ -201,3 +213,28 @@ def test_a_robot_of_its_former_site_that_boots_hears_from_no_neighbour_that_it_i
     unknown.hear("robot1", entry(State.STANDBY, SPAN + 2, "robot3", NEWEST, flags=HOLDS))
     tell(unknown, Recovered(NAME, SPAN + 2, "robot4"))
     assert "an operator recovered it at robot4" in " ".join(view(unknown).notes)
+
+
+@pytest.mark.parametrize(("ours", "is_first"), [("dock", True), ("mill", False)])
+def test_of_two_sites_where_it_was_recovered_the_one_whose_name_sorts_first_goes_on(ours: str, *, is_first: bool) -> None:
+    talk = booted(Record(NAME, SPAN, state=State.STANDBY, spec=SPEC, begun=True), config=replace(ALONE, site=ours))
+    tell(talk, Recovered(NAME, SPAN + 3, "robot3"))
+    talk.tick(1_000)
+    assert f"the site of {'robot1' if is_first else 'robot3'}, whose name sorts first, goes on" in " ".join(view(talk).notes)
+    tell(talk, Restored(NAME, SPAN + 1, NEWEST, 0), Recovered(NAME, SPAN + 3, "robot3"))
+    talk.tick(1_000)
+    assert view(talk).state is State.PRIMARY and view(talk).epoch == (2 * SPAN + 1 if is_first else SPAN + 1)
+    assert is_first == ("two copies may act" not in " ".join(view(talk).notes))
+    assert sum("whose name sorts first" in one.sentence for ready in talk.readies for one in ready.told) == 1
+    if not is_first:
+        tell(talk, Recovered(NAME, 2 * SPAN + 1, "robot3"))
+        assert talk.orders(acts.KeepAside) and view(talk).primary == "robot3"
+
+
+def test_what_began_anew_after_a_release_is_no_other_copy_of_it() -> None:
+    talk = booted(RAN_HERE)
+    tell(talk, THERE, SitesHeard(), Release(4, NAME), Run(5, SPEC), Started(NAME, SPAN + 2))
+    tell(talk, replace(THERE, epoch=SPAN + 9))
+    talk.tick(1_000)
+    assert view(talk).epoch == SPAN + 2 and not view(talk).recovered and view(talk).state is State.PRIMARY
+    assert "operator" not in " ".join(view(talk).notes)
