@@ -24,8 +24,8 @@ from failover.core.election.consent import STATES, state_of
 from failover.core.types import ENDED, EPOCH_SAID_MAX, HOLDING, MS, PEERS_MAX, Config, State
 from failover.core.wire.messages import BEGUN, FREE, HOLDS, NEEDS_BASE, OPEN, Beat, Entry
 
-EPOCHS_AWAY_MAX = 1 << 20
-"""Epochs that may have passed while this robot was away: one each second for twelve days, one each minute for two years."""
+EPOCHS_AWAY_MAX = 1 << 26
+"""Epochs that may have passed while this robot was away: one each second for two years, or 1,023 recoveries at another site."""
 
 MANY = 10
 """The event log tells of the first entry that was refused, and of each that makes so many times as many."""

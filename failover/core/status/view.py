@@ -30,7 +30,7 @@ COPIES_LATE = 3
 
 def status(components: dict[str, Component], turn: Turn, boot: int, testimony: Testimony) -> StatusView:
     """Everything, as this robot sees it."""
-    views = tuple(_component(component, turn) for _, component in sorted(components.items()) if not _is_nothing(component))
+    views = tuple(_component(component, turn) for _, component in sorted(components.items()) if not _is_nothing(component, turn))
     peers = tuple(
         replace(peer, refused=testimony.told(peer.robot, turn.now_ns), doubted=testimony.is_recent(peer.robot, turn.now_ns))
         for peer in turn.team.views(turn.now_ns)
@@ -45,9 +45,14 @@ def status(components: dict[str, Component], turn: Turn, boot: int, testimony: T
     )
 
 
-def _is_nothing(component: Component) -> bool:
-    """Whether it is a name alone: heard of only, or of a start that was refused, whose epoch must not be forgotten."""
-    return component.state is State.ABSENT or (component.state is State.RELEASED and component.spec is None)
+def _is_nothing(component: Component, turn: Turn) -> bool:
+    """Whether it is a name alone: heard of only, or of a start that was refused, whose epoch must not be forgotten.
+
+    What agent.toml declares is more, where it waits for other sites: an operator looks for it.
+    """
+    if component.state is State.ABSENT:
+        return not (component.autostart and turn.config.runs(turn.me) and sites.waits_ns(component, turn))
+    return component.state is State.RELEASED and component.spec is None
 
 
 def _component(component: Component, turn: Turn) -> ComponentView:
@@ -223,10 +228,13 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
         notes.append(f"a snapshot was not stored at {turn.me}: {component.unstored}")
     if component.state is State.STANDBY and (left_ns := pair.waits_after_boot_ns(component, turn)):
         notes.append(_waits_after_boot(component, turn, left_ns))
-    if component.state is State.STANDBY and (left_ns := sites.waits_ns(component, turn)):
+    is_idle = component.state in (State.ABSENT, State.STANDBY) and not component.is_elsewhere
+    if is_idle and (left_ns := sites.waits_ns(component, turn)):
+        begins = "claims" if component.epoch else "starts"
         notes.append(
             f"waiting: an operator may have recovered it at another site, and not every site has answered since {turn.me} started"
-            f"; {turn.me} claims it in {left_ns / NS_PER_S:.0f} s (boot_patience_s); failover promote does not wait"
+            f"; {turn.me} {begins} it in {left_ns / NS_PER_S:.0f} s (boot_patience_s)"
+            + ("; failover promote does not wait" if component.epoch else "")
         )
     if contention := sites.contention(component, turn):
         notes.append(contention)

@@ -7,7 +7,7 @@ import pytest
 from failover.core.events import Promote, Received, Run, Tick
 from failover.core.node import Node
 from failover.core.peer_claims import EPOCHS_AWAY_MAX
-from failover.core.types import COMPONENTS_MAX, EPOCH_MAX, EPOCH_SAID_MAX, MS, Config, Record, State, VoteRecord
+from failover.core.types import COMPONENTS_MAX, EPOCH_MAX, EPOCH_SAID_MAX, MS, SPAN, Config, Record, State, VoteRecord
 from failover.core.wire import codec
 from failover.core.wire.messages import Beat, Echo, Entry
 from tests.failover.core.election.test_majority import NAME, NEWEST, ROBOT, SPEC, Talk, entry
@@ -24,7 +24,7 @@ def epoch(talk: Talk) -> int:
     return next((one.epoch for one in talk.node.status(talk.now_ns).components if one.name == NAME), 0)
 
 
-@pytest.mark.parametrize("passed", [1, 5_000, EPOCHS_AWAY_MAX - 1])
+@pytest.mark.parametrize("passed", [1, 5_000, 500 * SPAN, EPOCHS_AWAY_MAX - 1])
 def test_as_many_epochs_as_can_have_passed_are_believed(passed: int) -> None:
     talk = Talk(PAIR, VoteRecord((Record(NAME, 7, "robot1", State.STANDBY, spec=SPEC),)))
     talk.hear("robot1", entry(State.PRIMARY, 7 + passed, "robot1", NEWEST))

@@ -21,7 +21,7 @@ from failover.core.events import (
 )
 from failover.core.peer_claims import EPOCHS_AWAY_MAX
 from failover.core.types import SPAN, ComponentView, Config, Held, Record, Rule, State, VoteRecord
-from failover.core.wire.messages import HOLDS
+from failover.core.wire.messages import FREE, HOLDS, OPEN
 from tests.failover.core.election.test_majority import NAME, NEWEST, SPEC, Talk, entry
 
 FAR = {"robot3": "hall"}
@@ -84,7 +84,7 @@ def test_a_declared_program_begins_on_a_new_disk_once_the_other_site_has_told_th
     first, second = Talk(config), Talk(config)
     for talk in (first, second):
         talk.tick(4_000)
-        assert not talk.orders(acts.Start)
+        assert not talk.orders(acts.Start) and "starts it in 1 s (boot_patience_s)" in " ".join(view(talk).notes)
     tell(first, SitesHeard())
     tell(second, THERE, SitesHeard())
     for talk in (first, second):
@@ -161,9 +161,9 @@ def test_votes_elect_no_robot_for_what_another_site_has() -> None:
     talk = Talk(THREE, VoteRecord((record,)), HELD)
     tell(talk, THERE, SitesHeard())
     for _ in range(100):
-        talk.hear("robot2", entry(State.STANDBY, 1, "robot1", NEWEST))
-        talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
-        talk.tick(20)
+        talk.hear("robot2", entry(State.STANDBY, 1, "robot1", NEWEST, flags=FREE | OPEN))
+        talk.hear("witness1", entry(State.STANDBY, 1, "robot1", flags=FREE | OPEN))
+        talk.tick(17)
     assert view(talk).primary == "robot3" and view(talk).epoch == SPAN + 1
 
 
