@@ -518,11 +518,11 @@ def heard_end(component: Component, turn: Turn, sender: str, entry: Entry, their
     if component.state is State.STOPPING or (component.state in ENDED and entry.epoch == component.epoch and not forgotten):
         return
     component.epoch, component.primary, component.status = entry.epoch, entry.primary, entry.status
+    component.elsewhere = -abs(component.elsewhere)
     component.entrusted, component.trusted = (), False
     component.reason = f"as {sender} says" if theirs is State.FAILED else ""
     component.move(_END_CAUSES[theirs])
     if theirs is State.RELEASED:
-        component.elsewhere = -abs(component.elsewhere)
         drop(component, turn, f"{sender} released it")
     turn.say(component, f"{turn.me} records that it is {theirs}, as {sender} says")
 

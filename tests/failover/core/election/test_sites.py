@@ -238,3 +238,11 @@ def test_what_began_anew_after_a_release_is_no_other_copy_of_it() -> None:
     talk.tick(1_000)
     assert view(talk).epoch == SPAN + 2 and not view(talk).recovered and view(talk).state is State.PRIMARY
     assert "operator" not in " ".join(view(talk).notes)
+
+
+def test_what_began_anew_at_a_neighbour_after_a_release_and_ended_there_is_not_elsewhere() -> None:
+    talk = Talk(PAIR, VoteRecord((Record(NAME, SPAN + 1, "robot3", State.STANDBY, spec=SPEC, elsewhere=1),)), HELD)
+    talk.hear("robot1", entry(State.FINISHED, SPAN + 2, "robot1"))
+    assert view(talk).state is State.FINISHED and "operator" not in " ".join(view(talk).notes)
+    tell(talk, Recovered(NAME, SPAN + 5, "robot3"))
+    assert view(talk).primary == "robot1"
