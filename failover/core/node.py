@@ -342,6 +342,8 @@ class Node:
                     acts.Answer(event.request, False, f"{name} is not known at {turn.me}; failover status lists the components")
                 )
             return []
+        if isinstance(event, Recovered):
+            return [component] if sites.recovered(component, turn, event) else []
         _tell(component, turn, event)
         return [component]
 
@@ -560,8 +562,6 @@ def _tell(component: Component, turn: Turn, event: Event) -> None:
             archived.damaged(component, turn, event)
         case Archived():
             archived.archived(component, event)
-        case Recovered():
-            sites.recovered(component, turn, event)
         case ActFailed():
             exits.failed(component, turn, event)
         case Exited():

@@ -26,20 +26,16 @@ from failover.core.wire.messages import Entry
 CURE = "to bring it back: failover-agent recover {} at a robot of this site, while its agent is stopped"
 
 
-def recovered(component: Component, turn: Turn, event: Recovered) -> None:
-    """A robot of another site runs it there, or did, by the order of an operator.
+def recovered(component: Component, turn: Turn, event: Recovered) -> bool:
+    """A robot of another site runs it there, or did, by the order of an operator. Returns whether that is news.
 
     What is said again changes nothing; nor does an epoch that nobody can have opened yet.
     """
     span = event.epoch // SPAN
     if event.robot not in turn.config.far or event.epoch > epoch_max(component, turn) or span < max(component.span, 1):
-        return
+        return False
     if span == component.span:
-        if is_ours(component, turn):
-            _contend(component, turn, event.robot)
-        else:
-            _moved_there(component, turn, event)
-        return
+        return (_contend if is_ours(component, turn) else _moved_there)(component, turn, event)
     turn.say(component, f"an operator recovered it at {event.robot}, of another site, in epoch {event.epoch}")
     if component.holding:
         lose(component, turn, event.robot, Entry(component.name, 0, event.epoch, event.robot))
@@ -49,21 +45,27 @@ def recovered(component: Component, turn: Turn, event: Recovered) -> None:
             component.move(Cause.FOLLOW)
     component.elsewhere = span
     admit(component, turn, "")
+    return True
 
 
-def _moved_there(component: Component, turn: Turn, event: Recovered) -> None:
+def _moved_there(component: Component, turn: Turn, event: Recovered) -> bool:
     """The same recovery: another robot of that site runs it, or this record names one that has left the team."""
     is_theirs = component.elsewhere != -component.span  # else begun anew here, after a release
     is_news = event.epoch > component.epoch or not component.is_elsewhere or component.primary not in turn.config.far
-    if is_theirs and is_news and not component.holding and component.state not in ENDED:
-        component.epoch, component.primary = max(component.epoch, event.epoch), event.robot
-        component.elsewhere = component.span
+    if not (is_theirs and is_news) or component.holding or component.state in ENDED:
+        return False
+    component.epoch, component.primary = max(component.epoch, event.epoch), event.robot
+    component.elsewhere = component.span
+    return True
 
 
-def _contend(component: Component, turn: Turn, rival: str) -> None:
-    if component.contender != (rival, component.span):
-        component.contender = rival, component.span
-        turn.say(component, contention(component, turn))
+def _contend(component: Component, turn: Turn, event: Recovered) -> bool:
+    rival, span = component.contender
+    if span == component.span and turn.config.far.get(rival) == turn.config.far[event.robot]:
+        return False
+    component.contender = event.robot, component.span
+    turn.say(component, contention(component, turn))
+    return True
 
 
 def contention(component: Component, turn: Turn) -> str:
