@@ -77,7 +77,8 @@ class Freshness:
         claimed = {name for name, one in node._components.items() if one.state is State.CLAIMING} if node is not None else set()
         for component in claimed - {name for of, name in self.claims if of == robot}:
             chance = self.chances.get((robot, component))
-            self.claims[robot, component] = chance is not None and not self._is_excused(world, robot, chance)
+            freed_ns = node._components[component].freed_ns if node is not None else 0
+            self.claims[robot, component] = chance is not None and not self._is_excused(world, robot, chance, freed_ns)
         for of, name in [one for one in self.claims if one[0] == robot and one[1] not in claimed]:
             if node is None or node._components[name].state is not State.TAKING_OVER:
                 del self.claims[of, name]
@@ -99,12 +100,17 @@ class Freshness:
             had = f"the archive had {chance.newest} when etcd would vote for it, {since_ms:.0f} ms ago"
             raise broken(world, f"{robot} resumes {act.component} from {act.position}: {had}")
 
-    def _is_excused(self, world: World, robot: str, chance: Chance) -> bool:
-        """Whether the archive showed what was old, or did not answer for as long as a takeover waits for it."""
+    def _is_excused(self, world: World, robot: str, chance: Chance, freed_ns: int) -> bool:
+        """Whether the archive showed what was old, or did not answer for as long as a takeover waits for it.
+
+        Args:
+            freed_ns: since when the robot waits, by its clock: since etcd would vote, or was not there to ask.
+        """
         assert world.archive is not None
         if world.archive.aged is not None or world.archive.true_since_ns > chance.true_ns:
             return True
-        waited_ns = world.now_ns - chance.true_ns
+        now_ns = world.local(world.robots[robot])
+        waited_ns = now_ns - (freed_ns or now_ns)
         answered = self.looked.get(robot, -1) >= chance.local_ns
         return not answered and waited_ns >= world.robots[robot].config.retry_ms * MS * CLOCKS
 
