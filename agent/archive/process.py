@@ -101,13 +101,12 @@ class Archivist:
                 with open(descriptors[0], "rb", buffering=0, closefd=False) as content:
                     return Done(size=archive.put_content(request.digest, content))
             case KeepCheckpoint():
-                require_room(
-                    self._aside, 2 * sum(os.fstat(one).st_size for one in descriptors)
-                )  # folded, and sealed or folded again
+                size = sum(os.fstat(one).st_size for one in descriptors)
+                require_room(self._aside, 2 * size)  # folded, and sealed or folded again
                 with folded_in_steps(descriptors, self._aside) as checkpoint:
-                    name, size = archive.put(checkpoint, self._settings.config.robot, self._spec(request.component))
+                    name, put_size = archive.put(checkpoint, self._settings.config.robot, self._spec(request.component))
                 archive.thin(request.component, self._settings.config.store.s3_keep, but=name)
-                return Done(name=name, size=size)
+                return Done(name=name, size=put_size)
             case ListCopies():
                 return Done(copies=tuple(archive.copies()))
             case Fetch(copy):

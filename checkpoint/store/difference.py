@@ -6,8 +6,7 @@ digest covers the state to which it leads (`checkpoint.store.chain`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import chain
+from collections.abc import Iterator, Mapping
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -21,6 +20,7 @@ from checkpoint.snapshot import format
 from checkpoint.snapshot.byte_sources import Source
 from checkpoint.snapshot.process_tree import every_mapping
 from checkpoint.store.chain import check_sum
+from checkpoint.store.fold_rules import cut
 
 
 class Known(Struct, frozen=True, eq=False):
@@ -86,8 +86,15 @@ def difference(base: Source, after: Known, before: Known, pages_max: int) -> Sna
         runs=_runs(changed, page_size),
         cleared=_runs(former.addresses[~stays], page_size),
         contents=np.ascontiguousarray(rows).reshape(-1).data,
-        output=tuple(chain.from_iterable(_newer(piece, before.ends.get(piece.stream, 0)) for piece in outline.output)),
+        output=tuple(_output_since(outline, before.ends)),
     )
+
+
+def _output_since(outline: Snapshot, ends: Mapping[int, int]) -> Iterator[OutputPiece]:
+    for piece in outline.output:
+        end = ends.get(piece.stream, 0)
+        if max(end, piece.offset) < piece.offset + len(piece.content):
+            yield cut(piece, end)
 
 
 def _number(known: Known) -> tuple[int, int]:
@@ -96,11 +103,3 @@ def _number(known: Known) -> tuple[int, int]:
 
 def _runs(addresses: Words, page_size: int) -> tuple[PageRun, ...]:
     return page_set.page_runs(page_set.extents_of_addresses(addresses, page_size))
-
-
-def _newer(piece: OutputPiece, end: int) -> tuple[OutputPiece, ...]:
-    """The part of a piece behind an offset of its stream."""
-    skipped = max(0, end - piece.offset)
-    if skipped >= len(piece.content):
-        return ()
-    return (replace(piece, offset=piece.offset + skipped, content=piece.content[skipped:]),)

@@ -54,13 +54,13 @@ def newest_output(output: tuple[OutputPiece, ...]) -> tuple[OutputPiece, ...]:
     """The end of each stream, so that a base that was folded a thousand times does not carry all that was ever written."""
     ends = {piece.stream: piece.offset + len(piece.content) for piece in output}
     return tuple(
-        _cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE)
+        cut(piece, ends[piece.stream] - FOLDED_OUTPUT_SIZE)
         for piece in output
         if piece.offset + len(piece.content) >= ends[piece.stream] - FOLDED_OUTPUT_SIZE
     )
 
 
-def _cut(piece: OutputPiece, first: int) -> OutputPiece:
+def cut(piece: OutputPiece, first: int) -> OutputPiece:
     """The part of a piece from an offset of its stream on."""
     skipped = max(0, first - piece.offset)
     return replace(piece, offset=piece.offset + skipped, content=piece.content[skipped:])

@@ -202,7 +202,9 @@ class Archive:
         header = format.verify(checkpoint.fileno())
         if not header.is_base:
             raise FormatError("a delta is not archived: it is no whole checkpoint")
-        before, _ = self._found(folder := f"{self._team}/{folder_name(header.component)}")
+        folder = f"{self._team}/{folder_name(header.component)}"
+        there = self._found(folder)
+        before, _ = there
         if self._by_epoch and before and before[0].epoch > header.epoch:
             raise ArchiveError(
                 f"the archive has {header.component} in epoch {before[0].epoch}, and this copy has epoch {header.epoch}: another "
@@ -212,15 +214,17 @@ class Archive:
             if _stem(copy.file) == _stem(file_name(header)) and not self._lack_of(copy):
                 return copy.name, copy.size
         try:
-            return self._put_now(checkpoint, header, robot, spec, folder)
+            return self._put_now(checkpoint, header, robot, spec, folder, there)
         except PutRefusedError as error:
             if error.why == FULL:
                 raise
-            return self._put_now(checkpoint, header, robot, spec, folder)  # another member was first
+            return self._put_now(checkpoint, header, robot, spec, folder, self._found(folder))  # another member was first
 
-    def _put_now(self, checkpoint: BinaryIO, header: Header, robot: str, spec: bytes, folder: str) -> tuple[str, int]:
+    def _put_now(
+        self, checkpoint: BinaryIO, header: Header, robot: str, spec: bytes, folder: str, there: tuple[list[Copy], list[_Object]]
+    ) -> tuple[str, int]:
         """Keep a checkpoint as the newest copy, later than those before. Where there is no room, older ones of it go first."""
-        before, found = self._found(folder)
+        before, found = there
         now_s = time.time()
         stamp_ms = min(max([int(1000 * now_s), *(one.stamp_ms + 1 for one in found)]), STAMP_MS_MAX)
         label = msgspec.msgpack.encode(Label(robot, now_s, spec))
@@ -240,7 +244,7 @@ class Archive:
             self._last.pop(header.component, None)
         if parent and self._objects.size(parent.name) is None:  # another member has removed it meanwhile
             self._objects.remove(name)
-            return self._put_now(checkpoint, header, robot, spec, folder)
+            return self._put_now(checkpoint, header, robot, spec, folder, self._found(folder))
         if self._last is not None and known is not None and not known.is_tree:
             self._last[header.component] = Last(name, known, self._keys)
             while len(self._last) > LAST_MAX:
