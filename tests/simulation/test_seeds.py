@@ -22,8 +22,8 @@ from tests.simulation.mutants import (
     mistaken,
 )
 
-SEEDS = int(os.environ.get("FAILOVER_SEEDS", "300"))
-APART_SHARE = 6
+SEEDS = int(os.environ.get("FAILOVER_SEEDS", "150"))
+APART_SHARE = 3
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""
 
