@@ -23,6 +23,7 @@ import os
 import signal
 import struct
 import threading
+import zlib
 from collections import Counter
 from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING, Any, Final
@@ -80,6 +81,29 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeSch
                 super()._reschedule(node)
 
     return OneStage(config, log)
+
+
+# --- Which cases -----------------------------------------------------------------------------------------------------
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Of a test's cases take one in n, where it is ``sampled(n)``: always the same ones, spread over all its parameters.
+
+    All are taken with ``FAILOVER_CASES=all`` in the environment, and where a test is named on the command line.
+    """
+    if os.environ.get("FAILOVER_CASES") == "all" or any("::" in word for word in config.args):
+        return
+    cases: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("sampled"):
+            cases.setdefault(item.nodeid.split("[")[0], []).append(item)
+    left: set[pytest.Item] = set()
+    for of_one in cases.values():
+        count = -(-len(of_one) // of_one[0].get_closest_marker("sampled").args[0])
+        left.update(sorted(of_one, key=lambda item: zlib.crc32(item.nodeid.encode()))[count:])
+    if left:
+        config.hook.pytest_deselected(items=list(left))
+        items[:] = [item for item in items if item not in left]
 
 
 # --- Where the time goes ---------------------------------------------------------------------------------------------

@@ -94,3 +94,24 @@ def test_a_run_ends_as_usual_whatever_its_tests_do(tmp_path: Path) -> None:
     assert f"{len(FAILED)} failed, {PASSED} passed" in ran.stdout, said
     assert "in test_hangs_for_good" in said, "the stacks of a test that nothing but its worker's end could end"
     assert "a hook is wrong" in said
+
+
+@pytest.mark.parametrize(("cases", "words", "count"), [("", [], 2), ("all", [], 6), ("", ["test_many.py::test_many"], 6)])
+def test_of_a_test_with_many_cases_a_run_takes_some_unless_all_are_asked_for(
+    cases: str, words: list[str], count: int, tmp_path: Path
+) -> None:
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = sampled(n): one case in n\n")
+    (tmp_path / "conftest.py").write_text('pytest_plugins = ["tests.runner"]\n')
+    many = '@pytest.mark.sampled(3)\n@pytest.mark.parametrize("a", [1, 2])\n@pytest.mark.parametrize("b", [1, 2, 3])\n'
+    (tmp_path / "test_many.py").write_text(f"import pytest\n\n{many}def test_many(a, b): pass\n")
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--collect-only", "-q", *words]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    ran = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env=environment | {"PYTHONPATH": str(ROOT), "FAILOVER_CASES": cases},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.stdout.count("::test_many[") == count, ran.stdout + ran.stderr

@@ -66,6 +66,7 @@ def some_text() -> str:
     return " ".join(words)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES, ids=str)
 @pytest.mark.slow
 def test_a_program_brought_back_three_times_computes_the_same(case: Case, prepared: Callable[[Case, str], Path]) -> None:
@@ -82,6 +83,7 @@ AS_USER = [replace(case, argv=("/usr/bin/python3", *case.argv[1:])) for case in 
 ]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", AS_USER, ids=str)
 @pytest.mark.root
 @pytest.mark.slow

@@ -182,6 +182,7 @@ def expected(found: list[Case], not_yet: dict[str, str]) -> list[ParameterSet]:
 Way = Callable[[Program, Path], Program]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", [copied, straight])
 @pytest.mark.parametrize("case", expected(PRESERVED, NOT_YET))
 def test_a_restored_program_finds_everything_as_it_was(case: Case, way: Way, compiled: Compiled, tmp_path: Path) -> None:

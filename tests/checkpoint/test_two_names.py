@@ -80,6 +80,7 @@ def test_a_semaphore_is_made_where_it_is_missing(compiled: Compiled, tmp_path: P
 HELD = [("map", "map"), ("map", "open"), ("open", "map"), ("open", "open"), ("lock", "lock")]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.compiler
 @pytest.mark.parametrize(("mine", "theirs"), HELD)
 @pytest.mark.parametrize("where", ["memory", "disk", "far"])

@@ -79,6 +79,7 @@ def behind(robot: RobotMachine) -> list[str]:
     return [note for note in robot.status()["notes"] if "ARCHIVE BEHIND" in note]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", s3_servers.KINDS)
 def test_a_machine_with_nothing_but_the_teams_keys_goes_on_where_all_robots_were_lost(

@@ -93,6 +93,7 @@ def numbers(content: bytes) -> list[int]:
     return [int(line) for line in content.split()]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", WAYS)
 def test_whoever_is_killed_the_program_runs_on(pair: Pair, way: str) -> None:
     first, second = pair
@@ -143,6 +144,7 @@ def copies(robot: RobotMachine) -> tuple[int, int]:
     return programs, ours
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_restore_that_is_broken_off_leaves_nothing_behind(pair: Pair, way: str) -> None:
     """The robot that is to go on with the program loses a part of its agent in the middle of it, again and again."""

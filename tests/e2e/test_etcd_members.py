@@ -57,6 +57,7 @@ def revision_at(site: Site, member: int) -> int:
     return int(told["header"]["revision"])
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("is_killed", [True, False], ids=["killed", "standing still"])
 def test_robots_keep_their_leases_while_the_member_that_they_ask_is_lost(site: Site, tmp_path: Path, is_killed: bool) -> None:
     record = tmp_path / "acts"
@@ -95,6 +96,7 @@ def test_without_a_majority_of_etcd_programs_run_on_and_nobody_is_taken_over(sit
     robots.counts_on_elsewhere(site.first, site.second, 10)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("is_claiming", [False, True], ids=["before the votes", "between the votes"])
 def test_etcds_leader_stands_still_and_another_member_decides(site: Site, tmp_path: Path, is_claiming: bool) -> None:
     record = tmp_path / "acts"

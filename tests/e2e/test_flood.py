@@ -54,6 +54,7 @@ def refused(robot: RobotMachine) -> int:
     return sum(robot.status()["beats"]["refused"].values())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.root
 @pytest.mark.parametrize("frame", [bytes(64), MAGIC + bytes(62)], ids=["garbage", "garbage that begins as a beat"])
 def test_a_flood_replaces_nobody_and_takes_nothing_over(pair: Pair, frame: bytes) -> None:

@@ -139,6 +139,7 @@ def _with_team(robot: RobotMachine, change: Callable[[Team], Team]) -> Callable[
     return lambda: team.write(directory, right)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("spoil", "at_first", "at_second"),
     [

@@ -109,6 +109,7 @@ def busy_keepers(robot: RobotMachine) -> list[int]:
     return busy if len(busy) == 1 else []
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", STOPPED)
 def test_who_stops_and_wakes_up_stale_has_not_run_on(pair: Pair, way: str) -> None:
     first, second = pair
@@ -135,6 +136,7 @@ def test_who_stops_and_wakes_up_stale_has_not_run_on(pair: Pair, way: str) -> No
 ALONE = [("worker", signal.SIGSTOP), ("keeper", signal.SIGSTOP), ("guard", signal.SIGSTOP), ("guard", signal.SIGKILL)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("part", "number"), ALONE)
 def test_a_part_that_stops_alone_is_replaced_and_nobody_takes_over(pair: Pair, part: str, number: int) -> None:
     first, second = pair

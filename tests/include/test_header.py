@@ -83,6 +83,7 @@ CALLS = {
 # --- Compiling -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("header", "call"), CALLS.items(), ids=CALLS.keys())
 @pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
 @pytest.mark.parametrize(

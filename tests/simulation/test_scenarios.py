@@ -18,6 +18,7 @@ def test_the_story_comes_true(path: Path) -> None:
     Story().play(path.read_text())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("mutant", "name"), SPOILERS, ids=lambda one: one if isinstance(one, str) else one.__name__)
 def test_a_mistake_in_the_rules_spoils_the_story(mutant: Mutant, name: str) -> None:

@@ -129,6 +129,7 @@ def test_a_mistake_in_the_rules_of_a_pair_is_caught_by_some_seed(mutant: Mutant)
     _catch(mutant, (PAIR,))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("mutant", ELECTIVE_MUTANTS, ids=lambda mutant: mutant.__name__)
 def test_a_mistake_in_the_rules_of_voters_is_caught_by_some_seed(mutant: Mutant) -> None:

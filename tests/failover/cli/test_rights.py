@@ -295,6 +295,7 @@ ASKED: Mapping[str, tuple[Craft, str]] = {
 """What a file may ask for; a part of what is said of it, "" where no more than its owner's right is asked for."""
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("field", ASKED)
 def test_root_gives_a_users_file_that_users_rights_at_most_and_says_what_it_asked_for(
     field: str, honest: Snapshot, place: Path
@@ -306,6 +307,7 @@ def test_root_gives_a_users_file_that_users_rights_at_most_and_says_what_it_aske
         assert said in back.notes + back.error, back.notes + back.error
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("field", ASKED)
 def test_an_ordinary_user_gets_by_no_file_more_than_he_has(field: str, honest: Snapshot, place: Path) -> None:
     craft, _ = ASKED[field]
@@ -341,6 +343,7 @@ def given_by_an_agent(crafted: Snapshot, file: Path) -> list[str]:
     return []
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("field", ASKED)
 def test_an_agent_of_root_gives_an_ordinary_owners_component_nothing_above_him(field: str, honest: Snapshot, place: Path) -> None:
     """What a standby was sent is refused (`check_rights`), or comes back with its owner's rights."""

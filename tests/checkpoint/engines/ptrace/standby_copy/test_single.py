@@ -100,6 +100,7 @@ def deltas_of(session: Session, dice: random.Random, count: int) -> Iterator[Sna
         session.acknowledge(delta.position)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("ways", COVERED)
 def test_a_copy_that_follows_the_deltas_is_the_program(ways: str, compiled: Compiled, tmp_path: Path) -> None:
     program, dice = compiled("mutator", "-O2"), random.Random(1)

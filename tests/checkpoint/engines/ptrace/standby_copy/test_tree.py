@@ -285,6 +285,7 @@ OF_EACH_OTHER = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("program", OF_EACH_OTHER)
 def test_what_processes_are_to_each_other_comes_back_from_their_copy_over_two_lives(program: str, tmp_path: Path) -> None:
     """Each of these programs says what differs."""
