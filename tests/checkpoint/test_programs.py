@@ -66,7 +66,6 @@ def some_text() -> str:
     return " ".join(words)
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES, ids=str)
 @pytest.mark.slow
 def test_a_program_brought_back_three_times_computes_the_same(case: Case, prepared: Callable[[Case, str], Path]) -> None:

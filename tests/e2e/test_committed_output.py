@@ -128,7 +128,6 @@ def until_more(files: list[Path]) -> None:
         robots.until(lambda file=file, seen=seen: len(lines_of(file.read_bytes())) > seen + MORE, "a reader to see more")  # type: ignore[misc]
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.timeout(max(120, CUTS * 30))
 @pytest.mark.parametrize("engine", PROGRAMS)
 def test_a_reader_sees_each_line_once_and_in_order_across_power_cuts(tmp_path: Path, engine: str) -> None:
