@@ -89,9 +89,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeSch
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Of a test's cases take one in n, where it is ``sampled(n)``: always the same ones, spread over all its parameters.
 
-    All are taken with ``FAILOVER_CASES=all`` in the environment, and where a test is named on the command line.
+    All are taken with ``FAILOVER_CASES=all`` in the environment, and where the command line names tests, by ``::`` or ``-k``.
     """
-    if os.environ.get("FAILOVER_CASES") == "all" or any("::" in word for word in config.args):
+    is_named = config.option.keyword or any("::" in word for word in config.args)
+    if is_named or os.environ.get("FAILOVER_CASES") == "all":
         return
     cases: dict[str, list[pytest.Item]] = {}
     for item in items:

@@ -73,6 +73,15 @@ FAILED = [
 PASSED = 8
 
 
+def run_pytest(directory: Path, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Have another pytest run the tests of a directory, with these variables in its environment."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    environment["PYTEST_DEBUG_TEMPROOT"] = str(directory)  # ours is open to other users in some tests; pytest closes it
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", *words]
+    environment |= {"PYTHONPATH": str(ROOT)} | variables
+    return subprocess.run(command, cwd=directory, env=environment, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_run_ends_as_usual_whatever_its_tests_do(tmp_path: Path) -> None:
@@ -80,12 +89,7 @@ def test_a_run_ends_as_usual_whatever_its_tests_do(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text(CONFTEST)
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "2", "-q", "-rf"]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    environment["PYTEST_DEBUG_TEMPROOT"] = str(tmp_path)  # ours is open to other users in some tests; pytest closes it
-    ran = subprocess.run(
-        command, cwd=tmp_path, env=environment | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
-    )
+    ran = run_pytest(tmp_path, "-n", "2", "-rf")
     said = ran.stdout + ran.stderr
     assert ran.returncode == pytest.ExitCode.TESTS_FAILED, said
     assert "INTERNALERROR" not in said
@@ -96,7 +100,9 @@ def test_a_run_ends_as_usual_whatever_its_tests_do(tmp_path: Path) -> None:
     assert "a hook is wrong" in said
 
 
-@pytest.mark.parametrize(("cases", "words", "count"), [("", [], 2), ("all", [], 6), ("", ["test_many.py::test_many"], 6)])
+@pytest.mark.parametrize(
+    ("cases", "words", "count"), [("", [], 2), ("all", [], 6), ("", ["test_many.py::test_many"], 6), ("", ["-k", "many"], 6)]
+)
 def test_of_a_test_with_many_cases_a_run_takes_some_unless_all_are_asked_for(
     cases: str, words: list[str], count: int, tmp_path: Path
 ) -> None:
@@ -104,14 +110,5 @@ def test_of_a_test_with_many_cases_a_run_takes_some_unless_all_are_asked_for(
     (tmp_path / "conftest.py").write_text('pytest_plugins = ["tests.runner"]\n')
     many = '@pytest.mark.sampled(3)\n@pytest.mark.parametrize("a", [1, 2])\n@pytest.mark.parametrize("b", [1, 2, 3])\n'
     (tmp_path / "test_many.py").write_text(f"import pytest\n\n{many}def test_many(a, b): pass\n")
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--collect-only", "-q", *words]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    ran = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env=environment | {"PYTHONPATH": str(ROOT), "FAILOVER_CASES": cases},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ran = run_pytest(tmp_path, "--collect-only", *words, FAILOVER_CASES=cases)
     assert ran.stdout.count("::test_many[") == count, ran.stdout + ran.stderr
