@@ -6,7 +6,6 @@ import contextlib
 import os
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,6 +23,7 @@ from failover.archive.objects import OLDER, FolderObjects, PutRefusedError
 from failover.archive.witness import WANTED, Listed, Put, Read, Size, WitnessObjects
 from failover.errors import ArchiveError
 from tests import witnesses
+from tests.agent.guards import until
 from tests.checkpoint.snapshots import COMPONENT, page, pages_of, snapshot
 from tests.witnesses import GATE, ROBOT, Gate
 
@@ -316,9 +316,7 @@ def test_a_transfer_that_is_dropped_while_its_copy_is_stored_leaves_a_copy_that_
     gate.drop_transfers()
     dropped.set()
     putting.join()
-    while (size := WitnessObjects(gate, KEY).size(FIRST)) is None:  # the witness's thread may not have ended yet
-        time.sleep(0.01)
-    assert size == 3 << 20
+    assert until(lambda: WitnessObjects(gate, KEY).size(FIRST), "the witness's thread to end") == 3 << 20
 
 
 def test_the_witness_sees_what_was_removed_or_changed_on_its_disk(gate: Gate, content: BinaryIO) -> None:
