@@ -61,7 +61,9 @@ def team_config(settings: Settings) -> types.Config:
 
 def fetches(settings: Settings) -> bool:
     """Whether this robot takes checkpoints from the archive, of components whose primary it does not hear."""
-    return _rule(settings) is Rule.ETCD and bool(settings.config.store.s3) and settings.me.role == "robot"
+    store, rule = settings.config.store, _rule(settings)
+    wanted = (rule is Rule.ETCD and bool(store.s3)) or (rule is Rule.MAJORITY and store.resume)
+    return wanted and settings.me.role == "robot"
 
 
 def declared(settings: Settings, name: str, task: TaskConfig) -> types.ComponentSpec:

@@ -147,7 +147,8 @@ class Archiving:
             since = f"its newest copy is {age_s:.0f} s old" if shelf.position else f"it has had no copy for {age_s:.0f} s"
             is_waiting = self._busy_with not in ("", name)
             why = shelf.trouble or (f"it waits behind {self._busy_with}" if is_waiting else "a copy is on its way")
-            alone = "a robot that does not hear this one would resume from that copy" if fetches(self._settings) else ""
+            is_standby = fetches(self._settings) and self._settings.config.rule == "etcd"
+            alone = "a robot that does not hear this one would resume from that copy" if is_standby else ""
             stays = alone or "a standby, if it has one, protects it as before"
             behind.append(f"ARCHIVE BEHIND: {name}: {since}: {why}; {stays}; next try within {every_s} s")
         more = len(behind) - SAID_MAX

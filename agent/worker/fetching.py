@@ -1,4 +1,4 @@
-"""Takes checkpoints from the archive (``rule = "etcd"``, ``[store] s3``), of components whose primary this robot does not hear.
+"""Takes checkpoints from the archive, of components whose primary this robot does not hear (`agent.core_config.fetches`).
 
 Each ``s3_every_s``, and when the core orders a look, the archive's process lists the copies. What is newer than this robot's own
 goes into its store, verified; the core hears of it, and decides (`failover.core.replication.archived`). Nothing waits for it.
@@ -28,6 +28,7 @@ from agent.system import clock
 from agent.system.threads import to_its_end
 from agent.worker.archive_process import LEAST_RATE, ArchiveProcess, NotArchivedError
 from agent.worker.replication.receive_files import is_in_place
+from agent.worker.replication.send_sealed import Courier
 from checkpoint.engine import COOPERATIVE
 from checkpoint.errors import UNDECODABLE
 from checkpoint.model import Position, Snapshot
@@ -81,17 +82,19 @@ class Fetching:
         tell: Callable[[Event], None],
         kept: Callable[[Arrived], None],
         listed: Callable[[Collection[Copy], int], None] = lambda _copies, _begun_ns: None,
+        courier: Courier | None = None,
     ) -> None:
         """
         Args:
             told: the core's view of the team.
             kept: called with a checkpoint once the core has accepted it.
             listed: called with what the archive had, and the instant at which it was asked.
+            courier: the way to the witness that keeps the copies; None: they are elsewhere.
         """
         self._listed = listed
         self._settings, self._store = settings, store
         self._told, self._tell, self._kept = told, tell, kept
-        self._process = ArchiveProcess(settings.path)
+        self._process = ArchiveProcess(settings.path, courier)
         self._rounds = itertools.count()
         self._ordered = asyncio.Event()
         self._fetched: dict[str, Position] = {}
@@ -112,12 +115,24 @@ class Fetching:
         """Take copies until cancelled."""
         try:
             while True:
-                await self._round(next(self._rounds))
+                if await self._is_wanted():
+                    await self._round(next(self._rounds))
+                else:
+                    self._process.hang_up()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._ordered.wait(), self._settings.config.store.s3_every_s)
                 self._ordered.clear()
         finally:
             self._process.close()
+
+    async def _is_wanted(self) -> bool:
+        """Whether to turn to the archive now: robots that share nothing else always do, others where a primary is silent."""
+        if self._settings.config.rule == "etcd" or self._looked_for:
+            return True
+        with contextlib.suppress(*TROUBLE):
+            if (view := (await self._told()).status) is not None:
+                return not view.components or any(_takes(one.name, view) for one in view.components)
+        return True
 
     def look(self, component: str) -> None:
         """The core orders a look, because it could take that component over: what is fetched in advance gives way to it."""

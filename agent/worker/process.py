@@ -87,6 +87,11 @@ STORE_TRIES: Final = 50
 STORE_PAUSE_S: Final = 0.1
 """Between two tries to have the store: it is also what keeps two lives of an agent apart."""
 
+NO_RESUME: Final = (
+    "resume = true in [store] has no effect: two robots alone do not vote, and a server resumes nothing; set it on robots of a "
+    "team with a witness, or remove it, and restart the agent"
+)
+
 log = logging.getLogger("failover.lanes")
 
 
@@ -171,13 +176,16 @@ class Worker(Switchboard):
             courier = Courier(self.errands, self._shipper, witness, lambda: self._way_is_shut(witness)) if witness else None
             self._archiving = Archiving(self.settings, store, self._running_here, self._sources.open, self.tell, courier)
             self._task(self._archiving.run())
-        if fetches(self.settings):
-            from agent.worker.fetching import Fetching  # here: with rule = "etcd" and an archive alone
+            if fetches(self.settings):
+                from agent.worker.fetching import Fetching  # here: few robots go on from an archive
 
-            assert self._archiving is not None, "it fetches from the archive that it puts copies into"
-            listed = self._archiving.listed
-            self._fetching = Fetching(self.settings, store, lambda: self.ask("status"), self.tell, self._arrived, listed)
-            self._task(self._fetching.run())
+                listed = self._archiving.listed
+                self._fetching = Fetching(
+                    self.settings, store, lambda: self.ask("status"), self.tell, self._arrived, listed, courier
+                )
+                self._task(self._fetching.run())
+            elif self.settings.config.store.resume:
+                self._own_troubles.append(NO_RESUME)
         found = await self._find_guards(records)
         await self._mend_logs(found)
         if found:

@@ -22,6 +22,7 @@ class StoreConfig:
         s3_endpoint: URL of a server that speaks the protocol of S3; "": S3 itself, or what the environment says.
         s3_every_s: seconds between two copies of a component; one that has not changed is not copied again.
         s3_keep: copies of each component; older ones are removed.
+        resume: where members vote: a component of which no robot has a checkpoint any more resumes from its newest copy.
         sealed_size: at a witness: bytes of all sealed copies that it keeps, as "20GB"; "": it keeps none.
     """
 
@@ -30,6 +31,7 @@ class StoreConfig:
     s3_endpoint: str = ""
     s3_every_s: int = 60
     s3_keep: int = 10
+    resume: bool = False
     sealed_size: str = ""
 
     def __post_init__(self) -> None:
@@ -47,6 +49,8 @@ class StoreConfig:
             raise ValueError(f's3_endpoint is {self.s3_endpoint!r}, which is no URL; write "https://HOST:PORT"')
         if self.s3 and self.witness:
             raise ValueError(f"s3 is {self.s3!r} and witness {self.witness!r}: copies go to one place; remove one of the two")
+        if self.resume and not self.place:
+            raise ValueError("resume is true, and there is no archive; set s3 or witness, or remove resume")
         if self.sealed_size:
             try:
                 size_bytes(self.sealed_size)

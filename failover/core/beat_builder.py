@@ -10,6 +10,7 @@ from failover.core.frames.frame import beat_size_max
 from failover.core.types import EPOCH_MAX, HOLDING, Rule, State
 from failover.core.wire.codec import beat_size, entry_size
 from failover.core.wire.messages import (
+    BARE,
     BEGUN,
     FREE,
     FRESH,
@@ -48,7 +49,11 @@ def entry_of(component: Component) -> Entry:
     flags |= WANTS * (component.wanted is not None)
     flags |= STOOD * (component.holding and component.stood)
     flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
-    flags |= BEGUN * component.has_begun | FRESH * component.fresh
+    flags |= (
+        BEGUN * component.has_begun
+        | FRESH * component.fresh
+        | BARE * (component.elects and component.bare and newest is not None)
+    )
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,

@@ -277,6 +277,7 @@ class Node:
                 component.keeps_state = one.keeps_state
                 component.held = [position for position in one.positions if self._may_resume(component, position)]
                 standby.remember(component, self._config)
+                archived.remember(component, self._config)
 
     def _change_team(self, config: Config, now_ns: int) -> None:
         """Between two turns: who is a peer, how many are a majority. Leases that were granted and votes that were given stay."""

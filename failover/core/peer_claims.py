@@ -22,7 +22,7 @@ from failover.core.component import Component, Turn
 from failover.core.election import majority
 from failover.core.election.consent import STATES, state_of
 from failover.core.types import ENDED, EPOCH_SAID_MAX, HOLDING, MS, PEERS_MAX, Config, State
-from failover.core.wire.messages import BEGUN, FREE, HOLDS, NEEDS_BASE, OPEN, Beat, Entry
+from failover.core.wire.messages import BARE, BEGUN, FREE, HOLDS, NEEDS_BASE, OPEN, Beat, Entry
 
 EPOCHS_AWAY_MAX = 1 << 26
 """Epochs that may have passed while this robot was away: one each second for two years, or 1,023 recoveries at another site."""
@@ -164,7 +164,7 @@ def _beyond_role(config: Config, sender: str, entry: Entry) -> tuple[Beyond, str
     keeps = config.keeps(sender)
     if not keeps and (entry.position is not None or entry.flags & NEEDS_BASE):
         return Beyond.KEEPS, f"{who} says that it keeps checkpoints of {name}: it keeps none"
-    if entry.flags & ~(_VOTES | NEEDS_BASE) or entry.yields_to:
+    if entry.flags & ~(_VOTES | NEEDS_BASE | BARE) or entry.yields_to:
         return Beyond.ORDERS, f"{who} says of {name} what only a robot may (flags {entry.flags})"
     return None
 

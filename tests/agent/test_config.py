@@ -495,6 +495,7 @@ def test_no_member_of_any_site_is_called_as_etcd_is(site: str, directory: Path) 
         (('witness = "robot2"', 's3 = "/mnt"'), "copies go to one place; remove one of the two"),
         (('sealed_size = "20GB"',), "robot1 is a robot: sealed_size is for a witness"),
         (('sealed_size = "much"',), "sealed_size: 'much' is no size"),
+        (("resume = true",), "resume is true, and there is no archive; set s3 or witness, or remove resume"),
     ],
 )
 def test_who_keeps_sealed_copies_is_a_witness(lines: tuple[str, ...], said: str, directory: Path) -> None:

@@ -1,4 +1,7 @@
-"""A witness keeps sealed copies: it can read none of its disk or memory, gives them back, and what it alters is refused."""
+"""A witness keeps sealed copies: it can read none of its disk or memory, gives them back, and what it alters is refused.
+
+With ``resume = true`` robots that lost their disks go on from them by themselves.
+"""
 
 from __future__ import annotations
 
@@ -49,9 +52,10 @@ READ_SIZE = 16 << 20
 
 
 @contextlib.contextmanager
-def team(tmp_path: Path) -> Iterator[TeamStage]:
+def team(tmp_path: Path, more: str = "") -> Iterator[TeamStage]:
     """Two robots that put sealed copies into the keeping of a witness, and one program with secrets that is protected."""
-    with teams.acting(tmp_path, ROLES, BOOTS_FAST, OWN) as stage:
+    own = {name: table + (more if name != "gate" else "") for name, table in OWN.items()}
+    with teams.acting(tmp_path, ROLES, BOOTS_FAST, own) as stage:
         first, second, _ = (stage.members[name].directory / "team" for name in ROLES)
         keys.new_key(first)
         shutil.copy2(keys.key_path(first), keys.key_path(second))
@@ -110,6 +114,15 @@ def is_in_memory(pid: int) -> tuple[bool, int]:
     return found, size
 
 
+def lose_disks(stage: TeamStage) -> None:
+    """Both robots lose their power and their disks; what they are told at their set-up is on the new ones."""
+    stage.cut_power("robot1", "robot2")
+    for robot in (stage.members["robot1"], stage.members["robot2"]):
+        until(lambda robot=robot: is_gone(robot), "everything of it to have ended")  # type: ignore[misc]
+        for name in ("state", "run"):
+            shutil.rmtree(robot.directory / name)
+
+
 def test_nothing_of_a_program_is_readable_on_the_disk_or_in_the_memory_of_a_witness_that_keeps_it(tmp_path: Path) -> None:
     with team(tmp_path) as stage:
         first, second, gate = (stage.members[name] for name in ROLES)
@@ -144,11 +157,7 @@ def test_a_team_that_lost_every_disk_goes_on_from_the_witness_which_is_refused_w
         until(lambda: sealed_of(gate).get("copies", 0) >= 2, "two copies")
         number, newest = counted(first)[-1], copies(gate)[-1].name
         until(lambda: copies(gate)[-1].name > newest, "a later copy")
-        stage.cut_power("robot1", "robot2")
-        for robot in (first, second):
-            until(lambda robot=robot: is_gone(robot), "everything of it to have ended")  # type: ignore[misc]
-            for name in ("state", "run"):
-                shutil.rmtree(robot.directory / name)
+        lose_disks(stage)
         older, newest_copy = copies(gate)[-2:]
         whole = newest_copy.read_bytes()
         for spoiled in (whole[:-1] + bytes([whole[-1] ^ 1]), whole[:-100], older.read_bytes()):
@@ -167,3 +176,22 @@ def test_a_team_that_lost_every_disk_goes_on_from_the_witness_which_is_refused_w
         numbers = counted(second)
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "each number once, in order"
         robots.until_protected(second)
+
+
+@pytest.mark.parametrize("name", ["robot1", "robot2"], ids=["the robot that ran it", "its standby"])
+def test_with_resume_a_robot_that_is_back_without_its_disk_goes_on_from_the_witness(tmp_path: Path, name: str) -> None:
+    with team(tmp_path, "resume = true\n") as stage:
+        gate = stage.members["gate"]
+        until(lambda: sealed_of(gate).get("copies", 0) >= 2, "two copies")
+        number, newest = counted(stage.members["robot1"])[-1], copies(gate)[-1].name
+        until(lambda: copies(gate)[-1].name > newest, "a later copy")
+        lose_disks(stage)
+        back = stage.switch_on(name)
+        until(lambda: is_primary(back), f"{name} to run it")
+        until(lambda: counted(back) and counted(back)[-1] > number, "it to go on")
+        numbers = counted(back)
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "each number once, in order"
+        why = robots.failover(back, "why", "count").stdout
+        assert f"{name} has its checkpoint" in why and "from the archive" in why
+        stage.switch_on("robot2" if name == "robot1" else "robot1")
+        robots.until_protected(back)

@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING
 from checkpoint.model import Position
 from failover.core.events import Archived, Fetched, Looked
 from failover.core.types import MS, PEERS_MAX, ComponentSpec, State
-from tests.simulation.robots import KEEPS_STATE, Robot
+from tests.simulation.robots import KEEPS_STATE, Robot, vote_record_of
 
 if TYPE_CHECKING:
     from tests.simulation.coordinator import Fault
     from tests.simulation.world import World
+
+COPIES_MS = 200
+"""Between two copies of a component, in lives with an archive."""
 
 LATE_MS = 1_500
 """A put that was begun before a robot was replaced arrives so late at most."""
@@ -49,7 +52,8 @@ class SimulatedArchive:
     def begin(self) -> None:
         """Every robot turns to it each period, from now on."""
         for robot in self._world.robots.values():
-            self._turn(robot)
+            if robot.config.copies_ms:
+                self._turn(robot)
 
     def heal(self) -> None:
         """From now on it answers, soon."""
@@ -83,7 +87,7 @@ class SimulatedArchive:
 
     def _put(self, robot: Robot, component: str) -> None:
         kept = robot.store.get(component, [])
-        spec = next((one for one in robot.config.components if one.name == component), None)
+        spec = next((one.spec for one in vote_record_of(robot).records if one.name == component), None)
         if robot.node is None or not kept or spec is None or not self._reaches(robot):
             return
         position, begun_ns, life = kept[-1], self._world.local(robot), robot.life

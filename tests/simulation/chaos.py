@@ -11,6 +11,7 @@ from failover.core import beat_builder
 from failover.core.frames.frame import beat_size_max
 from failover.core.types import MS, ComponentSpec, Config, Launch, OnLoss, Restart, Rule, Rules, WhenAlone
 from tests.simulation import planned
+from tests.simulation.archive import COPIES_MS
 from tests.simulation.coordinator import Fault
 from tests.simulation.freshness import Freshness
 from tests.simulation.invariants import Broken, Invariants
@@ -66,8 +67,8 @@ COORDINATED = (2, 2, 2, 4, 3)
 DEAF_LIVES = 0.3
 """Of their lives: those in which they hear each other no more from some instant on, until all is healed."""
 
-COPIES_MS = 200
-"""Between two copies to the archive, in every second of these lives."""
+EMPTIED = 0.7
+"""Of the lives of voters with an archive: those in which robots lose their disks, perhaps all of them."""
 
 LIE_NS = 300 * MS
 """After so long, on the average, a liar says something else."""
@@ -85,6 +86,7 @@ def life(
     liars: bool = False,
     etcd: bool = False,
     apart: bool = False,
+    archive: bool = False,
     restart: Restart = Restart.UNDECLARED,
     restarts: int = 0,
 ) -> World:
@@ -98,15 +100,18 @@ def life(
         liars: an attacker has the key of a member, and lies by it until the world is healed.
         etcd: the robots decide by the rule ``etcd``, and etcd has faults, too.
         apart: the same, and until all is healed they never hear each other: they have but etcd, and an archive with faults.
+        archive: the team votes, and its robots go on from an archive with faults where none of them has a checkpoint any more.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
     specs = tuple(replace(spec, rules=replace(spec.rules, restart=restart, restart_limit=0)) for spec in specs)
-    teams = LIARS_TEAMS if liars else TEAMS
+    teams = LIARS_TEAMS if liars or archive else TEAMS
     robots, servers, witnesses = team or teams[seed // HARSH % len(teams)]
     configs = pair(specs, boot_patience_ms=0 if seed % CAREFUL else BOOT_PATIENCE_MS)
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
+    if archive:
+        configs = [replace(config, copies_ms=COPIES_MS if config.runs(config.robot) else 0) for config in configs]
     if etcd or apart:
         configs = coordinated(COORDINATED[seed // HARSH % len(COORDINATED)], specs, 150 if seed % HARSH else LONG_LEASE_MS)
         if seed % 2 or apart:
@@ -133,7 +138,7 @@ def _live(
     votes = configs[0].rule is not Rule.PAIR
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
     invariants = Invariants(safe=safe, votes=votes)
-    freshness = (Freshness(invariants),) if configs[0].copies_ms else ()
+    freshness = (Freshness(invariants),) if configs[0].copies_ms and configs[0].coordinator else ()
     world = World(seed, configs, (invariants, *freshness), random.choice(DRIFTS))
     _weather(world, random)
     world.unchanged = 0.8 if seed % SELDOM == SELDOM - 2 else 0.0
@@ -148,11 +153,14 @@ def _live(
     if world.coordination is not None:
         faulty = world.coordination.faults() + (2 * world.archive.faults() if world.archive is not None else ())
         _trouble_etcd(world, faulty, Random(seed ^ 0xE7CD), trouble_ns, faults, apart=apart)
+    elif world.archive is not None:
+        _happen(world, world.archive.faults(), Random(seed ^ 0xE7CD), trouble_ns, faults)
+        _lose_disks(world, Random(seed ^ 0xD15C), trouble_ns)
     if apart:
         _die_ahead(world, specs[0].name, Random(seed ^ 0xF2E5), trouble_ns)
     if liars:
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
-    elif votes and random.random() < 0.3:
+    elif votes and random.random() < 0.3 and (world.archive is None or world.coordination is not None):
         _lose_a_disk(world, random)
     world.run(trouble_ns)
     _heal(world)
@@ -194,11 +202,17 @@ def _make_harsh(world: World) -> None:
 
 def _trouble_etcd(world: World, faulty: tuple[Fault, ...], random: Random, until_ns: int, faults: int, *, apart: bool) -> None:
     """Faults of etcd and of the archive, half where something acts; some while robots do not hear each other, or never do."""
-    names, specs = list(world.robots), [spec.name for spec in next(iter(world.robots.values())).config.components]
+    names = list(world.robots)
     ways = {(one, other) for one in names for other in names if one != other}
     if random.random() < DEAF_LIVES or apart:
         at_ns = random.choice((0, random.randrange(until_ns // 2)))
         world.at(0 if apart else at_ns, lambda: world.network.cuts.update(ways))
+    _happen(world, faulty, random, until_ns, faults)
+
+
+def _happen(world: World, faulty: tuple[Fault, ...], random: Random, until_ns: int, faults: int) -> None:
+    """Faults of etcd or of the archive, half where something acts."""
+    names, specs = list(world.robots), [spec.name for spec in next(iter(world.robots.values())).config.components]
     for _ in range(faults or random.randrange(2, 12)):
         fault, name, for_ns = (
             random.choice(faulty),
@@ -267,6 +281,23 @@ def _lose_a_disk(world: World, random: Random) -> None:
 
     world.at(at_ns, lose)
     world.at(at_ns + random.randrange(10, 500) * MS, lambda: world.power_on(name))
+
+
+def _lose_disks(world: World, random: Random, until_ns: int) -> None:
+    """Robots come back empty, one after the other or all at once; servers and witnesses keep what they have."""
+    if random.random() > EMPTIED:
+        return
+    robots = [name for name, robot in world.robots.items() if robot.config.runs(name)]
+    at_ns, apart_ns = random.randrange(until_ns // 3, until_ns - 1_500 * MS), random.choice((0, 0, 300 * MS))
+    for place, name in enumerate(random.sample(robots, random.choice((1, len(robots), len(robots))))):
+
+        def lose(name: str = name, vote_record: bool = random.random() < 0.5) -> None:
+            world.faults += 1
+            world.power_off(name)
+            world.new_disk(name, vote_record)
+
+        world.at(at_ns + place * apart_ns, lose)
+        world.at(at_ns + place * apart_ns + random.randrange(10, 800) * MS, lambda name=name: world.power_on(name))
 
 
 def _heal(world: World) -> None:

@@ -38,6 +38,8 @@ class Invariants:
         last: components whose end was reported as acknowledged.
         over: (robot, component): its program has ended by itself, and was cleared away; the component is declared, perhaps.
         former: positions of a declared component's program that had ended before the one that runs was started anew.
+        forgetful: robots that lost their vote records.
+        emptied: components that resumed from an older checkpoint after all disks with what was acknowledged had been lost.
         liar: a robot whose key was stolen. It may give away, end or hold back what it runs and keeps itself; so then only that is
             looked at which no robot's word may break: the others run nothing twice, vote once, and no epoch falls.
     """
@@ -60,6 +62,8 @@ class Invariants:
     crashing: set[tuple[str, str]] = field(default_factory=set)
     over: set[tuple[str, str]] = field(default_factory=set)
     former: dict[str, set[Position]] = field(default_factory=dict)
+    forgetful: set[str] = field(default_factory=set)
+    emptied: set[str] = field(default_factory=set)
 
     def __call__(self, world: World, robot: str, what: object) -> None:
         """Look at one thing that happened, or (None) at the state of the world."""
@@ -74,7 +78,7 @@ class Invariants:
                 self._epochs_grow(world, robot, what)
                 self._one_vote_an_epoch(world, robot, what)
             case NewDisk():
-                self._forget(robot, what)
+                self._forget(world, robot, what)
             case Beat():
                 self._durable_before_said(world, robot, what)
             case acts.Capture():
@@ -162,9 +166,12 @@ class Invariants:
                 story = f"{robot} votes for {before} and {record.primary} in epoch {record.epoch} of {record.name}"
                 raise broken(world, story)
 
-    def _forget(self, robot: str, loss: NewDisk) -> None:
+    def _forget(self, world: World, robot: str, loss: NewDisk) -> None:
         self.gone.update(loss.lost)
         if loss.vote_record:
+            self.forgetful.add(robot)
+            if len(self.forgetful) >= world.robots[robot].config.quorum:
+                self.owners.clear()  # a majority knows no vote of before: an epoch may be counted again
             self.epochs = {key: epoch for key, epoch in self.epochs.items() if key[0] != robot}
             self.given = {key: primary for key, primary in self.given.items() if key[0] != robot}
 
@@ -208,10 +215,13 @@ class Invariants:
             self.seen.pop(act.component, None)
             self.begun.pop(act.component, None)
             return
-        for epoch, position in self.seen.get(act.component, {}).items():
-            is_before = epoch < act.epoch and world.values[position] > begin
-            if is_before and self._is_held(world, act.component, position):
+        seen = self.seen.get(act.component, {})
+        for epoch, position in list(seen.items()):
+            if epoch >= act.epoch or world.values[position] <= begin:
+                continue
+            if self._is_held(world, act.component, position):
                 raise broken(world, f"{robot} begins {act.component} before {position}, of which readers have seen the output")
+            del seen[epoch]  # it was lost with the disks
         self.begun.setdefault(act.component, {}).setdefault(act.epoch, begin)
 
     def _is_held(self, world: World, component: str, position: Position) -> bool:
@@ -254,6 +264,10 @@ class Invariants:
             )
             and (robot, act.component) in self.crashing
         )
+        if safe_from is not None and not self._is_held(world, act.component, safe_from):
+            del self.acknowledged[act.component]  # it was lost with the disks
+            self.emptied.add(act.component)
+            safe_from = None
         comparable = act.component not in self.split and not in_place
         if comparable and safe_from is not None and world.values[act.position] < world.values[safe_from]:
             raise broken(world, f"{robot} resumes {act.component} from {act.position}, older than the acknowledged {safe_from}")
@@ -267,7 +281,8 @@ class Invariants:
                 continue  # there is none such
             states = {name: state_at(world, name, component) for name in world.robots}
             if any(state in (State.FINISHED, State.FAILED, State.RELEASED) for state in states.values()):
-                if len(set(states.values())) > 1:
+                known = {state for name, state in states.items() if not _has_a_copy_alone(world, name, component)}
+                if len(known) > 1:
                     raise broken(world, f"{component} has ended for some only: {states}")
                 self._nothing_waits_in_vain(world, component, "")
                 continue
@@ -291,6 +306,12 @@ class Invariants:
 def state_at(world: World, robot: str, component: str) -> State:
     """How the component stands at a robot, as that robot says."""
     return next((one.state for one in _views(world, robot) if one.name == component), State.ABSENT)
+
+
+def _has_a_copy_alone(world: World, robot: str, component: str) -> bool:
+    """Whether it has lost its checkpoints and its notes, and waits with a copy of the archive for a word of an operator."""
+    node = world.robots[robot].node
+    return node is not None and component in node._components and node._components[component].bare
 
 
 def seen_at(world: World, robot: str, component: str) -> ComponentView:

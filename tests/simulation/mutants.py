@@ -9,11 +9,11 @@ from unittest.mock import patch
 
 from msgspec.structs import replace
 
-from failover.core import acts, node, peer_claims
+from failover.core import acts, beat_builder, node, peer_claims
 from failover.core.component import Component, Turn
 from failover.core.election import lease, majority, pair, votes
 from failover.core.election.coordinator import Arbiter
-from failover.core.events import Looked
+from failover.core.events import Fetched, Looked
 from failover.core.membership import UNREAD_NS, Membership, Peer
 from failover.core.replication import archived, servers, standby, warm_standby
 from failover.core.transitions import drain, exits, handover, restarts
@@ -661,7 +661,35 @@ APART_MUTANTS: tuple[tuple[Mutant, int], ...] = ((no_last_look, 11), (content_wi
 """Mistakes that lives of robots which never hear each other catch, and the seed that caught each last."""
 
 
+def as_good_as_before() -> Any:
+    """A robot that lost its disk counts as one that holds all again, as soon as it has a copy."""
+    honest = archived.fetched
+
+    def proud(component: Component, turn: Turn, event: Fetched) -> None:
+        honest(component, turn, event)
+        component.bare = False
+
+    return patch.object(archived, "fetched", proud)
+
+
+def keeps_its_loss_to_itself() -> Any:
+    """A robot that lost its disk does not say that its position is that of a copy."""
+    return patch.object(beat_builder, "BARE", 0)
+
+
+def waits_for_no_server() -> Any:
+    """A robot with but a copy does not wait for silent servers and witnesses, nor for their word of an end."""
+    return patch.object(archived, "may_be_outdated", lambda *_: False)
+
+
+ARCHIVE_MUTANTS: tuple[tuple[Mutant, int], ...] = ((as_good_as_before, 53), (waits_for_no_server, 284))
+"""Mistakes that lives of voters with an archive catch, and the seed that caught each last."""
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
+    (as_good_as_before, "a_copy_of_the_archive_waits_for_the_standby_that_holds_more"),
+    (keeps_its_loss_to_itself, "a_copy_of_the_archive_waits_for_the_standby_that_holds_more"),
+    (waits_for_no_server, "a_copy_of_the_archive_waits_for_the_server_that_holds_more"),
     (blind_to_the_better, "the_newest_checkpoint_wins_over_the_lesser_name"),
     (loyal_to_the_lost, "three_robots_stand_in_for_one_another"),
     (no_pre_vote, "whoever_is_cut_off_raises_no_epoch"),

@@ -4,6 +4,7 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
 
     team robot1 robot2 robot3              who is in the team, if not robot1 and robot2; before everything else
     votes robot1 robot2 witness1           the same, and primaries are elected; servers have their role by their name, too
+    archive                                robots go on from copies where none of them has a checkpoint; after the team
     boot-patience 5000                     of robots that start, in ms; before everything but that
     rule when_alone=freeze on_loss=hold    rules of the component, before everything but that
     0    on robot1                         start a robot; off: power cut; agent-dies: guards and programs live on
@@ -42,6 +43,7 @@ from msgspec.structs import replace
 from failover.core import acts
 from failover.core.events import Drain, Handover, Promote, Run, Stop
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rules
+from tests.simulation.archive import COPIES_MS
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.liars import by_name
 from tests.simulation.planned import with_grace
@@ -66,6 +68,7 @@ class Story:
         lines = [words for line in text.splitlines() if (words := line.split("#")[0].split())]
         kind, *members = lines.pop(0) if lines[0][0] in ("team", "votes") else ("team", "robot1", "robot2")
         names, votes = tuple(members), kind == "votes"
+        copies_ms = COPIES_MS if lines[0][0] == "archive" and lines.pop(0) else 0
         boot_patience_ms = int(lines.pop(0)[1]) if lines[0][0] == "boot-patience" else 0
         grace_ms = int(lines.pop(0)[1]) if lines[0][0] == "grace" else 0
         if lines[0][0] == "rule":
@@ -74,6 +77,7 @@ class Story:
         self.invariants = Invariants(safe=safe, votes=votes)
         configs = _voters(names) if votes else pair((), names, boot_patience_ms)
         configs = with_grace(configs, grace_ms) if grace_ms else configs
+        configs = [replace(config, copies_ms=copies_ms if config.runs(config.robot) else 0) for config in configs]
         self.world = World(1, configs, (self.invariants, self._count))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)

@@ -10,9 +10,10 @@ from failover.core.types import Restart
 from tests.simulation import planned
 from tests.simulation.__main__ import FAULTS_A_LIFE, RESTARTS_A_LIFE, play
 from tests.simulation.chaos import TEAMS, life
-from tests.simulation.invariants import Broken
+from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.mutants import (
     APART_MUTANTS,
+    ARCHIVE_MUTANTS,
     AS_THE_SEED_SAYS,
     CAUGHT_BY,
     ELECTIVE_MUTANTS,
@@ -21,6 +22,7 @@ from tests.simulation.mutants import (
     Mutant,
     mistaken,
 )
+from tests.simulation.world import World
 
 SEEDS = int(os.environ.get("FAILOVER_SEEDS", "150"))
 APART_SHARE = 3
@@ -36,6 +38,9 @@ ONCE_BROKEN = (98, 161, 368)
 
 APART_ONCE_BROKEN = (330, 436, 821)
 """What had ended ran again; a standby with a new disk, and a robot that heard one with more, resumed an older copy at once."""
+
+ARCHIVE_ONCE_BROKEN = (99, 359, 607, 651)
+"""What was acknowledged was lost to an older copy, after a restart and beside a server; what had ended ran again; none acted."""
 
 PAIR = TEAMS[0]
 VOTERS = tuple(team for team in TEAMS if team != PAIR)
@@ -100,6 +105,32 @@ def test_a_takeover_from_an_older_copy_than_the_archive_had_is_caught_by_some_se
     pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
 
 
+@pytest.mark.parametrize("first", range(0, SEEDS // APART_SHARE, BLOCK))
+def test_every_promise_holds_where_voters_go_on_from_an_archive_after_their_disks_are_lost(first: int) -> None:
+    emptied = 0
+    for seed in range(first, first + BLOCK):
+        try:
+            emptied += len(invariants_of(life(seed, archive=True)).emptied)
+        except Broken as story:
+            raise Broken(f"seed {seed} (again: python -m tests.simulation --archive --first {seed} --seeds 1): {story}") from None
+    assert emptied, "in no life did a component go on from a copy in the archive"
+
+
+@pytest.mark.parametrize("seed", ARCHIVE_ONCE_BROKEN)
+def test_a_life_of_voters_with_an_archive_that_broke_a_promise_once_keeps_it_now(seed: int) -> None:
+    life(seed, archive=True)
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("mutant", "first"), ARCHIVE_MUTANTS, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_mistake_about_a_copy_of_the_archive_is_caught_by_some_seed(mutant: Mutant, first: int) -> None:
+    with mistaken(mutant):
+        for seed in sorted(range(SEEDS_TO_CATCH), key=lambda seed: (seed != first, seed)):
+            if play(seed, 0, archive=True)[1]:
+                return
+    pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
+
+
 @pytest.mark.parametrize("seed", ONCE_BROKEN)
 def test_a_long_life_that_broke_a_promise_once_keeps_it_now(seed: int) -> None:
     life(seed, faults=FAULTS_A_LIFE)
@@ -146,6 +177,11 @@ def _catch(mutant: Mutant, teams: tuple[tuple[int, int, int], ...]) -> None:
             except AssertionError:
                 return
     pytest.fail(f"{seeds} seeds found nothing wrong with: {mutant.__doc__}")
+
+
+def invariants_of(world: World) -> Invariants:
+    """What watched it."""
+    return next(watcher for watcher in world._watchers if isinstance(watcher, Invariants))
 
 
 def test_a_seed_tells_the_same_story_twice() -> None:

@@ -77,7 +77,7 @@ class World:
         self.archive: SimulatedArchive | None = None
         if configs[0].coordinator:
             self.coordination = Coordination(self, self.random)
-        if configs[0].copies_ms:
+        if any(config.copies_ms for config in configs):
             self.archive = SimulatedArchive(self, Random(seed ^ 0xA5C4))
             self.archive.begin()
 

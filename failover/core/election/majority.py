@@ -23,7 +23,7 @@ from failover.core.component import Component, Turn
 from failover.core.election.consent import grants, state_of
 from failover.core.membership import Peer
 from failover.core.types import ENDED, HOLDING, MS, State
-from failover.core.wire.messages import FREE, FRESH, OPEN, ORDERED, STARTS, Entry
+from failover.core.wire.messages import BARE, FREE, FRESH, OPEN, ORDERED, STARTS, Entry
 
 _BOUND = HOLDING | {State.STOPPING}
 """States in which the robot's copy may still be there."""
@@ -166,22 +166,23 @@ def _covers(component: Component, turn: Turn, sure: tuple[str, ...], robot: str,
 
 
 def _position_at(component: Component, turn: Turn, robot: str) -> Position | None:
-    """The position from which a living robot says that it can restore."""
+    """The position from which a living robot says that it can restore, if it has lost nothing."""
     if robot == turn.me:
-        return component.newest
+        return None if component.bare else component.newest
     peer = turn.team.peers.get(robot)
     entry = peer.entry(component.name) if peer is not None and turn.alive(robot) else None
-    return entry.position if entry is not None else None
+    return entry.position if entry is not None and not entry.flags & BARE else None
 
 
 def _all_gone(component: Component, turn: Turn) -> bool:
     """Whether the robots that hold all that was acknowledged were waited for long enough, or are back without it."""
-    return all(_lost(component, turn, robot) for robot in _sure(component, turn))
+    return all(is_lost(component, turn, robot) for robot in _sure(component, turn))
 
 
-def _lost(component: Component, turn: Turn, robot: str) -> bool:
+def is_lost(component: Component, turn: Turn, robot: str) -> bool:
+    """Whether a member was waited for long enough, or is back without what it held."""
     if robot == turn.me:
-        return component.newest is None
+        return component.bare or component.newest is None
     peer = turn.team.peers.get(robot)
     if peer is None:
         return True
@@ -190,7 +191,7 @@ def _lost(component: Component, turn: Turn, robot: str) -> bool:
     entry = peer.entry(component.name)
     if entry is None:
         return peer.complete
-    return entry.position is None and state_of(entry) not in _BOUND
+    return (entry.position is None or bool(entry.flags & BARE)) and state_of(entry) not in _BOUND
 
 
 def _would(component: Component, turn: Turn, peer: Peer, position: Position | None) -> bool:

@@ -382,6 +382,7 @@ def follow(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     admit(component, turn, sender)
     if entry.flags & SAFE and entry.position is not None:
         component.vouched = entry.position
+        component.bare = component.bare and component.newest != entry.position
     if entry.flags & UNPROTECTED:
         drop(component, turn, f"{sender} protects it no longer")
     if entry.yields_to == turn.me and component.state is State.STANDBY and component.newest == entry.position:
@@ -443,7 +444,8 @@ def _may_switch(component: Component, turn: Turn, sender: str, entry: Entry) -> 
 
 
 def accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
-    component.begun, component.bare = component.has_begun, False
+    component.begun = component.has_begun
+    component.bare = component.bare and component.elects and bool(component.held)  # it is as old as it was
     component.epoch, component.primary = epoch, primary
     component.elsewhere = -abs(component.elsewhere)
     component.entrusted, component.trusted = (), False

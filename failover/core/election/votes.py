@@ -86,9 +86,14 @@ def _is_untold(component: Component, turn: Turn) -> bool:
 
 
 def _waits_for_a_server(component: Component, turn: Turn, mine: Position, best: Position | None) -> bool:
-    """Whether to wait for a server's newer checkpoint: a standby has all that it can have, and no robot waits for ever."""
+    """Whether to wait for a server's newer checkpoint: a standby has all that it can have, and no robot waits for ever.
+
+    A robot that has lost what it held, and has but an older copy, waits for silent ones, too.
+    """
+    if archived.may_be_outdated(component, turn):
+        return True
     is_behind = (best is not None and mine < best) or _is_untold(component, turn)
-    if not is_behind or turn.me in component.entrusted:
+    if not is_behind or (turn.me in component.entrusted and not component.bare):
         component.behind_ns = 0
         return False
     component.behind_ns = component.behind_ns or turn.now_ns

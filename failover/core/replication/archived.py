@@ -1,4 +1,4 @@
-"""Checkpoints from the archive, for robots that do not hear the primary: with ``rule = "etcd"`` and ``[store] s3``.
+"""Checkpoints from the archive, for robots that do not hear the primary: with ``rule = "etcd"``, and where members vote.
 
 The worker of such a robot copies the newest checkpoint from the archive into this robot's store, in advance; here is when that
 counts. Invariants:
@@ -15,6 +15,13 @@ counts. Invariants:
 * A component that ran elsewhere does not begin anew here before the archive has said that it has no copy.
 * Where the archive alone tells of a component, and no member of the team, it may have ended, or have been released and run on:
   no robot claims it by itself.
+
+Where members vote without etcd, a copy is for the day on which no robot has a checkpoint any more:
+
+* A robot that held nothing when the copy came is ``bare``: it does not count as one that holds all that was acknowledged, and
+  says so (``BARE``). So the robots that may hold more are waited for, as long as `failover.core.election.majority` says.
+* It waits for silent servers and witnesses as long: a server may hold more, and both may know that the component has ended.
+* A robot that holds all that was acknowledged never waits for the archive.
 """
 
 from __future__ import annotations
@@ -23,8 +30,9 @@ from checkpoint.model import Position
 from failover.core import acts
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import majority
-from failover.core.events import Archived, Damaged, Fetched, Looked
-from failover.core.types import ENDED, MS, PEERS_MAX, State
+from failover.core.election.consent import state_of
+from failover.core.events import Archived, Damaged, Fetched, Looked, Stored
+from failover.core.types import ENDED, MS, PEERS_MAX, Config, State
 from failover.core.wire.messages import FREE
 
 KEPT = 2
@@ -46,16 +54,32 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
         return
     if component.state is State.ABSENT:
         component.move(Cause.FOLLOW)
+    had_none = not component.held
     component.held = [*component.held, event.position][-KEPT:]
     component.spec, component.keeps_state = event.spec, event.keeps_state
     component.stored_ns = turn.now_ns
     component.fetched = event.position, turn.now_ns - event.age_ns
     component.lags = component.lags and not event.begun_ns
-    component.bare = component.bare and (component.vouched is None or event.position < component.vouched)
+    if turn.config.coordinator:
+        component.bare = component.bare and (component.vouched is None or event.position < component.vouched)
+    else:
+        component.bare = component.bare or had_none
     component.unable, component.tries, component.unstored = "", 0, ""
     turn.order(acts.Accept(component.name, component.epoch, event.position))
     turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
     turn.say(component, f"{turn.me} has its checkpoint {event.position.sequence} from the archive")
+
+
+def remember(component: Component, config: Config) -> None:
+    """After a restart, where members vote: what is held of a component that is on no record came from the archive."""
+    if config.copies_ms and not config.coordinator and component.epoch == 0 and component.held:
+        component.bare = True
+
+
+def has_newer(component: Component, event: Stored) -> bool:
+    """Whether a copy from the archive came before an older checkpoint that a server, or a standby, gave back meanwhile."""
+    is_given_back = component.bare and event.sender != component.primary
+    return is_given_back and component.newest is not None and event.position < component.newest
 
 
 def damaged(component: Component, turn: Turn, event: Damaged) -> None:
@@ -102,7 +126,7 @@ def archived(component: Component, event: Archived) -> None:
 
 def is_alone(component: Component, turn: Turn) -> bool:
     """Whether the archive alone can protect it: no standby of it is heard, and a robot that etcd votes for would look there."""
-    return turn.config.copies_ms > 0 and component.holding and not turn.alive(component.standby)
+    return bool(turn.config.coordinator) and turn.config.copies_ms > 0 and component.holding and not turn.alive(component.standby)
 
 
 def sealed_ns(component: Component) -> int:
@@ -128,15 +152,15 @@ def review(component: Component, turn: Turn) -> None:
     component.freed_ns = component.freed_ns or turn.now_ns
     has_looked = component.looked_ns >= component.freed_ns
     is_sole = not component.bare and majority.is_sole(component, turn, turn.me, component.newest)
-    component.fresh = has_looked and bool(component.held) and is_sole
+    component.fresh = bool(turn.config.coordinator) and has_looked and bool(component.held) and is_sole
     if not has_looked and turn.now_ns >= component.asked_ns + turn.config.retry_ms * MS:
         component.asked_ns = turn.now_ns
         turn.order(acts.Look(component.name, component.epoch))
 
 
 def _would_coordinator(component: Component, turn: Turn) -> bool:
-    """Whether etcd, if it is heard, is bound to no primary of the component."""
-    if not turn.alive(turn.config.coordinator):
+    """Whether etcd, if it has a vote and is heard, is bound to no primary of the component."""
+    if not turn.config.coordinator or not turn.alive(turn.config.coordinator):
         return True
     entry = turn.team.peers[turn.config.coordinator].entry(component.name)
     return entry is None or bool(entry.flags & FREE)
@@ -148,6 +172,8 @@ def waits(component: Component, turn: Turn) -> bool:
         return False
     if is_told_by_it_alone(component):
         return True
+    if not turn.config.coordinator and _holds_all(component, turn):
+        return False  # as if there were no archive
     if 0 < component.freed_ns <= component.looked_ns:
         return False
     if component.newest is None and component.epoch > 0:  # our own, of which no checkpoint was ever made, is nowhere else
@@ -155,6 +181,35 @@ def waits(component: Component, turn: Turn) -> bool:
     if component.primary == turn.me and is_own(component, turn) and not component.lags:
         return False
     return turn.now_ns < component.freed_ns + _limit_ns(component, turn)
+
+
+def _holds_all(component: Component, turn: Turn) -> bool:
+    has_lost = component.bare or component.lags or component.newest is None
+    return not has_lost and majority.holds_all(component, turn, turn.me, component.newest)
+
+
+def awaited(component: Component, turn: Turn) -> list[str]:
+    """The silent servers and witnesses for which a robot with but a copy waits: they may hold more, or know of an end."""
+    others = {*turn.config.servers, *turn.config.witnesses}
+    return sorted(one for one in others if not turn.alive(one) and not majority.is_lost(component, turn, one))
+
+
+def ended_for(component: Component, turn: Turn) -> str:
+    """The server or the witness that says that it has ended; "" for none.
+
+    They end nothing by their word alone. Where no robot remembers the end, an operator says what is to become of the copy.
+    """
+    for robot in (*turn.config.servers, *turn.config.witnesses):
+        peer = turn.team.peers.get(robot)
+        entry = peer.entry(component.name) if peer is not None and turn.alive(robot) else None
+        if entry is not None and state_of(entry) in ENDED and entry.epoch >= component.epoch:
+            return robot
+    return ""
+
+
+def may_be_outdated(component: Component, turn: Turn) -> bool:
+    """Whether a robot with but a copy of the archive does not go on from it yet, beyond what votes decide."""
+    return component.bare and bool(awaited(component, turn) or ended_for(component, turn))
 
 
 def is_told_by_it_alone(component: Component) -> bool:

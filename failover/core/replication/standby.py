@@ -24,6 +24,7 @@ from failover.core.events import (
     UnderWay,
 )
 from failover.core.membership import Peer
+from failover.core.replication import archived
 from failover.core.schedule.slack import LAG_NS_MAX, LAG_PERIODS
 from failover.core.types import ENDED, HISTORY_MAX, MS, PEERS_MAX, Config, OnUnsupported, State
 from failover.core.wire.messages import NEEDS_BASE, Entry
@@ -353,7 +354,8 @@ def _tell_prune(component: Component, turn: Turn) -> None:
 
 def stored(component: Component, turn: Turn, event: Stored) -> None:
     """A snapshot of the primary's is durable here: our next beat acknowledges it. One that came too late is forgotten again."""
-    if (event.sender, event.epoch) != component.admitted or component.holding:
+    is_overtaken = archived.has_newer(component, event)
+    if (event.sender, event.epoch) != component.admitted or component.holding or is_overtaken:
         if event.position not in component.held:
             turn.order(acts.Discard(component.name, component.epoch, event.position))
         return

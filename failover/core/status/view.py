@@ -115,10 +115,12 @@ def _archive_notes(component: Component, turn: Turn) -> list[str]:
             return ["NOT PROTECTED: no standby of it is heard, and no copy of it is in the archive yet"]
         age_s = (turn.now_ns - archived.sealed_ns(component)) / NS_PER_S
         return [f"no standby of it is heard; its newest copy in the archive is {age_s:.0f} s old"]
-    if not turn.config.copies_ms or component.state is not State.STANDBY or turn.alive(component.primary):
+    is_idle = component.bare and component.freed_ns > 0
+    if not turn.config.copies_ms or component.state is not State.STANDBY or (turn.alive(component.primary) and not is_idle):
         return []
     if not component.held:
-        return [f"NOT PROTECTED: {turn.me} does not hear {component.primary}, and no copy of it came from the archive yet"]
+        unheard = f"does not hear {component.primary}" if component.primary != turn.me else "has lost what it held"
+        return [f"NOT PROTECTED: {turn.me} {unheard}, and no copy of it came from the archive yet"]
     notes = []
     if component.fetched is not None and archived.gave(component, component.held[-1]):
         age_s = (turn.now_ns - component.fetched[1]) / NS_PER_S
@@ -130,7 +132,26 @@ def _archive_notes(component: Component, turn: Turn) -> list[str]:
         )
     elif component.freed_ns and archived.waits(component, turn):
         notes.append(f"{turn.me} looks into the archive before it takes it over")
+    elif not turn.config.coordinator and is_idle:
+        notes += _copy_waits(component, turn)
     return notes
+
+
+def _copy_waits(component: Component, turn: Turn) -> list[str]:
+    """Why a robot that has but a copy of the archive does not go on from it yet, where members vote."""
+    if robot := archived.ended_for(component, turn):
+        return [
+            f"NOT PROTECTED: {robot} says that it has ended, and no robot remembers that: failover promote {component.name} "
+            f"resumes it from its copy at {turn.me}, failover release {component.name} forgets it"
+        ]
+    robots = () if component.open else {component.primary, *component.entrusted} - {"", turn.me}
+    if silent := [*archived.awaited(component, turn), *sorted(one for one in robots if not turn.alive(one))]:
+        patience_s = turn.config.patience_ms / 1_000
+        return [
+            f"NOT PROTECTED: {' and '.join(silent)} may hold more than the archive: {turn.me} waits {patience_s:.0f} s at most; "
+            f"start what is off; failover promote {component.name} resumes it from its copy at {turn.me} at once"
+        ]
+    return []
 
 
 def _overdue(component: Component, turn: Turn) -> bool:

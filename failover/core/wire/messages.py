@@ -54,7 +54,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True, gc=False):
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
             ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
             ``SAFE`` (primary: its newest position is acknowledged); ``STOOD`` (primary of a pair); ``FREE``, ``OPEN``,
-            ``STARTS``, ``ORDERED`` (majority); ``BEGUN``; ``FRESH`` (etcd).
+            ``STARTS``, ``ORDERED``, ``BARE`` (majority); ``BEGUN``; ``FRESH`` (etcd).
         status: of a finished component, waitpid's.
         born: epoch under which the sender's copy was started or restored; 0 does not tell.
     """
@@ -111,6 +111,9 @@ BEGUN = 2048
 
 FRESH = 4096
 """The sender holds all that the archive had when the old primary's lease was over: `failover.core.replication.archived`."""
+
+BARE = 8192
+"""The sender has lost what it held: a position that it tells of came from elsewhere since, and may be older than what it had."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -28,7 +28,7 @@ from failover.archive.objects import FolderObjects
 from failover.config import team
 from failover.config.team import Robot, Team
 from failover.core.events import Damaged, Event, Fetched, Looked
-from failover.core.types import ComponentSpec, ComponentView, Protection, State, StatusView
+from failover.core.types import ComponentSpec, ComponentView, PeerView, Protection, State, StatusView
 from tests.checkpoint.snapshots import COMPONENT, PAGE, history, snapshot
 
 pytest.importorskip("cryptography")
@@ -37,10 +37,13 @@ PATIENCE_S = 100.0
 SPEC = ComponentSpec(COMPONENT)
 
 
+ETCD = 'rule = "etcd"\nlease_ms = 1800\n[coordinator]\nendpoints = ["http://127.0.0.1:1"]\n'
+
+
 class Member:
     """A robot's store, the archive beside it, and what the core would hear."""
 
-    def __init__(self, directory: Path, bring: bool = False, components: str = "") -> None:
+    def __init__(self, directory: Path, bring: bool = False, components: str = "", rule: str = ETCD) -> None:
         robots = {f"robot{place}": Robot((f"127.0.0.1:74{place}0",), f"127.0.0.1:74{place}1") for place in (1, 2)}
         team.write(directory / "team", Team("lab", robots))
         keys.new_key(directory / "team")
@@ -49,16 +52,19 @@ class Member:
         path = directory / "agent.toml"
         path.write_text(
             f'robot = "robot1"\nteam_directory = "{directory}/team"\nstate_directory = "{directory}/state"\ninsecure = true\n'
-            f'bring = {str(bring).lower()}\nrule = "etcd"\nlease_ms = 1800\n[coordinator]\nendpoints = ["http://127.0.0.1:1"]\n'
-            f'[store]\ns3 = "{directory}/place"\ns3_every_s = 1\n{components}'
+            f'bring = {str(bring).lower()}\n{rule}[store]\ns3 = "{directory}/place"\ns3_every_s = 1\n'
+            f"resume = {str(rule != ETCD).lower()}\n{components}"
         )
         self.directory, self.events = directory, list[Event]()
         self.seen: tuple[ComponentView, ...] = ()
+        self.peers: tuple[PeerView, ...] = ()
+        self.asked = 0
         self.store = open_store(directory / "state" / "store")
         self.fetching = Fetching(configuration.load(path), self.store, self.told, self.events.append, self.kept)
 
     async def told(self) -> Told:
-        return Told(1, 0, StatusView("robot1", 1, "etcd", "", True, (), self.seen))
+        self.asked += 1
+        return Told(1, 0, StatusView("robot1", 1, "etcd", "", True, self.peers, self.seen))
 
     def kept(self, arrived: Arrived) -> None:
         raise AssertionError("no core accepts it here")
@@ -80,9 +86,9 @@ class Member:
                 await asyncio.sleep(0.02)
 
 
-def run(tmp_path: Path, work: Callable[[Member], object], bring: bool = False, components: str = "") -> None:
+def run(tmp_path: Path, work: Callable[[Member], object], bring: bool = False, components: str = "", rule: str = ETCD) -> None:
     async def both() -> None:
-        member = Member(tmp_path, bring, components)
+        member = Member(tmp_path, bring, components, rule)
         taking = asyncio.create_task(member.fetching.run())
         try:
             await work(member)  # type: ignore[misc]
@@ -125,6 +131,19 @@ def test_the_newest_copy_comes_into_the_store_an_altered_one_is_named_and_a_roll
         assert member.store.newest(COMPONENT) == second.position
 
     run(tmp_path, work)
+
+
+def test_where_members_vote_the_archive_is_asked_only_while_a_primary_is_silent(tmp_path: Path) -> None:
+    async def work(member: Member) -> None:
+        member.seen = (ComponentView(COMPONENT, State.STANDBY, 1, "robot2", "", Protection.NONE, -1, 0, (), ""),)
+        member.peers = (PeerView("robot2", "alive", 1, 0, hears_us=True, load=0),)
+        member.put(bases()[0])
+        await member.until(lambda: member.asked >= 3)
+        assert member.fetching._process._child is None, "nothing was asked, so no process was started"
+        member.peers = (PeerView("robot2", "dead", 1, 0, hears_us=False, load=0),)
+        await member.until(lambda: member.fetched() == [1])
+
+    run(tmp_path, work, rule='rule = "majority"\n')
 
 
 def test_a_copy_that_is_not_the_newest_does_not_say_that_this_robot_has_all_that_the_archive_had(tmp_path: Path) -> None:
