@@ -433,6 +433,7 @@ class Turn(Struct):
         before: the vote record as the last step left it.
         late_ns: see `failover.core.event_log.decisions.Facts`.
         leaving: this agent is about to restart. drained: this robot is to run nothing.
+        denied: (member, component): since when the member has been saying a word on it that the robot which it names denies.
     """
 
     now_ns: int
@@ -444,6 +445,7 @@ class Turn(Struct):
     load: int = 0
     leaving: bool = False
     drained: bool = False
+    denied: dict[tuple[str, str], int] = {}
     acts: list[Act] = field(default_factory=list)
     said: list[Decision] = field(default_factory=list)
 

@@ -243,9 +243,8 @@ class Node:
 
     def _turn(self, now_ns: int) -> Turn:
         counter, leaving = self._speaker.counter + 1, self._leaving_ns > 0
-        return Turn(
-            now_ns, self._config, self._team, counter, self._durable, self._watch.late_ns, self._load, leaving, self._drained
-        )
+        facts = self._watch.late_ns, self._load, leaving, self._drained, self._testimony.denied_ns
+        return Turn(now_ns, self._config, self._team, counter, self._durable, *facts)
 
     def _note_promise(self, turn: Turn) -> None:
         """The journal has the team's promise at each change, and a component's while it differs from that."""

@@ -97,7 +97,8 @@ def _waits_for_a_server(component: Component, turn: Turn, mine: Position, best: 
         component.behind_ns = 0
         return False
     component.behind_ns = component.behind_ns or turn.now_ns
-    return turn.now_ns < component.behind_ns + turn.config.ship_ms * MS
+    limit_ms = max(turn.config.ship_ms, turn.config.patience_ms) if component.bare else turn.config.ship_ms
+    return turn.now_ns < component.behind_ns + limit_ms * MS
 
 
 def _starts_before(component: Component, one: str, other: str) -> bool:

@@ -189,9 +189,15 @@ def _holds_all(component: Component, turn: Turn) -> bool:
 
 
 def awaited(component: Component, turn: Turn) -> list[str]:
-    """The silent servers and witnesses for which a robot with but a copy waits: they may hold more, or know of an end."""
-    others = {*turn.config.servers, *turn.config.witnesses}
-    return sorted(one for one in others if not turn.alive(one) and not majority.is_lost(component, turn, one))
+    """The servers and witnesses for which a robot with but a copy waits: they may hold more, or know of an end.
+
+    They are silent; or the robot that they name denies their word, perhaps because it has lost its vote record, too.
+    """
+    others = sorted({*turn.config.servers, *turn.config.witnesses} - {turn.config.robot})
+    silent = (one for one in others if not turn.alive(one) and not majority.is_lost(component, turn, one))
+    since_ns = turn.now_ns - turn.config.patience_ms * MS
+    denied = (one for one in others if turn.denied.get((one, component.name), since_ns) > since_ns)
+    return list(dict.fromkeys((*silent, *denied)))
 
 
 def ended_for(component: Component, turn: Turn) -> str:
