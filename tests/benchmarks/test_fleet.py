@@ -10,6 +10,7 @@ from benchmarks import fleet
 def test_values_of_larger_teams_follow_from_frames_that_grow_with_the_team() -> None:
     measured = {size: (size - 1) * (100.0 + 10 * size) for size in (2, 4, 8)}
     assert fleet._by_frames(measured, 64) == pytest.approx(63 * 740)
+    assert fleet._by_frames({2: 7.8, 4: 17.2}, 64) == pytest.approx(63 * 17.2 / 3), "never less than nothing"
     rows = fleet._figures("sent", "kB/s", {size: (value, value) for size, value in measured.items()})
     assert {(row.case, row.who) for row in rows if row.who == fleet.LINE} == {
         (f"a team of {size}", fleet.LINE) for size in fleet.COMPUTED
