@@ -115,8 +115,9 @@ class Fetching:
         """Take copies until cancelled."""
         try:
             while True:
-                if await self._is_wanted():
-                    await self._round(next(self._rounds))
+                number = next(self._rounds)
+                if number == 0 or await self._is_wanted():
+                    await self._round(number)
                 else:
                     self._process.hang_up()
                 with contextlib.suppress(TimeoutError):
@@ -126,7 +127,7 @@ class Fetching:
             self._process.close()
 
     async def _is_wanted(self) -> bool:
-        """Whether to turn to the archive now: robots that share nothing else always do, others where a primary is silent."""
+        """Whether to turn to the archive again: robots that share nothing else always do, others where a primary is silent."""
         if self._settings.config.rule == "etcd" or self._looked_for:
             return True
         with contextlib.suppress(*TROUBLE):

@@ -49,11 +49,8 @@ def entry_of(component: Component) -> Entry:
     flags |= WANTS * (component.wanted is not None)
     flags |= STOOD * (component.holding and component.stood)
     flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
-    flags |= (
-        BEGUN * component.has_begun
-        | FRESH * component.fresh
-        | BARE * (component.elects and component.bare and newest is not None)
-    )
+    flags |= BEGUN * component.has_begun | FRESH * component.fresh
+    flags |= BARE * (component.elects and component.bare and newest is not None)
     flags |= STARTS * (component.autostart and not component.held and not component.entrusted)
     return Entry(
         component.name,

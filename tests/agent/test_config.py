@@ -20,7 +20,7 @@ from agent import config as configuration
 from agent.alerts_config import AlertsConfig
 from agent.config import ComponentConfig, Config, MediumConfig
 from agent.coordinator_config import CoordinatorConfig
-from agent.core_config import level_of, node_config, started_here
+from agent.core_config import fetches, level_of, node_config, started_here
 from agent.errors import ConfigError
 from agent.main import main as agent_main
 from agent.task_config import TaskConfig, declaration
@@ -503,6 +503,26 @@ def test_who_keeps_sealed_copies_is_a_witness(lines: tuple[str, ...], said: str,
     with pytest.raises(ConfigError, match=said):
         configuration.load(written(directory, "[store]", *lines))
     assert configuration.load(written(directory, "[store]", 'witness = "robot2"')).config.store.place == "of witness robot2"
+
+
+@pytest.mark.parametrize(
+    ("lines", "third", "is_taken"),
+    [
+        (("resume = true",), "witness", True),
+        ((), "witness", False),
+        (("resume = true",), "", False),
+        (("resume = true",), "robot", True),
+    ],
+    ids=["voters that resume", "voters that do not", "two robots alone do not vote", "three robots"],
+)
+def test_voters_take_copies_from_an_archive_where_they_are_told_so(
+    lines: tuple[str, ...], third: str, is_taken: bool, directory: Path
+) -> None:
+    others = {"gate": replace(ROBOT, role=third)} if third else {}  # type: ignore[arg-type]
+    team.write(directory / "team", Team("lab", {"robot1": ROBOT, "robot2": ROBOT, **others}))
+    settings = configuration.load(written(directory, "[store]", 's3 = "/mnt"', "s3_every_s = 7", *lines))
+    assert fetches(settings) == is_taken
+    assert node_config(settings).copies_ms == (7_000 if is_taken else 0)
 
 
 def test_a_team_without_the_witness_that_keeps_its_copies_is_refused_before_it_is_one(directory: Path) -> None:

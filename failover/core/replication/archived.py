@@ -215,7 +215,8 @@ def ended_for(component: Component, turn: Turn) -> str:
 
 def may_be_outdated(component: Component, turn: Turn) -> bool:
     """Whether a robot with but a copy of the archive does not go on from it yet, beyond what votes decide."""
-    return component.bare and bool(awaited(component, turn) or ended_for(component, turn))
+    is_copy = turn.config.copies_ms > 0 and component.bare
+    return is_copy and bool(awaited(component, turn) or ended_for(component, turn))
 
 
 def is_told_by_it_alone(component: Component) -> bool:

@@ -133,13 +133,14 @@ def test_the_newest_copy_comes_into_the_store_an_altered_one_is_named_and_a_roll
     run(tmp_path, work)
 
 
-def test_where_members_vote_the_archive_is_asked_only_while_a_primary_is_silent(tmp_path: Path) -> None:
+def test_where_members_vote_the_archive_is_asked_once_and_then_only_while_a_primary_is_silent(tmp_path: Path) -> None:
     async def work(member: Member) -> None:
         member.seen = (ComponentView(COMPONENT, State.STANDBY, 1, "robot2", "", Protection.NONE, -1, 0, (), ""),)
         member.peers = (PeerView("robot2", "alive", 1, 0, hears_us=True, load=0),)
         member.put(bases()[0])
-        await member.until(lambda: member.asked >= 3)
-        assert member.fetching._process._child is None, "nothing was asked, so no process was started"
+        await member.until(lambda: member.asked >= 4)
+        assert member.fetching._process._dialogue is None, "no process waits for the next question"
+        assert not member.fetched()
         member.peers = (PeerView("robot2", "dead", 1, 0, hears_us=False, load=0),)
         await member.until(lambda: member.fetched() == [1])
 
