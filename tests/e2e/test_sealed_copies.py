@@ -178,6 +178,7 @@ def test_a_team_that_lost_every_disk_goes_on_from_the_witness_which_is_refused_w
         robots.until_protected(second)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["robot1", "robot2"], ids=["the robot that ran it", "its standby"])
 def test_with_resume_a_robot_that_is_back_without_its_disk_goes_on_from_the_witness(tmp_path: Path, name: str) -> None:
     with team(tmp_path, "resume = true\n") as stage:
