@@ -6,11 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from failover.core.events import Release
+from failover.core.types import MS, State
 from tests.simulation.chaos import life
-from tests.simulation.invariants import seen_at
+from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.scenario import COMPONENT, Story
 
 WAITS = Path(__file__).parent / "scenarios" / "a_copy_of_the_archive_waits_for_the_standby_that_holds_more.txt"
+PART = "/team/part0"
 ENDED_FOR_A_SERVER = 607
 """In this life all robots lose their disks and vote records after a declared program has ended; a server remembers that."""
 
@@ -26,8 +29,16 @@ def test_it_names_the_robot_for_which_it_waits_and_the_order_that_does_not_wait(
     )
 
 
+def test_the_order_that_does_not_wait_resumes_it_from_the_copy() -> None:
+    before, _, _ = WAITS.read_text().partition("3140  acts nobody")
+    Story().play(f"{before}2900  acts nobody\n2900  promote robot2\n3100  acts robot2")
+
+
 def test_it_names_the_server_that_says_that_it_has_ended_and_the_two_orders() -> None:
     world = life(ENDED_FOR_A_SERVER, archive=True)
-    (note,) = [note for note in seen_at(world, "robot1", "/team/part0").notes if "has ended" in note]
+    (note,) = [note for note in seen_at(world, "robot1", PART).notes if "has ended" in note]
     assert note.startswith("NOT PROTECTED: server1 says that it has ended, and no robot remembers that: failover promote ")
-    assert "failover release /team/part0 forgets it" in note
+    assert note.endswith(f"failover release {PART} forgets it")
+    world.command("robot1", Release(world.request(), PART))
+    world.run(world.now_ns + 1_000 * MS)
+    assert {state_at(world, robot, PART) for robot in ("robot1", "robot2")} == {State.RELEASED}
