@@ -88,8 +88,8 @@ STORE_PAUSE_S: Final = 0.1
 """Between two tries to have the store: it is also what keeps two lives of an agent apart."""
 
 NO_RESUME: Final = (
-    "resume = true in [store] has no effect: two robots alone do not vote, and a server resumes nothing; set it on robots of a "
-    "team with a witness, or remove it, and restart the agent"
+    'resume = true in [store] has no effect here: it is for robots that vote by rule = "majority"; give two robots a witness, '
+    "or remove it, and restart the agent"
 )
 
 log = logging.getLogger("failover.lanes")

@@ -461,7 +461,7 @@ class Record(Struct, frozen=True):
         reason: why it failed.
         claimed: this robot's claim of ``epoch`` needs consent that it did not have yet.
         begun: there is a checkpoint of it, or there was one when this robot heard last: it is not to begin anew.
-        bare: this robot was among those that held all that was acknowledged, and has lost its checkpoints: others hold it.
+        bare: this robot has lost its checkpoints, and others may hold more than it took from elsewhere since, such as an archive.
         ended: generation and sequence of the last snapshot of the program before, since when another one was started anew.
         void: epoch of an end after which it began anew: the archive's copies up to that one are of another life of it.
         elsewhere: the span of epochs in which an operator recovered it at another site; negative once it was released here.

@@ -17,7 +17,7 @@ from tests.simulation.freshness import Freshness
 from tests.simulation.invariants import Broken, Invariants
 from tests.simulation.liars import LIES, ROBOTS_LIES
 from tests.simulation.robots import KEEPS_STATE
-from tests.simulation.teams import coordinated, elective, pair
+from tests.simulation.teams import coordinated, elective, pair, with_copies
 from tests.simulation.troubles import PAUSES_MS, Trouble
 from tests.simulation.world import World
 
@@ -111,11 +111,11 @@ def life(
     if robots + servers + witnesses > 2:
         configs = elective(robots, specs, servers, witnesses, lease_ms=150 if seed % HARSH else LONG_LEASE_MS)
     if archive:
-        configs = [replace(config, copies_ms=COPIES_MS if config.runs(config.robot) else 0) for config in configs]
+        configs = with_copies(configs, COPIES_MS)
     if etcd or apart:
         configs = coordinated(COORDINATED[seed // HARSH % len(COORDINATED)], specs, 150 if seed % HARSH else LONG_LEASE_MS)
         if seed % 2 or apart:
-            configs = [replace(config, copies_ms=COPIES_MS) for config in configs]
+            configs = with_copies(configs, COPIES_MS)
     narrow = NARROW_BEAT_SIZE + ECHO_SIZE * (len(configs) - 2)
     size_max = beat_size_max if seed % NARROW else lambda _: narrow
     if restarts:

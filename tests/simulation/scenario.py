@@ -47,7 +47,7 @@ from tests.simulation.archive import COPIES_MS
 from tests.simulation.invariants import Invariants, seen_at, state_at
 from tests.simulation.liars import by_name
 from tests.simulation.planned import with_grace
-from tests.simulation.teams import elective, pair
+from tests.simulation.teams import elective, pair, with_copies
 from tests.simulation.world import World
 
 COMPONENT = "/team/part"
@@ -77,7 +77,7 @@ class Story:
         self.invariants = Invariants(safe=safe, votes=votes)
         configs = _voters(names) if votes else pair((), names, boot_patience_ms)
         configs = with_grace(configs, grace_ms) if grace_ms else configs
-        configs = [replace(config, copies_ms=copies_ms if config.runs(config.robot) else 0) for config in configs]
+        configs = with_copies(configs, copies_ms)
         self.world = World(1, configs, (self.invariants, self._count))
         for at_ms, verb, *arguments in lines:
             self.world.run(int(at_ms) * MS)

@@ -48,6 +48,11 @@ def coordinated(robots: int, components: tuple[ComponentSpec, ...] = (), lease_m
     return ruled(Rule.ETCD, elective(robots, components, lease_ms=lease_ms))
 
 
+def with_copies(configs: list[Config], copies_ms: int) -> list[Config]:
+    """The same team, whose robots go on from copies in an archive; the other members know nothing of it."""
+    return [replace(config, copies_ms=copies_ms if config.runs(config.robot) else 0) for config in configs]
+
+
 def ruled(rule: Rule, configs: list[Config]) -> list[Config]:
     """The same robots, deciding by that rule; by the rule ``etcd`` with etcd among them."""
     if rule is not Rule.ETCD:

@@ -31,6 +31,7 @@ from failover.core import acts
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import majority
 from failover.core.election.consent import state_of
+from failover.core.election.pair import living_entries
 from failover.core.events import Archived, Damaged, Fetched, Looked, Stored
 from failover.core.types import ENDED, MS, PEERS_MAX, Config, State
 from failover.core.wire.messages import FREE
@@ -193,11 +194,13 @@ def awaited(component: Component, turn: Turn) -> list[str]:
 
     They are silent; or the robot that they name denies their word, perhaps because it has lost its vote record, too.
     """
-    others = sorted({*turn.config.servers, *turn.config.witnesses} - {turn.config.robot})
-    silent = (one for one in others if not turn.alive(one) and not majority.is_lost(component, turn, one))
     since_ns = turn.now_ns - turn.config.patience_ms * MS
-    denied = (one for one in others if turn.denied.get((one, component.name), since_ns) > since_ns)
-    return list(dict.fromkeys((*silent, *denied)))
+
+    def is_awaited(member: str) -> bool:
+        is_silent = not turn.alive(member) and not majority.is_lost(component, turn, member)
+        return is_silent or turn.denied.get((member, component.name), since_ns) > since_ns
+
+    return [one for one in sorted({*turn.config.servers, *turn.config.witnesses} - {turn.me}) if is_awaited(one)]
 
 
 def ended_for(component: Component, turn: Turn) -> str:
@@ -205,10 +208,8 @@ def ended_for(component: Component, turn: Turn) -> str:
 
     They end nothing by their word alone. Where no robot remembers the end, an operator says what is to become of the copy.
     """
-    for robot in (*turn.config.servers, *turn.config.witnesses):
-        peer = turn.team.peers.get(robot)
-        entry = peer.entry(component.name) if peer is not None and turn.alive(robot) else None
-        if entry is not None and state_of(entry) in ENDED and entry.epoch >= component.epoch:
+    for robot, entry in living_entries(component, turn):
+        if not turn.config.runs(robot) and state_of(entry) in ENDED and entry.epoch >= component.epoch:
             return robot
     return ""
 
