@@ -333,10 +333,10 @@ def test_who_listens_learns_no_key_and_joins_with_nothing_that_was_heard(tmp_pat
         before = (stage.place("robot1") / "team.toml").read_text()
         with stage.invited("robot1", "robot3") as (line, invites):
             with socket.create_connection(("127.0.0.1", read(line).port)) as replayed:
-                for content in between.sent:
-                    replayed.sendall(content)
                 replayed.settimeout(robots.PATIENCE_S)
-                with suppress(ConnectionResetError):
+                with suppress(ConnectionResetError, BrokenPipeError):  # the inviter may end it before it has heard all
+                    for content in between.sent:
+                        replayed.sendall(content)
                     while replayed.recv(65_536):  # until it is ended
                         pass
             assert invites.poll() is None
