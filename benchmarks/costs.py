@@ -37,6 +37,10 @@ CHANGES: Final = 300
 SNAPSHOTS: Final = 40
 QUICK_SNAPSHOTS: Final = 8
 WHOLE: Final = "failover, without differences"
+MANY: Final = 8
+MANY_RESIDENT_MB: Final = 10
+MANY_SNAPSHOTS: Final = 20
+"""Of each, before its keeper counts: what a keeper shares grows less as it is used."""
 IDLE_S: Final = 60.0
 QUICK_IDLE_S: Final = 3.0
 
@@ -58,6 +62,7 @@ def costs(quick: bool, directory: Path) -> Findings:
     figures += _of_small_deltas(1 if quick else TURNS, QUICK_SMALL_S if quick else SMALL_S, directory / "small")
     for who, settings in ((OURS, ""), (WHOLE, 'xor_cache = ""\n')):
         figures.append(_on_the_wire(who, settings, QUICK_SNAPSHOTS if quick else SNAPSHOTS, directory / f"wire-{len(settings)}"))
+    figures += _of_many(2 if quick else MANY, directory / "many")
     figures += _idle(QUICK_IDLE_S if quick else IDLE_S, directory / "idle")
     return Findings(
         "What protection takes",
@@ -66,8 +71,9 @@ def costs(quick: bool, directory: Path) -> Findings:
         "of the processes of the robot that runs it. Bytes of a delta's file, which is what travels, per byte of its pages: of a "
         f"Python program with {CELLS:,} objects in a dictionary, {CHANGES} of them replaced each 50 ms. Of small deltas "
         f"({SMALL_DIRTY_KB} KB in {RESIDENT_MB} MB, each {SMALL_PERIOD_MS} ms; the standby keeps a ready copy, where robots can "
-        "have PIDs of their own): processor time of every process of both robots by delta, beats included. What an agent takes "
-        "that protects nothing (beats each 20 ms; guard and keeper wait in advance for the first program).",
+        "have PIDs of their own): processor time of every process of both robots by delta, beats included. Memory of what "
+        f"protects {MANY} programs of {MANY_RESIDENT_MB} MB, by robot, what waits in advance included. What an agent takes that "
+        "protects nothing (beats each 20 ms).",
         tuple(figures),
     )
 
@@ -131,16 +137,21 @@ def _of_small_deltas(turns: int, span_s: float, directory: Path) -> list[Figure]
         with stage.robots[0].control() as link:
             link.ask("run", argv=argv, name=SMALL, cwd="/", wait=False)
         name = f"/demo/{stage.robots[0].name}/{SMALL}"
-        deadline = time.monotonic() + interference.PATIENCE_S
-        while _snapshots(stage.robots[1], name) < STANDBYS_SNAPSHOTS:
-            if time.monotonic() > deadline:
-                raise BenchmarkError(f"{name} was not protected in time: {stage.robots[0].last_words()}")
-            time.sleep(interference.POLL_S)
+        _await_snapshots(stage, name, STANDBYS_SNAPSHOTS)
         time.sleep(interference.SETTLED_S)
         for _ in range(turns):
             for part, ms in _by_delta(stage, name, span_s).items():
                 taken.setdefault(part, []).append(ms)
     return [Figure("processor time of a small delta", part, "ms", tuple(values)) for part, values in taken.items()]
+
+
+def _await_snapshots(stage: Stage, name: str, count: int) -> None:
+    """Until the standby has so many of it."""
+    deadline = time.monotonic() + interference.PATIENCE_S
+    while _snapshots(stage.robots[1], name) < count:
+        if time.monotonic() > deadline:
+            raise BenchmarkError(f"{name} was not protected in time: {stage.robots[0].last_words()}")
+        time.sleep(interference.POLL_S)
 
 
 def _by_delta(stage: Stage, name: str, span_s: float) -> dict[str, float]:
@@ -181,6 +192,26 @@ def _on_the_wire(who: str, settings: str, count: int, directory: Path) -> Figure
 
         interference.until(primary, note)
     return Figure("bytes on the wire per byte written", "a Python heap", "", tuple(seen.values()), who)
+
+
+def _of_many(count: int, directory: Path) -> list[Figure]:
+    """Memory (PSS) of every part, with so many programs on one robot and their ready copies on the other."""
+    directory.mkdir()
+    argv = ["/usr/bin/python3", str(PROGRAMS / "resident.py"), str(MANY_RESIDENT_MB), str(SMALL_DIRTY_KB)]
+    with Stage(directory / "robots", means()) as stage:
+        stage.directory.mkdir()
+        stage.start()
+        names = [f"{SMALL}{number}" for number in range(count)]
+        for name in names:
+            with stage.robots[0].control() as link:
+                link.ask("run", argv=argv, name=name, cwd="/", wait=False)
+        for name in names:
+            _await_snapshots(stage, f"/demo/{stage.robots[0].name}/{name}", MANY_SNAPSHOTS)
+        return [
+            Figure(f"memory that protects {count} programs", f"{who}, {part}", "MB", (sum(map(pss_mb, pids)),))
+            for who, robot in zip(("primary", "standby"), stage.robots, strict=True)
+            for part, pids in parts_of(robot).items()
+        ]
 
 
 def _idle(span_s: float, directory: Path) -> list[Figure]:

@@ -1,4 +1,4 @@
-"""Starts guards and keepers as transient systemd services: they outlive the agent's service and inherit nothing from it.
+"""Starts guards, and what forks keepers, as transient systemd services: they inherit nothing from the agent's service.
 
 A child of the agent would be in the agent service's cgroup. The child, its program and every restored program would then have
 what that service has: its limits, capability bounding set, group, score for the OOM killer, seccomp filters, view of the files.
@@ -34,11 +34,11 @@ ASK_S: Final = 2.5
 Less than the main loop waits for that answer (`agent.main_loop.departure.ASK_NS`).
 """
 
-Kind = Literal["guard", "keeper", "hook", "directory"]
+Kind = Literal["guard", "keepers", "hook", "directory"]
 
 PROPERTIES: Final[dict[Kind, tuple[str, ...]]] = {
     "guard": ("Delegate=yes", f"TimeoutStopSec={STOP_S}s", "OOMScoreAdjust=-900", "UMask=0077"),
-    "keeper": (f"TimeoutStopSec={STOP_S}s", "LimitNOFILE=65536", "UMask=0077"),
+    "keepers": (f"TimeoutStopSec={STOP_S}s", "LimitNOFILE=65536", "UMask=0077", "OOMPolicy=continue"),
     "directory": (
         f"TimeoutStopSec={STOP_S}s",
         "UMask=0077",
@@ -48,8 +48,9 @@ PROPERTIES: Final[dict[Kind, tuple[str, ...]]] = {
     ),
     "hook": (f"TimeoutStopSec={STOP_S}s", "KillSignal=SIGKILL"),
 }
-"""Without its guard a program ends, so memory is taken from others first; a keeper is replaced; of a hook nothing outlives its
-limit, for what comes after it begins then: asked to end first, it could go on for as long as a stop may take."""
+"""Without its guard a program ends, so memory is taken from others first. A keeper is replaced, and the others live on. Of a hook
+nothing outlives its limit, for what comes after it begins then: asked to end first, it could take as long as a stop may.
+"""
 
 
 def starter() -> str:

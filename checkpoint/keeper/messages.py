@@ -193,6 +193,19 @@ def pair() -> tuple[socket.socket, socket.socket]:
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
 
 
+# What the process that forks keepers is asked
+
+
+class Fork(msgspec.Struct, frozen=True, tag=True):
+    """Start a keeper, which is to serve the socket that comes as a descriptor. Answer: `Forked`, or `Failed`."""
+
+
+class Forked(msgspec.Struct, frozen=True, tag=True):
+    """The keeper has begun. ``pid``: of its process."""
+
+    pid: int
+
+
 # What a keeper is asked
 
 

@@ -1,6 +1,6 @@
-"""The keeper, the tracer's own process: ``python -m checkpoint keeper FD``, or ``keeper PATH``, where it listens.
+"""The keeper, the tracer's own process: one alone is ``python -m checkpoint keeper FD``; an agent's `fork_server` forks its own.
 
-A third word names a module whose function ``gate`` tells when a program may stand still (`WaitingGate`); it is loaded when a
+A last word names a module whose function ``gate`` tells when a program may stand still (`WaitingGate`); it is loaded when a
 capture is to ask it.
 
 One thread serves one channel; `checkpoint.keeper.messages` defines the requests and answers. The keeper follows at most one
@@ -21,7 +21,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
@@ -46,7 +45,6 @@ from checkpoint.keeper import messages
 from checkpoint.keeper.messages import Channel, ChannelClosedError, ChannelError, Reply, Request
 from checkpoint.linux.signal_wakeup import waking
 from checkpoint.linux.spawn import namespaces
-from checkpoint.linux.unix_address import address_of
 from checkpoint.model import Position, Snapshot
 from checkpoint.resources.sockets import tcp
 from checkpoint.runtime import allocator, parallel, slim_imports
@@ -63,9 +61,7 @@ from checkpoint.store.xor_cache import Sender
 if TYPE_CHECKING:
     from checkpoint.engines.cooperative.engine import GuardedTask
 
-USAGE: Final = f"usage: python -m {checkpoint.__name__} keeper FD|PATH [MODULE]\n"
-CALL_S: Final = 30.0
-"""How long one that listens waits for its peer."""
+USAGE: Final = f"usage: python -m {checkpoint.__name__} keeper FD [MODULE]\n"
 
 FILES: Final = 65536
 """Descriptors that it may have, as its unit says."""
@@ -570,23 +566,33 @@ def folded(files: Descriptors) -> Snapshot:
 
 
 def main(arguments: list[str]) -> int:
-    """Run a keeper on an inherited socket, or for the first client that connects at a path."""
-    if len(arguments) not in (2, 3) or arguments[0] != "keeper":
+    """Run a keeper on an inherited socket."""
+    if len(arguments) not in (2, 3) or arguments[0] != "keeper" or not arguments[1].isdigit():
         sys.stderr.write(USAGE)
         return 2
+    prepare()
+    try:
+        end = socket.socket(fileno=int(arguments[1]))
+    except OSError as error:
+        sys.stderr.write(f"keeper: no agent to serve at {arguments[1]}: {error.strerror or error}\n")
+        return 1
+    serve(end, *arguments[2:])
+    return 0
+
+
+def prepare() -> None:
+    """Have this process be one that can serve as a keeper, or be forked to one."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # a Ctrl-C at the terminal is for our peer to act on
     _allow_many_files()
     gc.disable()  # no collection inside a freeze: nearly all that a capture makes is freed by counting
     gc.freeze()
-    try:
-        end = socket.socket(fileno=int(arguments[1])) if arguments[1].isdigit() else called_at(arguments[1])
-    except OSError as error:
-        sys.stderr.write(f"keeper: no agent to serve at {arguments[1]}: {error.strerror or error}\n")
-        return 1
+
+
+def serve(end: socket.socket, gates: str = "") -> None:
+    """Be a keeper until the peer at the other end of this socket hangs up; see `Keeper`."""
     link: Channel[Request] = Channel(end, Request)
-    Keeper(link, registry.engine_named(engine.PTRACE), *arguments[2:]).serve()
-    return 0
+    Keeper(link, registry.engine_named(engine.PTRACE), gates).serve()
 
 
 def _allow_many_files() -> None:
@@ -595,26 +601,3 @@ def _allow_many_files() -> None:
     wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def called_at(path: str) -> socket.socket:
-    """Listen at a path (0600) until a client connects. No other client can connect afterwards.
-
-    Raises:
-        OSError: it cannot listen there, or no client came.
-    """
-    before = os.umask(0o177)
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC) as listener:
-            with address_of(Path(path)) as address:
-                listener.bind(address)
-            os.umask(before)
-            listener.listen(1)
-            listener.settimeout(CALL_S)
-            end, _ = listener.accept()
-    finally:
-        os.umask(before)
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(path)
-    end.settimeout(None)
-    return end

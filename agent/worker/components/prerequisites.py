@@ -101,7 +101,7 @@ async def _told_by_one_keeper(
     try:
         for supervisor in supervisors:
             await supervisor.cleared(CLEARING_S)
-            keeper = keeper or await around.places.process_pool.onlooker()
+            keeper = keeper or await around.places.process_pool.keeper()
             try:
                 found[supervisor.name] = await compared(around, supervisor, keeper)
             except StoreError:

@@ -1,8 +1,8 @@
-"""Starts guards and keepers in advance: a takeover does not wait for an interpreter to start.
+"""Starts guards in advance, and has keepers forked: a takeover does not wait for an interpreter to start.
 
-One pair waits for each component that this robot may have to take over and of which it has no ready copy (a ready copy has its
-own pair), up to `SPARES_MAX`. From the first component on, at least one pair waits. An agent without components has no waiting
-pairs, and so spends no memory on them.
+One guard waits for each component that this robot may have to take over and of which it has no ready copy (a ready copy has its
+own), up to `SPARES_MAX`; from the first component on, at least one. From then on the process that forks keepers waits, too
+(`checkpoint.keeper.fork_server`). An agent without components has none of these, and so spends no memory on them.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ POLL_S: Final = 0.005
 _PEER: Final = struct.Struct("3i")
 
 SPARES_MAX: Final = 8
-"""Pairs that wait at most; each holds about 60 MB. A takeover of more components waits for interpreters to start."""
+"""Guards that wait at most. A takeover of more components waits for interpreters to start."""
 
 REFILL_S: Final = 1.0
 """How long after one was used its successor is started: a takeover has the processor for itself."""
 
-KEEPER: Final = (checkpoint.__name__, "keeper")
+FORK_SERVER: Final = (checkpoint.__name__, "keepers")
 """Its module and verb."""
 
 GATES: Final = "agent.slack_gate"
@@ -86,12 +86,12 @@ class ProcessPool:
         self._expected = self._least = 0
         self._relieved: set[str] = set()
         self._guards: deque[asyncio.Task[Dialogue]] = deque()
-        self._keepers: deque[asyncio.Task[KeeperLink]] = deque()
+        self._fork_server: asyncio.Task[Dialogue] | None = None
         self._children: list[subprocess.Popen[bytes]] = []
         self._closed = False
 
     def begin(self) -> None:
-        """There is a component: have a pair born, both at the same time: a worker that takes a guard asks for a keeper next."""
+        """There is a component: have a guard and the fork server born, both at the same time."""
         if not self._least:
             self._least = 1
             self._prepare_if_possible()
@@ -115,11 +115,10 @@ class ProcessPool:
 
     def prepare(self) -> None:
         """Have as many wait as are wanted."""
-        self._keepers = deque(born for born in self._keepers if not _lost(born))
         while len(self._guards) < self._wanted:
             self._guards.append(asyncio.create_task(self._guard_born()))
-        while len(self._keepers) < self._wanted:
-            self._keepers.append(asyncio.create_task(self._keeper_waits()))
+        if self._wanted:
+            self._forking()
 
     async def guard(self) -> Dialogue:
         """A guard that guards nothing yet.
@@ -143,22 +142,10 @@ class ProcessPool:
             KeeperLostError: it cannot be started.
         """
         self.begin()
-        self._refill()
-        while self._keepers:
-            with contextlib.suppress(KeeperLostError):
-                link = await self._keepers.popleft()
-                link.dialogue.ended = lambda: None
-                if link.dialogue.open:
-                    return link
-        return await self._keeper_born()
-
-    async def onlooker(self) -> KeeperLink:
-        """A keeper for a question, besides those that wait for a takeover; the asker's to end.
-
-        Raises:
-            KeeperLostError: it cannot be started.
-        """
-        return await self._keeper_born()
+        try:
+            return await self._keeper_forked()
+        except KeeperLostError:  # the fork server may have been lost since it was last asked: another one is started
+            return await self._keeper_forked()
 
     async def close(self) -> None:
         """End the ones that wait; they guard nothing. Those in use live on."""
@@ -166,9 +153,9 @@ class ProcessPool:
         for guard in self._guards:
             with contextlib.suppress(GuardError):
                 (await guard).close()
-        for keeper in self._keepers:
+        if self._fork_server is not None:
             with contextlib.suppress(KeeperLostError):
-                (await keeper).end()
+                (await self._fork_server).close()
         self._reap()
 
     def _refill(self) -> None:
@@ -189,38 +176,54 @@ class ProcessPool:
         child = self._spawn("guard", name, ["agent.guard.server", str(path)])
         return _guard_at(path, await self._connected(path, child, "a guard"))
 
-    async def _keeper_waits(self) -> KeeperLink:
-        """A keeper whose end, while nothing needs it, is noticed."""
-        link = await self._keeper_born()
-        link.dialogue.ended = self._refill
-        return link
+    def _forking(self) -> asyncio.Task[Dialogue]:
+        """The fork server: the one that is there or comes, else another one."""
+        if self._fork_server is None or _lost(self._fork_server):
+            self._fork_server = asyncio.create_task(self._fork_server_born())
+        return self._fork_server
 
-    async def _keeper_born(self) -> KeeperLink:
+    async def _fork_server_born(self) -> Dialogue:
         try:
-            end, pid = await self._keeper_called() if self._starter else self._keeper_forked()
+            end, pid = await self._fork_server_called() if self._starter else self._fork_server_inheriting()
         except GuardError as error:
             raise KeeperLostError(str(error)) from error
-        dialogue = Dialogue(end, keeper_messages.Reply, KeeperLostError, "the keeper")
-        dialogue.watch(pid)
-        return KeeperLink(dialogue, pid)
+        server = Dialogue(end, keeper_messages.Forked | keeper_messages.Failed, KeeperLostError, "the process that forks keepers")
+        server.watch(pid)
+        server.ended = self._refill
+        return server
 
-    async def _keeper_called(self) -> tuple[socket.socket, int]:
+    async def _fork_server_called(self) -> tuple[socket.socket, int]:
         """One that systemd started: it listens as a guard does."""
         name = _new_name()
-        path = self._sockets / f"{name}.keeper"
-        child = self._spawn("keeper", name, [*KEEPER, str(path), GATES])
-        end = await self._connected(path, child, "a keeper")
+        path = self._sockets / f"{name}.keepers"
+        child = self._spawn("keepers", name, [*FORK_SERVER, str(path), GATES])
+        end = await self._connected(path, child, "the process that forks keepers")
         return end, _peer_of(end)
 
-    def _keeper_forked(self) -> tuple[socket.socket, int]:
+    def _fork_server_inheriting(self) -> tuple[socket.socket, int]:
         ours, theirs = keeper_messages.pair()
         with theirs:
             try:
-                child = self._spawn("keeper", "", [*KEEPER, str(theirs.fileno()), GATES], (theirs.fileno(),))
+                child = self._spawn("keepers", "", [*FORK_SERVER, str(theirs.fileno()), GATES], (theirs.fileno(),))
             except GuardError:
                 ours.close()
                 raise
         return ours, child.pid
+
+    async def _keeper_forked(self) -> KeeperLink:
+        server = await asyncio.shield(self._forking())
+        ours, theirs = keeper_messages.pair()
+        try:
+            with theirs:
+                forked, _ = await server.ask(keeper_messages.Fork(), (theirs.fileno(),))
+            if isinstance(forked, keeper_messages.Failed):
+                raise KeeperLostError(f"{forked.message}; is memory or the process limit used up?")
+        except BaseException:
+            ours.close()
+            raise
+        dialogue = Dialogue(ours, keeper_messages.Reply, KeeperLostError, "the keeper")
+        dialogue.watch(forked.pid)
+        return KeeperLink(dialogue, forked.pid)
 
     async def _connected(self, path: Path, child: subprocess.Popen[bytes], what: str) -> socket.socket:
         """Wait until a process listens at a path.
@@ -298,6 +301,6 @@ def _new_name() -> str:
     return secrets.token_hex(4)
 
 
-def _lost(born: asyncio.Task[KeeperLink]) -> bool:
-    """Whether a keeper that was to wait has not come, or has gone."""
-    return born.done() and (born.cancelled() or born.exception() is not None or not born.result().dialogue.open)
+def _lost(born: asyncio.Task[Dialogue]) -> bool:
+    """Whether the fork server has not come, or has gone."""
+    return born.done() and (born.cancelled() or born.exception() is not None or not born.result().open)

@@ -345,11 +345,11 @@ def test_what_is_lacking_is_looked_at_once_the_copy_that_was_here_has_ended(
         async def compared(*_: object) -> tuple[str, ...]:
             return () if guard.answers.is_set() else ("its port is another process's here",)
 
-        async def onlooker() -> Any:
+        async def keeper() -> Any:
             return SimpleNamespace(end=lambda: None)
 
         monkeypatch.setattr(prerequisites, "_compared", compared)
-        process_pool = SimpleNamespace(onlooker=onlooker, relieve=lambda *_: None)
+        process_pool = SimpleNamespace(keeper=keeper, relieve=lambda *_: None)
         places = cast(Any, SimpleNamespace(process_pool=process_pool))
         around = Surroundings(places, nothing, Records(tmp_path), lambda _: None, nothing, nothing, lambda _: ComponentConfig())
         supervisor = Supervisor(NAME, around, cast(Component, guard), epoch=3)
