@@ -343,6 +343,7 @@ class Switchboard:
         if state is LinkState.CONNECTED:
             key = self._connections.beat_key(peer)
             self._greet(way, peer, key)
+            self.errands.stands(peer)
             if peer in self.settings.peers:
                 self._say(SpeakKey(peer, key))
             return
@@ -350,6 +351,8 @@ class Switchboard:
             self.link_lost(peer)
         if had_words:
             self.errands.lost(peer)
+            if not self.hindrance(peer):  # another way stands
+                self.errands.stands(peer)
 
     def _unread(self, peer: str, why: str) -> None:
         """Something came from a peer, or from an unknown sender (""), that does not prove whose it is."""

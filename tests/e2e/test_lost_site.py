@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from failover.cli.demo.robots import RobotMachine
+from tests.conftest import compiler
 from tests.e2e import robots
 from tests.e2e.test_archive import is_gone
 from tests.e2e.test_orders import MORE, counted
-from tests.e2e.test_sealed_copies import KEEPS_SECRETS, copies, is_primary, sealed_of
+from tests.e2e.test_sealed_copies import copies, is_primary, sealed_of
 from tests.e2e.two_sites import PATIENCE_S, ROLES, SETTINGS, TwoSites, is_connected, stage
 
 pytest.importorskip("cryptography")
@@ -21,8 +23,26 @@ pytestmark = [
     pytest.mark.root,
     pytest.mark.slow,
     pytest.mark.timeout(1800),
+    pytest.mark.compiler,
     pytest.mark.skipif(not robots.has_cable() or not Path("/dev/net/tun").exists(), reason="needs network namespaces and TUN"),
 ]
+
+COUNTS = """
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+
+int main(void) {
+    static char held[300000];
+    for (int at = 0; at < 300000; at++) held[at] = rand();
+    for (long number = 0;; number++) {
+        printf("%ld\\n", number);
+        fflush(stdout);
+        nanosleep(&(struct timespec){0, 10000000}, NULL);
+    }
+}
+"""
+"""A small program, for the wire is slow; but a copy of it is a while under way."""
 
 
 def until(condition: Any, what: str) -> Any:
@@ -44,7 +64,9 @@ def goes_on(robot: RobotMachine, beyond: int) -> None:
 def begin(site: TwoSites) -> int:
     """A program of robot1 of which the witness keeps copies; what it had counted to before the newest one."""
     first, gate = site.members["robot1"], site.members["gate"]
-    robots.run(first, "count", "/usr/bin/python3", "-S", "-c", KEEPS_SECRETS)
+    program = site.directory / "count"
+    subprocess.run([str(compiler()), "-xc", "-O1", "-o", program, "-"], input=COUNTS, text=True, check=True)
+    robots.run(first, "count", str(program))
     until(lambda: len(copies(gate)) >= 2, "two copies")
     number = counted(first)[-1]
     for what in ("a later copy", "a copy that was begun since"):

@@ -3,6 +3,8 @@
 An order travels as an `Errand` on the replication link, which identifies the sender; every robot of the team may give one. The
 other robot carries it out as if it had been given there, and the answer travels back. It is carried out once or not at all: when
 the connection is lost in between, the agent tells the client that the result is unknown.
+
+Each robot makes a connection of its own. Where only the one that carries answers is lost, they are said again on the next one.
 """
 
 from __future__ import annotations
@@ -10,6 +12,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import secrets
+from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Final
@@ -31,6 +35,12 @@ ANSWER_S: Final = 15.0
 
 LOOK_S: Final = 0.02
 """How often it is looked whether the connection stands."""
+
+SAID_SIZE_MAX: Final = 1 << 20
+"""Bytes of answers to one peer that are kept, to be said again; the oldest are given up first."""
+
+NUMBER_BITS: Final = 48
+"""Of the first order's number, which is chosen at random: what an earlier life of this robot awaited is no answer to this one."""
 
 UNDER_WAY_MAX: Final = 64
 """Errands of one peer that are carried out at a time; more are refused."""
@@ -73,8 +83,10 @@ class Errands:
         self._hindrance = hindrance
         self._orders = orders
         self._of_peers = of_peers
-        self._numbers = itertools.count(1)
+        self._numbers = itertools.count(secrets.randbits(NUMBER_BITS))
         self._waiting: dict[tuple[str, int], asyncio.Future[ErrandDone]] = {}
+        self._said: dict[str, deque[tuple[float, ErrandDone]]] = {}
+        self._perhaps_unheard: set[str] = set()
         self._under_way: dict[str, set[asyncio.Task[None]]] = {}
 
     async def send(
@@ -116,11 +128,20 @@ class Errands:
             waiting.set_result(message)
 
     def lost(self, peer: str) -> None:
-        """The connection has gone: it is not known whether the order arrived."""
+        """The connection has gone: it is not known whether an order arrived, nor an answer."""
+        self._perhaps_unheard.add(peer)
         for (robot, number), waiting in self._waiting.items():
             if robot == peer and not waiting.done():
                 sentence = "the connection was lost before its answer; failover status tells whether it was done"
                 waiting.set_result(ErrandDone(number, b"", sentence))
+
+    def stands(self, peer: str) -> None:
+        """There is a connection again: say what may have been lost with the one before. A peer ignores what it has."""
+        if peer in self._perhaps_unheard:
+            self._perhaps_unheard.discard(peer)
+            self._forget_old(peer)
+            for _, answer in self._said.get(peer, ()):
+                self._say(peer, answer)
 
     def received(self, peer: str, message: Errand) -> None:
         """A peer gives an order."""
@@ -151,6 +172,16 @@ class Errands:
             done = ErrandDone(message.number, b"", f"its answer of {len(done.content)} bytes is too long to travel; ask there")
         await self._until_it_can_be_told(peer)
         self._say(peer, done)
+        self._said.setdefault(peer, deque()).append((asyncio.get_running_loop().time(), done))
+        self._forget_old(peer)
+
+    def _forget_old(self, peer: str) -> None:
+        """Of the answers to a peer: those that it awaits no more, and what is too much."""
+        said = self._said.get(peer, deque())
+        oldest_s = asyncio.get_running_loop().time() - PATIENCE_S
+        size = sum(len(answer.content) for _, answer in said)
+        while said and (said[0][0] < oldest_s or size > SAID_SIZE_MAX or len(said) > UNDER_WAY_MAX):
+            size -= len(said.popleft()[1].content)
 
     async def _until_it_can_be_told(self, peer: str) -> None:
         with contextlib.suppress(TimeoutError):

@@ -19,6 +19,7 @@ from agent.main import main as agent_main
 from agent.main_loop.messages import Happened, HearKey, Inventory, TeamIs, ToMainLoop, ToWorker, event_of
 from agent.worker import known_sites
 from agent.worker.network.connections import BULK
+from agent.worker.network.replication_link import LinkState
 from agent.worker.process import Worker
 from agent.worker.team_changes import TEAM_IS
 from agent.worker.witness import Witness
@@ -260,6 +261,29 @@ def test_an_end_is_told_after_the_inventory_in_which_the_program_still_runs(sett
 def shrunk(settings: configuration.Settings) -> configuration.Settings:
     """The same, after robot2 was taken out."""
     return settings.with_team(members.left(settings.team, "robot2", "robot1"))
+
+
+def test_answers_are_said_again_when_a_connection_stands_in_the_place_of_the_lost_one(
+    settings: configuration.Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def live() -> list[object]:
+        ours, theirs = pair()
+        with ours, theirs:
+            worker = Worker(settings, Channel(ours, ToWorker))
+            said: list[Any] = []
+            monkeypatch.setattr(worker.errands, "_hindrance", lambda _: "")
+            monkeypatch.setattr(worker.errands, "_say", lambda _, answer: said.append(answer))
+            for apart in ("_say", "link_lost"):
+                monkeypatch.setattr(worker, apart, lambda _: None)
+            worker.errands.received("robot2", Errand(3, "no such verb", b"\x80", 0))
+            while not said:
+                await asyncio.sleep(0)
+            for state in (LinkState.CONNECTED, LinkState.CONNECTING, LinkState.CONNECTED):
+                worker._way_changed(BULK, "robot2", state, "")
+                said.append(state)
+            return [one.number if isinstance(one, ErrandDone) else one for one in said]
+
+    assert asyncio.run(live()) == [3, LinkState.CONNECTED, LinkState.CONNECTING, 3, LinkState.CONNECTED]
 
 
 @pytest.mark.parametrize("message", [OFFER, Errand(3, "stop", b"\x80", 0), Errand(3, "team_taken", b"\x80", 0), Goodbye("x")])
