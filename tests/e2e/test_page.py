@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import grp
 import json
 import os
@@ -338,7 +339,8 @@ def test_what_no_page_of_ours_posts_is_refused_in_words(page: Served, pair: Pair
     for path in ("/nowhere", "/assets/../app.py", "/assets/%2e%2e/app.py", "/orders"):
         assert page.ask("GET", path)[0] in (404, 405)
     with socket.create_connection(("127.0.0.1", page.port), pages.PATIENCE_S) as link:
-        link.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n" + b"X-Long: " + b"x" * 100_000)
+        with contextlib.suppress(ConnectionError):  # it may hang up before it has heard all
+            link.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n" + b"X-Long: " + b"x" * 100_000)
         assert b"400" in link.recv(1000).split(b"\r\n")[0]
     with socket.create_connection(("127.0.0.1", page.port), pages.PATIENCE_S) as link:
         link.sendall(bytes(range(256)) * 40)
