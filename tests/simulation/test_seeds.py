@@ -24,7 +24,7 @@ from tests.simulation.mutants import (
 )
 from tests.simulation.world import World
 
-SEEDS = int(os.environ.get("FAILOVER_SEEDS", "150"))
+SEEDS = int(os.environ.get("FAILOVER_SEEDS", "100"))
 APART_SHARE = 3
 BLOCK = 50
 """Seeds a test, so that a failure names a narrow range and the story names the seed."""

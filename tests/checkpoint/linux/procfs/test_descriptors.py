@@ -82,7 +82,7 @@ CASES = {
 }
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("program", "case"), [(program, case) for program, cases in CASES.items() for case in cases.split()])
 def test_what_a_program_has_open_is_as_it_was_after_three_restores(
     program: str, case: str, compiled: Compiled, tmp_path: Path

@@ -118,7 +118,7 @@ def _chain(session: Session, dice: random.Random, *, lost: float) -> list[Snapsh
     return chain
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("lost", [0.0, 0.4], ids=["all_acknowledged", "some_lost"])
 @pytest.mark.parametrize("ways", WAYS)
