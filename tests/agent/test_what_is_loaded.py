@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -81,3 +83,20 @@ print(first.dedent("  x"), first is textwrap, hasattr(inspect, "no such thing"),
 def test_what_is_seldom_used_is_there_when_it_is_used_by_several_threads_at_once() -> None:
     ran = subprocess.run([sys.executable, "-c", USED], capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines() == ["True True Point(x: int) (x: int) -> None", "x True False True"]
+
+
+FROZEN: Final = """
+import gc
+import agent.worker.process
+
+def main():
+    print(gc.get_freeze_count() > len(gc.get_objects()), gc.isenabled())
+    return 3
+"""
+
+
+def test_no_collection_of_the_worker_looks_at_what_it_has_loaded(tmp_path: Path) -> None:
+    (tmp_path / "frozen.py").write_text(FROZEN)
+    command = [sys.executable, "-P", "-m", "agent.system.child_main", "frozen"]
+    ran = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (3, "True True\n", "")
