@@ -6,6 +6,7 @@ import asyncio
 import logging
 import os
 from pathlib import Path
+from typing import Final
 
 from msgspec import Struct
 
@@ -21,6 +22,9 @@ from checkpoint.snapshot import format
 from checkpoint.store import lost_copies
 from checkpoint.store.contract import SnapshotStore
 from failover.core import acts, events
+
+ASIDE_TRIES: Final = 2
+"""Of the last snapshot of a copy that lost: nothing else has its state, and a busy machine may have prevented the first one."""
 
 log = logging.getLogger("failover.component")
 
@@ -72,11 +76,17 @@ class Snapshots(Struct, frozen=True):
         Raises:
             CheckpointError, AgentError, OSError: there is none.
         """
-        await component.freeze(exposed=True)  # perhaps its lease has frozen it already
         newest = self.figures.newest or Position(1, 0, b"")
-        captured = await component.capture(
-            base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
-        )
+        for left in reversed(range(ASIDE_TRIES)):
+            await component.freeze(exposed=True)  # perhaps its lease has frozen it already
+            try:
+                captured = await component.capture(
+                    base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
+                )
+                break
+            except CheckpointError:
+                if not left:
+                    raise
         assert isinstance(captured, Captured), "a base is always made"
         try:
             content = content_of(captured.snapshot)
