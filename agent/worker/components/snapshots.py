@@ -6,7 +6,6 @@ import asyncio
 import logging
 import os
 from pathlib import Path
-from typing import Final
 
 from msgspec import Struct
 
@@ -22,9 +21,6 @@ from checkpoint.snapshot import format
 from checkpoint.store import lost_copies
 from checkpoint.store.contract import SnapshotStore
 from failover.core import acts, events
-
-ASIDE_TRIES: Final = 2
-"""Of the last snapshot of a copy that lost: nothing else has its state, and a busy machine may have prevented the first one."""
 
 log = logging.getLogger("failover.component")
 
@@ -76,17 +72,10 @@ class Snapshots(Struct, frozen=True):
         Raises:
             CheckpointError, AgentError, OSError: there is none.
         """
-        newest = self.figures.newest or Position(1, 0, b"")
-        for left in reversed(range(ASIDE_TRIES)):
-            await component.freeze(exposed=True)  # perhaps its lease has frozen it already
-            try:
-                captured = await component.capture(
-                    base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
-                )
-                break
-            except CheckpointError:
-                if not left:
-                    raise
+        try:
+            captured = await self._captured_last(component, act)
+        except CheckpointError:  # nothing else has this state: it is tried once more
+            captured = await self._captured_last(component, act)
         assert isinstance(captured, Captured), "a base is always made"
         try:
             content = content_of(captured.snapshot)
@@ -96,6 +85,13 @@ class Snapshots(Struct, frozen=True):
         path = await asyncio.to_thread(lost_copies.keep, directory, self.name, act.epoch, content)
         log.warning("%s: the copy that lost is kept for inspection in %s: %s", self.name, path, act.reason)
         return path
+
+    async def _captured_last(self, component: Component, act: acts.KeepAside) -> Captured | Unchanged:
+        await component.freeze(exposed=True)  # perhaps its lease has frozen it already
+        newest = self.figures.newest or Position(1, 0, b"")
+        return await component.capture(
+            base=True, generation=newest.generation, sequence=newest.sequence + 1, epoch=act.epoch, hold=True
+        )
 
     async def tidy(self, act: acts.Forget | acts.Prune | acts.Drop) -> None:
         """Remove snapshots that are not needed any more.
