@@ -51,6 +51,46 @@ def test_no_beat_is_sooner_or_later_for_a_first_member_with_another_period(first
     assert min(gaps) >= EARLIEST_NS and max(gaps) <= LATEST_NS
 
 
+def together(pace: BeatPace, at_ns: int) -> None:
+    """The first member beats, and this robot right after it."""
+    pace.follow(at_ns, PERIOD_NS)
+    pace.tick(at_ns)
+    pace.left(at_ns, PERIOD_NS)
+
+
+def test_a_beat_with_a_change_is_one_more_and_robots_stay_together() -> None:
+    pace = BeatPace(0, FREE_NS)
+    pace.left(FREE_NS, PERIOD_NS)
+    for number in range(1, 20):
+        at_ns = FREE_NS + number * PERIOD_NS
+        together(pace, at_ns)
+        due_ns = pace.next_ns
+        pace.press()
+        assert pace.next_ns == at_ns + URGENT_GAP_NS
+        pace.left(pace.next_ns + number * MS, PERIOD_NS)
+        assert pace.next_ns == due_ns, "the regular beat leaves when it would have left anyway"
+
+
+def test_a_change_of_the_first_member_draws_no_other_from_its_instant() -> None:
+    pace = BeatPace(0, FREE_NS)
+    together(pace, FREE_NS + PERIOD_NS)
+    due_ns = pace.next_ns
+    for late_ms in (1, 5, 20, 40):
+        pace.follow(FREE_NS + PERIOD_NS + late_ms * MS, PERIOD_NS)
+        assert pace.next_ns == due_ns
+    together(pace, FREE_NS + 2 * PERIOD_NS)
+    assert pace.last_ns == FREE_NS + 2 * PERIOD_NS
+
+
+@pytest.mark.parametrize("apart_ms", [2, 5, 12, 24])
+def test_who_beats_somewhat_before_the_first_member_waits_for_it(apart_ms: int) -> None:
+    heard = [apart_ms * MS + number * PERIOD_NS for number in range(200)]
+    left = beats(BeatPace(0, 0), heard, 200 * PERIOD_NS)
+    free = int(FREE_NS / PERIOD_NS)
+    met = next(number for number, at in enumerate(left) if number > free and at in set(heard))
+    assert met - free <= apart_ms * MS // (PERIOD_NS // LATE_PART) + 2
+
+
 def test_a_change_that_waits_is_not_put_off() -> None:
     pace = BeatPace(0, FREE_NS)
     pace.left(FREE_NS, PERIOD_NS)
