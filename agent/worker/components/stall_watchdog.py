@@ -17,8 +17,9 @@ from typing import Final
 STEP_S: Final = 1.0
 """Between two looks at a process that owes an answer."""
 
-STEPS_MAX: Final = 5
-"""Looks in a row at which it has done nothing; then it is ended. A guard answers within two seconds, even while it waits."""
+STEPS_MAX: Final = 4
+"""Looks in a row, after the first one, at which it has done nothing; then it is ended. A guard answers within two seconds, even
+while it waits."""
 
 LATE_S: Final = 0.5
 """A look that comes so late says that we stood still, too: it does not count."""
@@ -27,6 +28,8 @@ UNKNOWN: Final = ""
 WAITS_FOR_DISK: Final = "D"
 WAITS_FOR_PROCESSOR: Final = "R"
 """Of one that has used none meanwhile: others kept it from running, and would keep the one in its place."""
+
+NOT_SEEN: Final[tuple[object, str, int]] = (None, UNKNOWN, 0)
 
 log = logging.getLogger("failover.component")
 
@@ -42,13 +45,13 @@ class Watchman:
         """
         self._pid, self._whom, self._owed = pid, whom, owed
         self._next_look: asyncio.TimerHandle | None = None
-        self._seen: tuple[object, str, int] = (None, UNKNOWN, 0)
+        self._seen = NOT_SEEN
         self._steps = 0
 
     def awaits(self) -> None:
         """An answer is awaited from now on."""
         if self._next_look is None:
-            self._seen, self._steps = self._sight(), 0
+            self._seen, self._steps = NOT_SEEN, 0  # nearly all answers come before the first look
             self._plan()
 
     def close(self) -> None:
