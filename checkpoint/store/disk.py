@@ -29,6 +29,9 @@ _sync_file_range.argtypes = (ctypes.c_int, ctypes.c_int64, ctypes.c_int64, ctype
 class Disk:
     """A real file system. Every method raises OSError as the kernel gives it."""
 
+    def __init__(self) -> None:
+        self._nameless: set[int] = set()
+
     def make_folder(self, path: Path) -> None:
         """Create a folder for our eyes only; durable after ``sync_folder`` of its parent."""
         path.mkdir(mode=FOLDER_MODE)
@@ -43,8 +46,9 @@ class Disk:
         return len(content)
 
     def is_unnamed(self, descriptor: int) -> bool:
-        """Whether it is a file that no name leads to (O_TMPFILE, or a memory file)."""
-        return os.fstat(descriptor).st_nlink == 0
+        """Whether it is a file that no name leads to (O_TMPFILE), and no file system is known that keeps `name` from it."""
+        found = os.fstat(descriptor)
+        return found.st_nlink == 0 and found.st_dev not in self._nameless
 
     def name(self, descriptor: int, path: Path) -> bool:
         """Give an unnamed file a name.
@@ -57,6 +61,8 @@ class Disk:
             os.link(f"/proc/self/fd/{descriptor}", path, src_dir_fd=descriptor, follow_symlinks=True)
         except OSError as error:
             if error.errno in (errno.EXDEV, errno.ENOENT, errno.EPERM, errno.EOPNOTSUPP):
+                if error.errno == errno.EXDEV:  # as of memory files, and so of each snapshot that is made here
+                    self._nameless.add(os.fstat(descriptor).st_dev)
                 return False
             raise
         os.chmod(path, FILE_MODE)
@@ -116,8 +122,8 @@ class DiskFile:
 
     def copy_from(self, source: int) -> None:
         """Append the whole of another file."""
-        offset = 0
-        while content := os.pread(source, COPY_SIZE, offset):
+        offset, size = 0, os.fstat(source).st_size
+        while content := os.pread(source, min(COPY_SIZE, size - offset), offset):
             self.write(content)
             offset += len(content)
 

@@ -378,6 +378,7 @@ class StuckDisk(Disk):
     """A disk whose syncs wait until somebody opens the gate."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.gate, self.waits = threading.Event(), threading.Event()
         self.gate.set()
 

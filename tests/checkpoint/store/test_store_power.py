@@ -37,6 +37,7 @@ class CuttingDisk(Disk):
     """
 
     def __init__(self, cut_at: int) -> None:
+        super().__init__()
         self.countdown = cut_at
         self.safe: Names = {}
         self.pending: dict[Path, list[tuple[Path, Inode | None, bool]]] = {}
