@@ -5,7 +5,7 @@ or: python -m benchmarks.team_channel --urgent 600
 
 Ways: unicast, multicast (each 20 ms), timers (multicast each 50 ms, without slots), slots (50 ms). Each robot's items are put at
 20 Hz. All ways in one run, one after the other: only rows of one run can be compared. With --urgent: how soon an urgent item of
-379 bytes is seen at another robot, beside a bare multicast between the same network namespaces.
+379 bytes is seen at another robot, beside other ways between the same network namespaces.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ SHORT_MS: Final = 4.7
 """A gap in which a frame of 379 bytes does not fit between two others, on a radio's lowest rate."""
 
 GROUP: Final = "239.77.255.1"
-GROUP_PORT: Final = 7499
-"""Of the bare multicast: not the team's."""
+PORTS: Final = range(7495, 7500)
+"""Of what is measured beside the team's frames, and not the team's."""
 
 ITEM: Final = '[board.items.item{}]\ntype = {{ x = "f8", y = "f8", angle = "f8", at = "u8" }}\n'
 
@@ -159,8 +159,16 @@ def _measure_urgent(count: int) -> None:
             for number, robot in enumerate(stage.robots, 1)
         ]
         time.sleep(SETTLE_S)
-        values = urgent.measured(ends[0], ends[1], (GROUP, GROUP_PORT), count, Path(directory))
-    for name, found in zip(("an urgent put until it is seen", "a bare multicast until it is received"), values, strict=True):
+        seen = urgent.measured(ends[0], ends[1], GROUP, PORTS, count, Path(directory))
+    ways = {
+        "an urgent put until it is seen": seen.put,
+        "a bare multicast until it is received": seen.datagram,
+        "a bare datagram passed on by two processes": seen.relayed,
+        "zenoh by its router": seen.zenoh,
+    }
+    for name, found in ways.items():
+        if not found:
+            continue
         cuts = statistics.quantiles(found, n=100)
         print(f"{name}: p50 {cuts[49]:.0f} µs, p90 {cuts[89]:.0f}, p99 {cuts[98]:.0f}, least {min(found):.0f}, of {len(found)}")
 

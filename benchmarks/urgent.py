@@ -1,16 +1,19 @@
-"""How soon an urgent put of one robot is seen at another, beside a bare UDP datagram between the same two places.
+"""How soon an urgent put of one robot is seen at another, beside other ways between the same two places.
 
-Programs of their own put, send, watch and receive. They have real-time priority, below the main loops', where this user may: what
-else runs on the machine is not to be measured.
+Beside it: a bare UDP datagram; a bare datagram by way of two processes that only pass it on, as a put goes by way of two main
+loops; and zenoh by way of its router, where it is installed. Programs of their own put, send, watch and receive. They have
+real-time priority, below the main loops', where this user may: what else runs on the machine is not to be measured.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -40,17 +43,37 @@ def now_ns():
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 """
 
+_ZENOH: Final = """
+import json, zenoh
+def session(mode, way, address):
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5(f"{way}/endpoints", json.dumps([address]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+"""
+
 PUTS: Final = f"""{_BEGIN}
-place, mine, theirs, port, count = sys.argv[1:]
-if ipaddress.ip_address(theirs).is_multicast:
+board_place, mine, direct_host, direct, relayed, router, count = sys.argv[1:]
+if ipaddress.ip_address(direct_host).is_multicast:
     link.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(mine))
-with board(place) as here:
-    item, rest = here.item("alarm", bytes), bytes({SIZE} - 8)
+def send(port, host):
+    return lambda content: link.sendto(content, (host, int(port)))
+with board(board_place) as here:
+    ways = [here.item("alarm", bytes).put, send(direct, direct_host), send(relayed, mine)]
+    if router:{_ZENOH.replace(chr(10), chr(10) + 8 * " ")}
+        link_to_router = session("client", "connect", router)
+        publisher = link_to_router.declare_publisher("alarm")
+        ways.append(publisher.put)
+        deadline = time.monotonic() + {PATIENCE_S}
+        while not publisher.matching_status.matching:
+            if time.monotonic() > deadline:
+                sys.exit("zenoh's publisher did not find its subscriber")
+            time.sleep(0.01)
     for _ in range(int(count)):
-        time.sleep(random.uniform{GAP_S} / 2)
-        item.put(now_ns().to_bytes(8, "little") + rest)
-        time.sleep(random.uniform{GAP_S} / 2)
-        link.sendto(now_ns().to_bytes(8, "little") + rest, (theirs, int(port)))
+        for way in ways:
+            time.sleep(random.uniform{GAP_S} / len(ways))
+            way(now_ns().to_bytes(8, "little") + bytes({SIZE} - 8))
 """
 
 WATCHES: Final = f"""{_BEGIN}
@@ -78,6 +101,30 @@ while True:
 """
 
 
+RELAYS: Final = f"""{_BEGIN}
+mine, port, theirs, next_port = sys.argv[1:]
+link.bind((mine, int(port)))
+print("ready", flush=True)
+while True:
+    link.sendto(link.recv(2048), (theirs, int(next_port)))
+"""
+
+ROUTES: Final = f"""{_BEGIN}{_ZENOH}
+router = session("router", "listen", sys.argv[1])
+print("ready", flush=True)
+time.sleep(3600)
+"""
+
+SUBSCRIBES: Final = f"""{_BEGIN}{_ZENOH}
+def came(sample):
+    print(now_ns() - int.from_bytes(sample.payload.to_bytes()[:8], "little"), flush=True)
+here = session("client", "connect", sys.argv[1])
+subscriber = here.declare_subscriber("alarm", came)
+print("ready", flush=True)
+time.sleep(3600)
+"""
+
+
 class End(Struct, frozen=True):
     """One of the two robots.
 
@@ -92,25 +139,48 @@ class End(Struct, frozen=True):
     inside: tuple[str, ...] = ()
 
 
-def measured(first: End, second: End, to: tuple[str, int], count: int, directory: Path) -> tuple[list[float], list[float]]:
-    """From a put at robot1 until a program that waits at robot2 has it, µs; from a datagram's send until it is received.
+class Seen(Struct, frozen=True):
+    """From a put or send until a program at the other robot has it, µs. ``zenoh`` is empty where it is not installed."""
+
+    put: list[float]
+    datagram: list[float]
+    relayed: list[float]
+    zenoh: list[float]
+
+
+def measured(first: End, second: End, group: str, ports: Sequence[int], count: int, directory: Path) -> Seen:
+    """Puts and sends at robot1, each by itself, one way after the other.
 
     Args:
-        to: host and port of the datagrams: a group, or the second's address.
+        group: host of the bare datagrams: a multicast group, or the second's address.
+        ports: five that are free at both.
 
     Raises:
         BenchmarkError: puts or datagrams did not come.
     """
-    host, port = to[0], str(to[1])
-    with (
-        _listening(WATCHES, second, [str(second.board)], directory / "seen") as seen,
-        _listening(RECEIVES, second, [second.address, host, port], directory / "received") as received,
-    ):
-        puts = [str(first.board), first.address, host, port, str(count)]
+    direct, arrival, relay, far_relay, router = map(str, ports)
+    address = f"tcp/{first.address}:{router}" if importlib.util.find_spec("zenoh") is not None else ""
+
+    with ExitStack() as stack:
+
+        def start(program: str, where: End, *arguments: str, name: str) -> Path:
+            return stack.enter_context(_listening(program, where, arguments, directory / name))
+
+        outputs = {
+            "put": start(WATCHES, second, str(second.board), name="seen"),
+            "datagram": start(RECEIVES, second, second.address, group, direct, name="received"),
+            "relayed": start(RECEIVES, second, second.address, second.address, arrival, name="relayed"),
+        }
+        start(RELAYS, first, first.address, relay, second.address, far_relay, name="relay")
+        start(RELAYS, second, second.address, far_relay, second.address, arrival, name="far relay")
+        if address:
+            start(ROUTES, first, address, name="router")
+            outputs["zenoh"] = start(SUBSCRIBES, second, address, name="subscribed")
+        puts = [str(first.board), first.address, group, direct, relay, address, str(count)]
         subprocess.run([*first.inside, sys.executable, "-c", PUTS, *puts], check=True)
-        _until(lambda: len(_rows(received)) >= SEEN_SHARE * count, "datagrams")
-        _until(lambda: len(_rows(seen)) >= SEEN_SHARE * count, "urgent puts")
-        return _rows(seen), _rows(received)
+        for way, output in outputs.items():
+            _until(partial(_has_rows, output, SEEN_SHARE * count), f"what was sent to be seen ({way})")
+        return Seen(**{"zenoh": [], **{way: _rows(output) for way, output in outputs.items()}})
 
 
 @contextmanager
@@ -129,6 +199,10 @@ def _listening(program: str, where: End, arguments: Sequence[str], output: Path)
 def _rows(output: Path) -> list[float]:
     whole, _, _ = output.read_text().rpartition("\n")
     return [int(line) / 1000 for line in whole.splitlines()[1:]]
+
+
+def _has_rows(output: Path, count: float) -> bool:
+    return len(_rows(output)) >= count
 
 
 def _until(holds: Callable[[], bool], what: str) -> None:
