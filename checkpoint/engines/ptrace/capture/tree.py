@@ -325,10 +325,10 @@ class CapturedTree:
                 with _gone_if_ended(pid):
                     is_base = base or process.memory.acknowledged is None
                     self._copied[pid] = process.copy_running(base=is_base, enough=enough, copied=before.get(pid))
-            except ProcessGoneError:  # or it has executed another program
-                self._forget(pid)
             except CaptureError as error:
-                raise MovedError(str(error)) from error
+                if not _is_another(process, error):
+                    raise MovedError(str(error)) from error
+                self._forget(pid)
 
     # The freeze
 
@@ -449,7 +449,9 @@ class CapturedTree:
                 process.memory.leave_out(told)
                 is_base = base or process.memory.acknowledged is None  # a delta may be of a position that has not heard of it
                 return process.look(self._copied[pid], None, base=is_base, opened=seen.opened[pid]), process
-            except ProcessGoneError:
+            except CaptureError as error:
+                if not _is_another(process, error):
+                    raise
                 self._forget(pid)
         elif process is not None:
             self._forget(pid)
@@ -462,6 +464,11 @@ class CapturedTree:
         copied = process.copy_running(base=True)
         process.memory.leave_out(told)
         return process.look(copied, None, base=True, opened=seen.opened[pid]), process
+
+
+def _is_another(process: CapturedProcess, error: CaptureError) -> bool:
+    """Whether a failure says that it has ended, or executed another program since it was entered, perhaps right then."""
+    return isinstance(error, ProcessGoneError) or not process.onlooker.is_entered()
 
 
 def _is_same(known: CapturedProcess) -> bool:

@@ -11,17 +11,19 @@ import sys
 import tracemalloc
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
 from checkpoint.engine import CaptureOrder, RestoreOptions
+from checkpoint.engines.ptrace.capture import enter
 from checkpoint.engines.ptrace.capture.process import CapturedProcess, Look
 from checkpoint.engines.ptrace.capture.tree import SeenOthers
 from checkpoint.engines.ptrace.facts.probe import probe
 from checkpoint.errors import CaptureError, ProbeError, ProcessGoneError, UnsupportedError
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.vessel import Birth, spawn_vessel
+from checkpoint.linux.trace.entry import Entered
 from checkpoint.model import ProcessState, Resource, Snapshot
 from checkpoint.resources.events import pidfd
 from checkpoint.resources.open_file import OpenFile, Surroundings
@@ -291,6 +293,29 @@ def test_a_capture_that_breaks_off_while_it_describes_leaves_nothing_behind(
             assert [one for one in gc.get_objects() if isinstance(one, SeenOthers)] == []
         finally:
             gc.enable()
+
+
+def test_a_child_that_executes_another_program_right_after_it_was_entered_is_entered_once_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is opened of it then is the next program's, and our pages are gone with the one before."""
+    os.mkfifo(tmp_path / "go")
+    script = f"(read line < {tmp_path}/go; exec sleep 1000) & echo ready; wait"
+    program = start(["/bin/sh", "-c", script], tmp_path, isolate=True)
+    track, executed = enter._tracker_for, []
+
+    def track_once_it_executes(pid: int, entered: Entered) -> Any:
+        if pid != program.pid and not executed:
+            (tmp_path / "go").write_text("go\n")
+            program.wait_until(lambda: procfs.status(pid).name == "sleep", "that it has executed it")
+            executed.append(pid)
+        return track(pid, entered)
+
+    monkeypatch.setattr(enter, "_tracker_for", track_once_it_executes)
+    program.wait_for_line("ready")
+    with ended(program), protected(program) as session:
+        captured_at_last(session, CaptureOrder())
+        assert executed
 
 
 POOL = """
