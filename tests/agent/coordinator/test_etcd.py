@@ -46,7 +46,7 @@ def until_answers(etcd: Etcd) -> str:
 
 
 def opened(server: EtcdServer, **keys: str) -> Etcd:
-    etcd = Etcd(CoordinatorConfig([server.endpoint], **keys), 5.0)
+    etcd = Etcd(CoordinatorConfig([server.endpoint], **keys), PATIENCE_S)
     assert until_answers(etcd).startswith("3.")
     return etcd
 
@@ -147,9 +147,9 @@ def test_an_account_of_etcd_is_used_and_its_token_renewed(server: EtcdServer, tm
     password.write_text("wrong\n")
     keys = {"user": "root", "password_file": str(password)}
     with pytest.raises(CoordinatorError, match=r"refuses .*authentication failed"):
-        swap(Etcd(CoordinatorConfig([server.endpoint], **keys), 5.0), {}, {})
+        swap(Etcd(CoordinatorConfig([server.endpoint], **keys), PATIENCE_S), {}, {})
     password.write_text(ROOT + "\n")
-    etcd = Etcd(CoordinatorConfig([server.endpoint], **keys), 5.0)
+    etcd = Etcd(CoordinatorConfig([server.endpoint], **keys), PATIENCE_S)
     assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
     etcd._token = "over"
     assert swap(etcd, {}, {f"{PREFIX}word/r1": b""}).is_done
