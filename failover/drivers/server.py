@@ -106,6 +106,10 @@ class Typing(Struct):
     is_over: bool = False
 
 
+SIGNALS_MAX: Final = 64
+"""Read at once; more of them say nothing new."""
+
+
 def run(cls: type[T]) -> T:
     """Make the driver and carry out its messages until SIGTERM or Ctrl-C.
 
@@ -117,7 +121,7 @@ def run(cls: type[T]) -> T:
         NameFormatError: its path belongs to another robot.
     """
     serving = Serving(cls)
-    with _signals(serving), serving:
+    with stopped_by_signals(serving), serving:
         for line in serving.addresses_told():
             print(line, file=sys.stderr, flush=True)
         serving.serve()
@@ -561,14 +565,30 @@ class Serving:
 
 
 @contextlib.contextmanager
-def _signals(serving: Serving) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end the driver after the message in hand."""
+def stopped_by_signals(serving: Serving) -> Iterator[None]:
+    """SIGTERM and Ctrl-C end the driver after the message in hand.
+
+    A signal that comes right before the wait for messages, or that the kernel gives another thread, does not end that wait:
+    Python calls the handler only after it. So the signal itself writes into a pipe that is waited for, too
+    (signal.set_wakeup_fd).
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    come, told = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+
+    def heed() -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(come, SIGNALS_MAX)
+
+    serving._wait_for(come, heed)
     before = {number: signal.signal(number, lambda *_: serving.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+    told_before = signal.set_wakeup_fd(told, warn_on_full_buffer=False)
     try:
         yield
     finally:
+        signal.set_wakeup_fd(told_before)
         for number, handler in before.items():
             signal.signal(number, handler)
+        os.close(told)
+        os.close(come)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import time
 from datetime import UTC, date, datetime
@@ -133,6 +132,7 @@ def receive(arguments: argparse.Namespace) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Hold a program's name and mailbox, and run its active version, until SIGTERM or Ctrl-C."""
+    from failover.drivers import server
     from failover.programs.hosting import Hosting
     from failover.programs.sources import Place, source_of_directory
 
@@ -141,9 +141,7 @@ def run(arguments: argparse.Namespace) -> int:
     name = source_of_directory(directory).manifest.name if directory is not None else arguments.program
     place = Place(store, Path(arguments.directory), name, directory, arguments.beside)
     hosting = Hosting(place, arguments.version or "")
-    with hosting:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: hosting.stop())
+    with server.stopped_by_signals(hosting), hosting:
         for line in (*hosting.addresses_told(), *hosting.confinement_told()):
             print(line, file=sys.stderr, flush=True)
         hosting.serve()
