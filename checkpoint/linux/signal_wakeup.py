@@ -31,13 +31,20 @@ def waking() -> Iterator[Callable[[int], None]]:
     if threading.current_thread() is not threading.main_thread():
         yield await_readable
         return
+    with told_of_signals() as heard:
+        yield lambda descriptor: await_readable(descriptor, heard)
+
+
+@contextlib.contextmanager
+def told_of_signals() -> Iterator[socket.socket]:
+    """A socket that never blocks, in which each signal leaves a byte within the body. For the first thread."""
     heard, told = socket.socketpair()
     with heard, told:
         for end in (heard, told):
             end.setblocking(False)
         before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
         try:
-            yield lambda descriptor: await_readable(descriptor, heard)
+            yield heard
         finally:
             signal.set_wakeup_fd(before)
 

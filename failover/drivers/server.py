@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 import msgspec
 from msgspec import Struct
 
+from checkpoint.linux.signal_wakeup import BYTES_AT_ONCE, told_of_signals
 from failover.boards import boottime
 from failover.core.messaging import envelope as envelopes
 from failover.core.messaging.by_hand import Typed
@@ -104,10 +105,6 @@ class Typing(Struct):
     unsent: bytearray
     waiting: int = 0
     is_over: bool = False
-
-
-SIGNALS_MAX: Final = 64
-"""Read at once; more of them say nothing new."""
 
 
 def run(cls: type[T]) -> T:
@@ -566,29 +563,20 @@ class Serving:
 
 @contextlib.contextmanager
 def stopped_by_signals(serving: Serving) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end the driver after the message in hand.
-
-    A signal that comes right before the wait for messages, or that the kernel gives another thread, does not end that wait:
-    Python calls the handler only after it. So the signal itself writes into a pipe that is waited for, too
-    (signal.set_wakeup_fd).
-    """
+    """SIGTERM and Ctrl-C end the driver after the message in hand, also where they come right before the wait for one."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    come, told = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    with told_of_signals() as heard:
+        serving._wait_for(heard.fileno(), functools.partial(_discard, heard))
+        before = {number: signal.signal(number, lambda *_: serving.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
-    def heed() -> None:
-        with contextlib.suppress(BlockingIOError):
-            os.read(come, SIGNALS_MAX)
 
-    serving._wait_for(come, heed)
-    before = {number: signal.signal(number, lambda *_: serving.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
-    told_before = signal.set_wakeup_fd(told, warn_on_full_buffer=False)
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(told_before)
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        os.close(told)
-        os.close(come)
+def _discard(heard: socket.socket) -> None:
+    with contextlib.suppress(BlockingIOError):
+        heard.recv(BYTES_AT_ONCE)
