@@ -41,14 +41,11 @@ with contextlib.suppress(OSError):
 def now_ns():
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-"""
-
-_ZENOH: Final = """
-import json, zenoh
 def session(mode, way, address):
+    import json, zenoh
     config = zenoh.Config()
     config.insert_json5("mode", json.dumps(mode))
-    config.insert_json5(f"{way}/endpoints", json.dumps([address]))
+    config.insert_json5(f"{{way}}/endpoints", json.dumps([address]))
     config.insert_json5("scouting/multicast/enabled", "false")
     return zenoh.open(config)
 """
@@ -61,7 +58,7 @@ def send(port, host):
     return lambda content: link.sendto(content, (host, int(port)))
 with board(board_place) as here:
     ways = [here.item("alarm", bytes).put, send(direct, direct_host), send(relayed, mine)]
-    if router:{_ZENOH.replace(chr(10), chr(10) + 8 * " ")}
+    if router:
         link_to_router = session("client", "connect", router)
         publisher = link_to_router.declare_publisher("alarm")
         ways.append(publisher.put)
@@ -109,13 +106,13 @@ while True:
     link.sendto(link.recv(2048), (theirs, int(next_port)))
 """
 
-ROUTES: Final = f"""{_BEGIN}{_ZENOH}
+ROUTES: Final = f"""{_BEGIN}
 router = session("router", "listen", sys.argv[1])
 print("ready", flush=True)
 time.sleep(3600)
 """
 
-SUBSCRIBES: Final = f"""{_BEGIN}{_ZENOH}
+SUBSCRIBES: Final = f"""{_BEGIN}
 def came(sample):
     print(now_ns() - int.from_bytes(sample.payload.to_bytes()[:8], "little"), flush=True)
 here = session("client", "connect", sys.argv[1])
