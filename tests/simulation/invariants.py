@@ -29,6 +29,7 @@ class Invariants:
         safe: components that must never act twice: ``when_alone`` is freeze, or primaries are elected.
         votes: primaries are elected; ``given``: who voted for whom, of which component, in which epoch; ``cast``: the same, with
             votes that their voters have lost together with their disks: their elections still count.
+        elected: component, epoch and robot that a majority of this robot's team had voted for at some instant.
         gone: positions that were on a disk that was lost.
         split: components that computed in two places at once (allowed under ``run``, after a cut).
         acknowledged: newest position that each component's primaries acknowledged while a standby held it.
@@ -50,6 +51,7 @@ class Invariants:
     gone: set[Position] = field(default_factory=set)
     given: dict[tuple[str, str, int], str] = field(default_factory=dict)
     cast: set[tuple[str, str, int, str]] = field(default_factory=set)
+    elected: set[tuple[str, int, str]] = field(default_factory=set)
     split: set[str] = field(default_factory=set)
     epochs: dict[tuple[str, str], int] = field(default_factory=dict)
     acknowledged: dict[str, Position] = field(default_factory=dict)
@@ -153,18 +155,25 @@ class Invariants:
         for record in vote_record.records:
             if not self.votes or not record.primary or record.state in ENDED:
                 continue
-            key = (robot, record.name, record.epoch)
-            before = self.given.setdefault(key, record.primary)
-            for_it = sum((name, *key[1:], record.primary) in self.cast for name in world.robots)
-            voters = len(world.robots)
-            if world.coordination is not None:
-                voters, for_it = voters + 1, for_it + ((*key[1:], record.primary) in world.coordination.etcd.votes)
-            self.cast.add((*key, record.primary))
-            if before == robot and for_it > voters // 2:
-                self.given[key] = record.primary  # its own claim was in vain: it follows the one that was elected
+            vote = (record.name, record.epoch, record.primary)
+            before = self.given.setdefault((robot, *vote[:2]), record.primary)
+            self._count(world, *vote)
+            if before == robot and vote in self.elected:
+                self.given[robot, *vote[:2]] = record.primary  # its own claim was in vain: it follows the one that was elected
             elif before != record.primary:
                 story = f"{robot} votes for {before} and {record.primary} in epoch {record.epoch} of {record.name}"
                 raise broken(world, story)
+            self.cast.add((robot, *vote))
+            self._count(world, *vote)
+
+    def _count(self, world: World, component: str, epoch: int, primary: str) -> None:
+        """Whether a majority of the primary's own team, as that is now, has voted for it. Who is no member of it has no vote."""
+        team = world.robots[primary].config
+        votes = sum((name, component, epoch, primary) in self.cast for name in (primary, *team.peers))
+        if world.coordination is not None:
+            votes += (component, epoch, primary) in world.coordination.etcd.votes
+        if votes >= team.quorum:
+            self.elected.add((component, epoch, primary))
 
     def _forget(self, world: World, robot: str, loss: NewDisk) -> None:
         self.gone.update(loss.lost)

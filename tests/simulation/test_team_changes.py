@@ -194,7 +194,7 @@ def stormy(seed: int, growth: str, patience_ms: int) -> World:
             world.power_off(leaving)
             world.new_disk(leaving, vote_record=False)
             after = tuple(name for name in team if name != leaving)
-        for name in sorted(set(after) & set(team), key=lambda _: random.random()):
+        for name in random.sample(staying := [name for name in team if name in after], len(staying)):
             if random.random() < 0.5:
                 _fault(world, random, team, former)
             world.run(world.now_ns + random.randrange(patience_ms) * MS)
