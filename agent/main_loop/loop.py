@@ -64,6 +64,7 @@ from failover.core.frames.lane import FrameLane
 from failover.core.frames.lanes import FrameLanes, medium_of
 from failover.core.frames.roster import Roster
 from failover.core.node import Node
+from failover.core.team_changes import elections
 from failover.core.types import COORDINATOR
 from failover.core.types import Config as CoreConfig
 from failover.core.wire.messages import OTHER_SITES, Beat
@@ -718,6 +719,8 @@ class MainLoop:
 
     def _told(self, question: messages.Ask) -> ToWorker:
         now_ns = clock.now_ns()
+        if question.what == "elections":
+            return Told(question.number, now_ns, elections=elections(self._outbox.durable))
         refused = Counter(self._refused)
         refused[str(Reason.NOT_OURS)] += self._beats.dropped()
         counts = BeatCounts(

@@ -16,6 +16,7 @@ from failover.core.acts import Act
 from failover.core.event_log.decisions import Line
 from failover.core.events import Event
 from failover.core.frames.terms import SlotsView
+from failover.core.team_changes import Elections
 from failover.core.types import Found, Held, StatusView
 
 ACTS: Final[dict[str, Any]] = {
@@ -138,10 +139,10 @@ class TeamIs(msgspec.Struct, frozen=True, tag=True):
 
 
 class Ask(msgspec.Struct, frozen=True, tag=True):
-    """Worker to main loop: show me the team, or the decisions that are not on the disk yet. Answer: `Told`."""
+    """Worker to main loop: show me the team, decisions that are not on the disk yet, or elections that are. Answer: `Told`."""
 
     number: int
-    what: Literal["status", "why"]
+    what: Literal["status", "why", "elections"]
 
 
 class BeatCounts(msgspec.Struct, frozen=True):
@@ -205,6 +206,7 @@ class Told(msgspec.Struct, frozen=True, tag=True):
     beats: BeatCounts = BeatCounts()
     troubles: tuple[str, ...] = ()
     media: tuple[MediumView, ...] = ()
+    elections: Elections = Elections()
 
 
 class IsRestart(msgspec.Struct, frozen=True, tag=True):

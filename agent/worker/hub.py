@@ -249,8 +249,8 @@ class Switchboard:
         else:
             self._say(messages.happened(event))
 
-    async def ask(self, what: Literal["status", "why"]) -> Told:
-        """Ask the main loop for the core's view, or for what it has not written down yet."""
+    async def ask(self, what: Literal["status", "why", "elections"]) -> Told:
+        """Ask the main loop for the core's view, for what it has not written down yet, or for the elections that it has."""
         number = next(self._numbers)
         answer: asyncio.Future[Told] = asyncio.get_running_loop().create_future()
         self._questions[number] = answer

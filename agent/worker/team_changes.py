@@ -29,7 +29,7 @@ from agent.worker.network.remote_orders import Errands, OrderOfPeer
 from failover.config import team as team_file
 from failover.config.team import Robot, Team, sites_of
 from failover.core import acts, events
-from failover.core.team_changes import TWO_KEYS, USE_NS, Grants, acts_unheard, missing, step
+from failover.core.team_changes import TWO_KEYS, USE_NS, Elections, Grants, acts_unheard, missing, step, unaware
 from failover.core.types import ENDED, HOLDING, PeerView
 from failover.errors import FailoverError
 
@@ -53,6 +53,12 @@ LOOK_S: Final = 0.1
 
 CONNECT_PATIENCE_S: Final = 10.0
 """For connections with another key; a grant holds for longer than that."""
+
+AWARE_PATIENCE_NS: Final = 3_000_000_000
+"""For members to hear of an election that a change must wait for: a heartbeat tells it."""
+
+PAIR_SIZE: Final = 2
+"""So few members elect nothing, unless the rule is given."""
 
 UNHEARD_NS: Final = 10_000_000_000
 """A member that was not heard since this agent's start counts as one that lives for so long: it may be starting, too."""
@@ -80,12 +86,15 @@ class Answer(NamedTuple):
     Attributes:
         sees: it hears the robot that is to leave.
         members: digest of the team that it has granted.
+        rule: as its agent.toml gives it; ``elections``: that it knows of; None: its release does not tell that.
     """
 
     granted: bool = False
     refusal: str = ""
     sees: bool = False
     members: int = 0
+    rule: str = ""
+    elections: Elections | None = None
 
 
 class Lines(Protocol):
@@ -259,9 +268,18 @@ class TeamChanges:
         Raises:
             RefusedError: a member refuses, or cannot be asked; nothing has changed.
         """
-        me, asked_ns = self._lines.settings.config.robot, clock.now_ns()
+        asked_ns = clock.now_ns()
         await self._tell_who_is_behind()
-        if refusal := self._grants.ask(before.change, before.change, me, asked_ns, digest(after.robots)):
+        while waits := _waits(before, after, await self._grants_of_all(before, after, removed)):
+            if clock.now_ns() - asked_ns > AWARE_PATIENCE_NS:
+                raise RefusedError(f"cannot change the team: {waits}; nothing has changed. Try again")
+            await asyncio.sleep(LOOK_S)
+        return asked_ns
+
+    async def _grants_of_all(self, before: Team, after: Team, removed: str) -> dict[str, Answer]:
+        """Ask all, this robot among them: the answers of those that have granted the change. Raises RefusedError: as above."""
+        me = self._lines.settings.config.robot
+        if refusal := self._grants.ask(before.change, before.change, me, clock.now_ns(), digest(after.robots)):
             raise RefusedError(f"cannot change the team at {me}: {refusal}")
         lives = bool(removed) and await self._may_live(removed)
         others = [peer for peer in self._lines.settings.others if peer != removed or lives]
@@ -282,7 +300,8 @@ class TeamChanges:
                 f"cannot change the team: each of its {len(before.robots)} members must agree, and {', '.join(short)} cannot be "
                 "reached; nothing has changed. Bring it back, or take out one that is lost: failover team remove ROBOT"
             )
-        return asked_ns
+        own = Answer(True, rule=self._lines.settings.config.rule, elections=(await self._lines.ask("elections")).elections)
+        return {me: own} | {peer: answer for peer, answer in answers.items() if answer.granted}
 
     async def _asked(self, peer: str, before: Team, after: Team) -> Answer:
         """What a member says; neither granted nor refused where it cannot be reached."""
@@ -293,8 +312,12 @@ class TeamChanges:
             log.info("%s does not answer about the team: %s", peer, error)
             return Answer()
         refusal = str(answer.get("refusal", ""))
-        members = answer.get("members")
-        return Answer(not refusal, refusal, bool(answer.get("sees")), members if isinstance(members, int) else 0)
+        members, rule = answer.get("members"), str(answer.get("rule", ""))
+        try:
+            known = msgspec.convert(answer["elections"], Elections)
+        except (KeyError, msgspec.ValidationError):
+            known = None  # its release tells none
+        return Answer(not refusal, refusal, bool(answer.get("sees")), members if isinstance(members, int) else 0, rule, known)
 
     async def _free(self, peer: str) -> None:
         if self._lines.hindrance(peer):
@@ -435,7 +458,14 @@ class TeamChanges:
             return {"refusal": objection}
         refusal = self._grants.ask(self._lines.settings.team.change, asked.have, peer, clock.now_ns(), digest(after.robots))
         sees = bool(removed) and removed != me and await self._may_live(removed)
-        return {"refusal": refusal, "sees": sees, "members": digest(after.robots)}
+        told = (await self._lines.ask("elections")).elections
+        return {
+            "refusal": refusal,
+            "sees": sees,
+            "members": digest(after.robots),
+            "rule": self._lines.settings.config.rule,
+            "elections": msgspec.to_builtins(told),
+        }
 
     async def _objection_to(self, removed: str, after: Team) -> str:
         if removed != self._lines.settings.config.robot:
@@ -549,6 +579,24 @@ class TeamChanges:
             raise RefusedError(
                 f"cannot write {directory / team_file.TEAM_FILE}: {error.strerror}; a service needs ReadWritePaths={directory}"
             ) from error
+
+
+def _waits(before: Team, after: Team, told: Mapping[str, Answer]) -> str:
+    """Which elections a change must wait for, as a part of a sentence; "" for none. Each site elects for itself."""
+    if before.robots.keys() == after.robots.keys():
+        return ""
+    waits = []
+    for site in sorted({one.site for one in after.robots.values()}):
+        members, voters = before.at_site(site), after.at_site(site)
+        answers = {name: answer for name, answer in told.items() if name in members}
+        rule = next((answer.rule for answer in answers.values() if answer.rule), "auto")
+        if rule == "pair" or (rule == "auto" and len(voters) <= PAIR_SIZE):
+            continue
+        known = {name: answer.elections for name, answer in answers.items()}
+        for component, (epoch, lacking) in unaware(members, voters, known, with_etcd=rule == "etcd").items():
+            names = ", ".join(one for one in lacking if one in members)
+            waits.append(f"{names}: not told yet which robot runs {component} in epoch {epoch}")
+    return "; ".join(waits)
 
 
 def _is_own_rotation(peer: str, who: str, before: Team, after: Team) -> bool:

@@ -11,6 +11,10 @@ majority of the other. That member's vote and that member's echo count once. Two
 granted, for each robot that asks needs the other one's grant. Source: Ongaro, Consensus: Bridging Theory and Practice, section
 4.2 (changes by one server); a majority of grants, as there, would let a member fall behind by two.
 
+An election is older than the teams after the next one, and may have no voter in their majorities. So each grant tells which
+elections that member knows. A change waits until so many members know the newest one that none of the majorities after it lacks
+it (`unaware`): else those others could elect a second primary with the same epoch.
+
 With rule = etcd a robot that no member hears may act by etcd's vote, if its own and etcd's are a majority (two of three votes).
 Such a robot is not taken out without its grant (`acts_unheard`): the next change would make a majority that knows neither.
 
@@ -28,7 +32,7 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from failover.core.types import MS, PEERS_MAX
+from failover.core.types import ENDED, MS, PEERS_MAX, VoteRecord
 
 GRANT_NS: Final = 60_000 * MS
 """A grant holds for so long; no clock of a robot that was given one can be so far off that half of it seems longer."""
@@ -124,6 +128,53 @@ def missing(team: Collection[str], granted: Collection[str], removed: str = "", 
         removed: the member that is to leave; ``lives``: a member sees it alive.
     """
     return sorted(member for member in team if member not in granted and (lives or member != removed))
+
+
+class Elections(Struct, frozen=True):
+    """What a member tells of elections, with its grant.
+
+    Attributes:
+        epochs: component → newest epoch that this member knows, as it stands on its disk.
+        ended: components that have ended, as this member knows: nothing waits for their elections.
+    """
+
+    epochs: dict[str, int] = {}
+    ended: frozenset[str] = frozenset()
+
+
+def elections(vote_record: VoteRecord) -> Elections:
+    """What a member with this vote record tells."""
+    records = vote_record.records
+    return Elections({one.name: one.epoch for one in records}, frozenset(one.name for one in records if one.state in ENDED))
+
+
+def unaware(
+    members: Collection[str], voters: Collection[str], told: Mapping[str, Elections | None], *, with_etcd: bool = False
+) -> dict[str, tuple[int, list[str]]]:
+    """Elections that a change must wait for: members that do not know of them could be a majority after it.
+
+    An epoch that a majority of the members does not know was claimed in vain. Of etcd it is not known which epochs it knows: it
+    counts as one that lacks them, but where a single member cannot have been elected without it.
+
+    Args:
+        members: all before the change, at one site; ``voters``: all after it.
+        told: by each member that grants the change; None: its release does not tell that.
+        with_etcd: etcd has a vote beside them.
+
+    Returns:
+        Component → its newest epoch of that kind, and the members that do not know it yet.
+    """
+    tellers = [one for one in told.values() if one is not None]
+    begun = {item for one in tellers for item in one.epochs.items() if item[0] not in one.ended}
+    waits = {}
+    for component, epoch in sorted(begun):
+        knowing = {name for name, one in told.items() if one is None or one.epochs.get(component, 0) >= epoch}
+        lacking = sorted({*voters} - knowing)
+        is_in_vain = len(told) - len(knowing) > (len(members) + with_etcd) // 2
+        etcd_lacks_it = with_etcd and len(members) > 1
+        if not is_in_vain and len(lacking) + etcd_lacks_it > (len(voters) + with_etcd) // 2:
+            waits[component] = epoch, lacking
+    return waits
 
 
 def acts_unheard(members: int) -> bool:

@@ -8,8 +8,10 @@ import pytest
 from msgspec.structs import replace
 
 from failover.core.events import TeamChanged
+from failover.core.team_changes import Elections, elections, unaware
 from failover.core.types import MS, ComponentSpec, Config, Launch, Rule, WhenAlone
 from tests.simulation.invariants import Broken, Invariants, seen_at
+from tests.simulation.robots import vote_record_of
 from tests.simulation.teams import elective, pair
 from tests.simulation.world import World
 
@@ -171,7 +173,7 @@ def stormy(seed: int, growth: str, patience_ms: int) -> World:
     """A team of three grows (+) and shrinks (-) amid faults, each member taking each change at an instant of its own.
 
     As the agents do it: a robot that is taken out runs nothing, and has ended before the others take the change. Its disk is lost
-    to the team.
+    to the team. Faults fall between the grants and the last member that takes the change, and last until the next one may begin.
     """
     random = Random(seed)
     configs = elective(3 + growth.count("+"), (SPEC,))
@@ -194,6 +196,10 @@ def stormy(seed: int, growth: str, patience_ms: int) -> World:
             world.power_off(leaving)
             world.new_disk(leaving, vote_record=False)
             after = tuple(name for name in team if name != leaving)
+        given_up_ns = world.now_ns + 10_000 * MS
+        while not _may_be_granted(world, team, after):
+            assert world.now_ns < given_up_ns, f"seed {seed}: {team} cannot become {after}"
+            world.run(world.now_ns + 10 * MS)
         for name in random.sample(staying := [name for name in team if name in after], len(staying)):
             if random.random() < 0.5:
                 _fault(world, random, team, former)
@@ -209,6 +215,17 @@ def stormy(seed: int, growth: str, patience_ms: int) -> World:
         world.power_on(name)
     world.run(world.now_ns + 4_000 * MS)
     return world
+
+
+def _may_be_granted(world: World, team: tuple[str, ...], after: tuple[str, ...]) -> bool:
+    """Whether all members are there, but one that leaves, and know enough of what was elected."""
+    told = {name: known_at(world, name) for name in team if world.robots[name].node is not None}
+    return set(team) & set(after) <= set(told) and not unaware(team, after, told)
+
+
+def known_at(world: World, robot: str) -> Elections:
+    """What a robot tells with its grant."""
+    return elections(vote_record_of(world.robots[robot]))
 
 
 def _fault(world: World, random: Random, names: tuple[str, ...], former: set[str]) -> None:
@@ -238,6 +255,36 @@ def test_one_member_at_a_time_nothing_acts_twice_in_any_fault(first: int) -> Non
     for seed in range(first, first + BLOCK):
         world = stormy(seed, GROWTHS[seed % len(GROWTHS)], 400)
         assert len(world.acting(PART)) == 1, f"seed {seed}: at {world.acting(PART)}"
+
+
+def test_a_change_before_a_majority_of_the_next_team_knows_an_election_would_let_two_be_elected() -> None:
+    """So all grants are not enough: robot2 has every change, and grants the next one before it has heard of robot3."""
+    world = World(1, [in_team(config, FIVE[:3], Rule.MAJORITY) for config in elective(4, (SPEC,))], (Invariants({PART}, True),))
+    for name in FIVE[:3]:
+        world.power_on(name)
+    world.run(1_500 * MS)
+    first, second, third = *world.acting(PART), *sorted({*FIVE[:3]} - {*world.acting(PART)})
+    world.power_off(second)
+    world.run(world.now_ns + 500 * MS)
+    world.power_off(first)
+    world.run(world.now_ns + 1_000 * MS)
+    world.power_on(first)
+    world.run(world.now_ns + 1_000 * MS)
+    (acting,) = world.acting(PART)
+    assert seen_at(world, acting, PART).epoch == 2, "of three, two have elected it"
+    for name in FIVE[:4]:
+        take(world, name, FIVE[:4])
+    idle = first if acting == third else third
+    after = tuple(name for name in FIVE[:4] if name != idle)
+    told = {name: known_at(world, name) for name in FIVE[:4]}
+    assert unaware(FIVE[:4], after, told) == {PART: (2, sorted((second, FIVE[3])))}
+    world.power_off(idle)
+    world.power_off(acting)
+    for name in after:
+        take(world, name, after)
+        world.power_on(name) if name != acting else None
+    with pytest.raises(Broken, match="epoch 2 of /team/part is"):
+        world.run(world.now_ns + 3_000 * MS)
 
 
 def test_two_members_at_a_time_would_let_two_robots_act() -> None:

@@ -25,7 +25,8 @@ from agent.worker.team_changes import TeamChanges, told_of
 from failover.config import members, team
 from failover.config.team import Robot, Role, Team
 from failover.core import acts, events
-from failover.core.types import ComponentView, PeerView, Protection, State, StatusView
+from failover.core.team_changes import Elections
+from failover.core.types import ENDED, ComponentView, PeerView, Protection, State, StatusView
 
 JOINING = Robot(("127.0.0.1:7490",), "127.0.0.1:7491")
 
@@ -67,7 +68,10 @@ class Member:
             PeerView(peer, "dead" if self.town.is_cut(self.name, peer) else "alive", 1, 10**12, True, 0)
             for peer in self.settings.peers
         )
-        return Told(1, 0, status=StatusView(self.name, 1, "pair", "", True, peers, tuple(self.runs)))
+        ended = frozenset(one.name for one in self.runs if one.state in ENDED)
+        known = Elections({one.name: one.epoch for one in self.runs}, ended)
+        status = StatusView(self.name, 1, "pair", "", True, peers, tuple(self.runs))
+        return Told(1, 0, elections=known) if what == "elections" else Told(1, 0, status=status)
 
     async def command(self, make: Callable[[int], events.Command]) -> acts.Answer:
         order = make(1)
@@ -147,8 +151,8 @@ class Town:
         return self.members[name]
 
 
-def view(name: str, primary: str, standby: str = "", state: State = State.PRIMARY) -> ComponentView:
-    return ComponentView(name, state, 1, primary, standby, Protection.PROTECTED, 0, 0, (), "")
+def view(name: str, primary: str, standby: str = "", state: State = State.PRIMARY, epoch: int = 1) -> ComponentView:
+    return ComponentView(name, state, epoch, primary, standby, Protection.PROTECTED, 0, 0, (), "")
 
 
 @pytest.fixture(autouse=True)
@@ -297,6 +301,86 @@ def test_an_older_change_that_comes_late_overwrites_no_newer_one(tmp_path: Path)
         assert [one.change for one in town["b"].taken] == [2]
 
     asyncio.run(live())
+
+
+# --- What was elected ---------------------------------------------------------------------------------------------------
+
+
+def test_a_change_waits_until_the_members_after_it_know_what_was_elected(tmp_path: Path) -> None:
+    """Else they could elect another primary with the same epoch: those that elected the first one have left, or are lost."""
+
+    async def live() -> None:
+        town = Town(tmp_path, "a", "b", "c", "d")
+        for name, epoch in (("a", 3), ("b", 2), ("c", 3), ("d", 2)):
+            town[name].runs = [view("/x", "a", epoch=epoch)]
+        asked = 0
+
+        async def hear(_one: str, other: str, verb: str) -> None:
+            nonlocal asked
+            if (verb, other) == ("team_grant", "b"):
+                asked += 1
+                assert town["a"].on_disk == ["a", "b", "c", "d"]
+                if asked == 3:
+                    town["b"].runs = [view("/x", "a", epoch=3)]
+
+        town.before = hear
+        assert (await town["a"].change("remove", "c"))["waiting"] == [] and asked == 3
+        assert town["d"].on_disk == ["a", "b", "d"]
+
+    asyncio.run(live())
+
+
+def test_a_change_that_waits_too_long_says_for_whom_and_frees_all_grants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(team_changes, "AWARE_PATIENCE_NS", 0)
+    town = Town(tmp_path, "a", "b", "c", "d")
+    for name, epoch in (("a", 3), ("b", 2), ("c", 2), ("d", 3)):
+        town[name].runs = [view("/x", "a", epoch=epoch)]
+    with pytest.raises(RefusedError, match="b, c: not told yet which robot runs /x in epoch 3; nothing has changed"):
+        asyncio.run(town["a"].change("remove", "d"))
+    assert {member.changes._grants.proposer for member in town.members.values()} == {""}
+    assert town["a"].on_disk == ["a", "b", "c", "d"]
+
+
+def test_no_change_waits_for_a_component_that_has_ended_or_for_members_of_a_release_that_tells_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    town = Town(tmp_path, "a", "b", "c", "d")
+    for name, state, epoch in zip("abcd", ("finished", "standby", "standby", "released"), (3, 2, 2, 3), strict=True):
+        town[name].runs = [view("/x", "", state=State(state), epoch=epoch)]
+    asyncio.run(town["a"].change("remove", "d"))
+    assert town["b"].on_disk == ["a", "b", "c"]
+    town["a"].runs = [view("/x", "a", epoch=4)]
+    granted = town["b"].changes._granted
+
+    async def by_the_release_before(peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        answer = await granted(peer, arguments)
+        return {key: answer[key] for key in ("refusal", "sees", "members")}
+
+    orders = {**town["b"].changes.orders(), "team_grant": by_the_release_before}
+    monkeypatch.setattr(town["b"].changes, "orders", lambda: orders)
+    asyncio.run(town["a"].change("add", "e", JOINING))
+    assert town["b"].on_disk == ["a", "b", "c", "e"]
+
+
+def test_keys_are_replaced_without_a_wait_for_elections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(team_changes, "AWARE_PATIENCE_NS", 0)
+    town = Town(tmp_path, "a", "b", "c", keyed=True)
+    for name, epoch in (("a", 2), ("b", 3), ("c", 3)):
+        town[name].runs = [view("/x", "b", epoch=epoch)]
+    asyncio.run(town["a"].change("rotate", ""))
+
+
+@pytest.mark.parametrize("names", ["a b", "a"])
+def test_members_that_elect_nothing_wait_for_no_election(tmp_path: Path, names: str) -> None:
+    town = Town(tmp_path, *names.split())
+    town["a"].runs = [view("/x", "a", epoch=3)]
+    if names == "a":
+        asyncio.run(town["a"].change("add", "b", JOINING))
+        assert town["a"].on_disk == ["a", "b"]
+    else:
+        town.cut_off("b")
+        asyncio.run(town["a"].change("remove", "b"))
+        assert town["a"].on_disk == ["a"]
 
 
 # --- What one robot says ----------------------------------------------------------------------------------------------

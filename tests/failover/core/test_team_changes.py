@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 from itertools import combinations, product
+from typing import Any
 
 import pytest
 
-from failover.core.team_changes import GRANT_NS, SEATS, Grants, is_step_of_keys, missing, rotation, seats, step
+from failover.core.team_changes import (
+    GRANT_NS,
+    SEATS,
+    Elections,
+    Grants,
+    is_step_of_keys,
+    missing,
+    rotation,
+    seats,
+    step,
+    unaware,
+)
 
 
 def test_a_grant_is_given_to_one_robot_at_a_time() -> None:
@@ -61,6 +73,99 @@ def test_every_member_must_grant_a_change_but_one_that_leaves_and_is_lost() -> N
     assert missing(("a", "b", "c"), {"a", "b"}, "c", lives=False) == []
     assert missing(("a", "b", "c"), {"a"}, "c", lives=False) == ["b"]
     assert missing(("a", "b"), {"a"}, "b", lives=False) == []
+
+
+def know(*ended: str, **epochs: int) -> Elections:
+    return Elections(epochs, frozenset(ended))
+
+
+def test_a_change_waits_until_no_majority_after_it_can_lack_an_election() -> None:
+    three, four, five = ("a", "b", "c"), ("a", "b", "c", "new"), ("a", "b", "c", "d", "e")
+    two_of_three = {"a": know(x=3), "b": know(x=3), "c": know(x=2)}
+    assert unaware(three, four, two_of_three) == {}, "any three of four have one that knows"
+    assert unaware(four, ("a", "c", "new"), {**two_of_three, "new": know()}) == {"x": (3, ["c", "new"])}
+    without_a = {"b": know(x=3), "c": know(x=2), "new": know(x=2)}
+    assert unaware(four, ("b", "c", "new"), without_a) == {"x": (3, ["c", "new"])}, "a is lost"
+    assert unaware(three, ("a", "b"), two_of_three) == {}
+    assert unaware(five, five[:4], {name: know(x=3 if name < "d" else 2) for name in five}) == {}
+
+
+def test_no_change_waits_for_an_epoch_that_was_claimed_in_vain_but_for_the_one_below_it() -> None:
+    four, after = ("a", "b", "c", "d"), ("b", "c", "d")
+    assert unaware(four, after, {"a": know(x=2), "b": know(x=2), "c": know(x=2), "d": know(x=3)}) == {}, "a majority lacks 3"
+    assert unaware(four, after, {"a": know(x=3), "b": know(x=2), "c": know(x=1), "d": know(x=1)}) == {"x": (2, ["c", "d"])}
+
+
+def test_what_has_ended_is_waited_for_nowhere_and_counts_as_known() -> None:
+    four, after = ("a", "b", "c", "d"), ("b", "c", "d")
+    assert unaware(four, after, {"a": know("x", x=3), "b": know(x=2), "c": know("x", x=2), "d": know("x", x=2)}) == {}
+    told = {"a": know(x=3, y=1), "b": know(x=3, y=1), "c": know(x=2, y=1), "d": know(x=2)}
+    assert unaware(four, after, told) == {"x": (3, ["c", "d"])}, "each component by itself"
+
+
+def test_etcd_counts_as_one_that_lacks_an_election_unless_there_is_a_single_member() -> None:
+    told = {"a": know(x=3), "b": know(x=3)}
+    assert unaware(("a", "b"), ("a", "b", "new"), told, with_etcd=True) == {}
+    assert unaware(("a", "b"), ("a", "new"), told, with_etcd=True) == {"x": (3, ["new"])}, (
+        "etcd and the new one would be a majority"
+    )
+    assert unaware(("a",), ("a", "new"), {"a": know(x=3)}, with_etcd=True) == {}, "one that etcd elected, or nothing did"
+
+
+def test_a_member_whose_release_tells_no_elections_holds_no_change_up() -> None:
+    assert unaware(("a", "b", "c"), ("a", "b", "c", "d"), {"a": know(x=3), "b": None, "c": None}) == {}
+
+
+def elections_in_all_histories(start: int, depth: int, wait: bool) -> str:
+    """Play every history of claims and changes of a small team; the first in which one epoch is elected twice, or "".
+
+    A claim asks as many members as are a majority, or none: then it is in vain. A member that is lost tells nothing any more.
+    """
+    first: tuple[Any, ...] = (tuple((name, 0) for name in range(start)), frozenset(), start)
+    histories: dict[Any, str] = {first: ""}
+    waiting = [first]
+    while waiting:
+        state = waiting.pop(0)
+        team, elected, following = state
+        story = histories[state]
+        if story.count(";") >= depth:
+            continue
+        steps: list[tuple[str, Any]] = []
+        for name, epoch in team:
+            claimed = epoch + 1
+            able = [other for other, known in team if other != name and known < claimed]
+            majority = len(team) // 2
+            for asked in [(), *combinations(able, majority)] if claimed < 3 and majority else []:
+                after = tuple((one, claimed if one == name or one in asked else known) for one, known in team)
+                if asked and claimed in elected:
+                    return f"{story} {name} is elected in {claimed} by {asked}"
+                steps.append(
+                    (f"{name} claims {claimed}, {asked} vote", (after, elected | {claimed} if asked else elected, following))
+                )
+        told = {str(name): know(x=epoch) for name, epoch in team}
+        if following < start + 2:
+            steps.append((f"{following} joins", ((*team, (following, 0)), elected, following + 1)))
+        for name, _ in team if len(team) > 3 else ():
+            steps += [
+                (f"{name} {way}", (tuple(one for one in team if one[0] != name), elected, following))
+                for way in ("leaves", "is lost")
+            ]
+        for step_of_it, reached in steps:
+            members = [str(name) for name, _ in team]
+            voters = [str(name) for name, _ in reached[0]]
+            granting = {name: one for name, one in told.items() if name in voters or "is lost" not in step_of_it}
+            if wait and members != voters and unaware(members, voters, granting):
+                continue
+            if reached not in histories:
+                histories[reached] = f"{story} {step_of_it};"
+                waiting.append(reached)
+    return ""
+
+
+@pytest.mark.parametrize("start", [3, 4])
+def test_no_history_of_claims_and_changes_elects_two_robots_in_one_epoch(start: int) -> None:
+    assert elections_in_all_histories(start, 6, wait=True) == ""
+    assert elections_in_all_histories(start, 6, wait=False), "the check can fail"
 
 
 def test_a_step_is_one_member() -> None:
