@@ -20,6 +20,7 @@ A batch, and why a SIGKILL of the tracer at any instant leaves the program unhar
    later tracer leaves them to the program as ordinary memory.
 6. *Late* (a busy machine, a tracer that was stopped): the wait ends as well, and the program makes steps of its own. If it got
    the registers of the first stop, it would repeat those steps: it keeps its own registers, and the query has failed.
+7. *SIGSTOP meanwhile* cannot be blocked. It takes effect, and the thread makes its calls in a program that is stopped now.
 
 A batch and its table: `checkpoint.linux.trace.syscall_batch`. One desk, and the way back of its thread:
 `checkpoint.linux.trace.syscall_desk`. Here: the pages as a whole, and the threads that are out at the same time.
@@ -65,6 +66,10 @@ from checkpoint.linux.trace.tracee import LOST_SIZE, Tracee, rest
 
 BATCH_TIMEOUT_S: Final = 1.0
 """How long a batch may take: its calls never wait, so only a machine that does not run the program at all exceeds this."""
+
+
+STOPPED_S: Final = 0.001
+"""A batch that takes so long may have met a SIGSTOP."""
 
 
 class BorrowedPages:
@@ -329,6 +334,9 @@ def _tables_when_done(memory: Memory, desks: Sequence[Desk], end: int) -> list[b
             )
         if is_here is None:
             is_here = desks[0].is_guest_here()
+        elif waited > STOPPED_S:
+            for desk in desks:
+                desk.let_guest_run_on()
         rest(waited, is_here=is_here)
 
 

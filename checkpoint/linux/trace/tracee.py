@@ -266,7 +266,7 @@ class Tracee:
             rest(waited)
 
     def has_stopped(self) -> bool:
-        """Whether it stands now, as `await_stop` would find it. Raises as `_standing`."""
+        """Whether it stands now, as `await_stop` would find it. Raises as `standing`."""
         stop = self._standing()
         return stop is not None and self._stays(stop)
 
@@ -282,14 +282,24 @@ class Tracee:
 
     def _standing(self) -> Stop | None:
         """As `reported`, without taking note of its end: it may be our child, for which another part of this process waits."""
+        return self.reported() if self.peek() is not None else None
+
+    def peek(self) -> Stop | None:
+        """The stop that it has reported already, if any: `reported` tells it once more.
+
+        Raises:
+            ProcessGoneError: it has ended, or we are not its tracer any more.
+        """
         options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT | abi.WALL
         try:
             found = os.waitid(os.P_PID, self.pid, options)
         except ChildProcessError as error:
             raise self._gone() from error
-        if found is not None and found.si_code in abi.ENDS:
+        if found is None:
+            return None
+        if found.si_code in abi.ENDS:
             raise self._gone()
-        return self.reported() if found is not None else None
+        return Stop(event=found.si_status >> 8, signal=found.si_status & 0xFF)
 
     def is_dead(self) -> bool:
         """Whether it has ended, reaped or not."""

@@ -35,6 +35,7 @@ from checkpoint.linux.procfs import procfs
 from checkpoint.linux.spawn.vessel import Birth, Born, spawn_vessel
 from checkpoint.linux.trace import entry, remote_syscalls, syscall_desk
 from checkpoint.linux.trace.syscall_desk import Desk
+from checkpoint.linux.trace.thread_dispatch import Round
 from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -323,6 +324,31 @@ def test_a_program_that_is_stopped_does_not_run_because_a_keeper_is_late(
     monkeypatch.undo()
     worker.wait_until(lambda: procfs.stat(worker.pid).state == "T", "it to be stopped as it was")
     assert (worker.directory / "turn").read_bytes() == turn
+    os.kill(worker.pid, signal.SIGCONT)
+    expect_undisturbed(worker)
+
+
+def test_a_program_that_is_stopped_while_it_makes_calls_for_a_keeper_does_not_run_either(
+    worker: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, wait_in_time = Round.start, remote_syscalls._tables_when_done
+
+    def stopped_first(self: Round, *rest: Any) -> bool:
+        os.kill(worker.pid, signal.SIGSTOP)
+        return start(self, *rest)
+
+    def wait_too_long(memory: Memory, desks: Sequence[Desk], end: int) -> list[bytes]:
+        tables = wait_in_time(memory, desks, end)
+        time.sleep(LATE_S)
+        return tables
+
+    with protected(worker) as session:
+        with monkeypatch.context() as patched:
+            patched.setattr(cpu, "ENTRY_TIMEOUT_NS", 1_000_000)
+            patched.setattr(Round, "start", stopped_first)
+            patched.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
+            session.capture(CaptureOrder(base=True, generation=1, sequence=1))  # refused where it has run on
+        worker.wait_until(lambda: procfs.stat(worker.pid).state == "T", "it to be stopped")
     os.kill(worker.pid, signal.SIGCONT)
     expect_undisturbed(worker)
 

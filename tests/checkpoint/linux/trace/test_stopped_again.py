@@ -8,18 +8,22 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from checkpoint.engine import CaptureOrder
 from checkpoint.linux.procfs import procfs
+from checkpoint.linux.trace import remote_syscalls
+from checkpoint.linux.trace.thread_dispatch import Round
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.engines.ptrace.capture.test_trees import three_lives
 from tests.checkpoint.engines.ptrace.restore.families import PREAMBLE, goes_through_three_lives
 from tests.checkpoint.engines.ptrace.restore.test_tree_states import state_of
-from tests.checkpoint.round_trip import Program, ended, expect_ok, start
+from tests.checkpoint.round_trip import Program, ended, expect_ok, protected, start
 
 pytestmark = pytest.mark.root
 
@@ -148,3 +152,32 @@ def test_no_call_made_inside_a_stopped_program_meets_a_stop_that_waits() -> None
     finally:
         child.kill()
         child.wait()
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_a_stop_that_comes_while_a_thread_makes_calls_for_us_takes_effect_and_delays_nothing(
+    threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of a guard whose lease ends: the program would stand there until the look is given up, and the look would fail."""
+    act = "for _ in range(int(sys.argv[1]) - 1): threading.Thread(target=wait_for_go, daemon=True).start()\n"
+    act += 'print("ready", flush=True)\nwait_for_go()\nprint("ok", flush=True)\n'
+    start_of, stopped = Round.start, []
+
+    def stopped_first(self: Round, tracees: Sequence[Tracee], *rest: Any) -> bool:
+        stopped.append(len(tracees))
+        os.kill(program.pid, signal.SIGSTOP)
+        return start_of(self, tracees, *rest)
+
+    with ended(start([sys.executable, "-c", PREAMBLE + STOPS + act, str(threads)], tmp_path)) as program:
+        program.wait_for_line("ready")
+        program.wait_until(lambda: len(os.listdir(f"/proc/{program.pid}/task")) == threads, "its threads")
+        with protected(program) as session:
+            monkeypatch.setattr(Round, "start", stopped_first)
+            monkeypatch.setattr(remote_syscalls, "BATCH_TIMEOUT_S", PATIENCE_S)
+            session.capture(CaptureOrder(base=True, generation=1, sequence=1))
+            monkeypatch.undo()
+        assert stopped
+        program.wait_until(lambda: state_of(program) == "T", "that it is stopped")
+        program.tell()
+        os.kill(program.pid, signal.SIGCONT)
+        expect_ok(program)
