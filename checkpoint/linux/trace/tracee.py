@@ -87,11 +87,12 @@ def _is_dead(pid: int) -> bool:
 
 
 def no_stop(tid: int, waited_s: float) -> CaptureError:
-    """The message about a thread that does not stop."""
-    return CaptureError(
-        f"pid {tid} did not stop within {waited_s:.2g} s: it waits inside the kernel for a device or "
-        "a file system; capture it again when that answers"
-    )
+    """The message about a thread that does not stop: it sleeps in the kernel, or is ready to run and gets no processor."""
+    why = "it waits inside the kernel for a device or a file system; capture it again when that answers"
+    with contextlib.suppress(CheckpointError):
+        if procfs.status(tid).state == "R":
+            why = "the machine leaves it no processor; capture it again when the load is less"
+    return CaptureError(f"pid {tid} did not stop within {waited_s:.2g} s: {why}")
 
 
 def rest(waited_s: float, *, is_here: bool = False) -> None:

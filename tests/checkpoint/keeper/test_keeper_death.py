@@ -394,7 +394,7 @@ def test_a_keeper_that_is_late_sends_none_of_many_threads_back(
     with ended(start_tracee(compiled("threads", "-O2"), tmp_path, "many")) as tracee:
         with protected(tracee) as session:
             monkeypatch.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
-            with pytest.raises(CaptureError, match="has run on while failover examined it"):
+            with pytest.raises(CaptureError, match=r"has run on while failover examined it|leaves it no processor"):
                 session.capture(CaptureOrder(base=True, generation=1, sequence=1))
             monkeypatch.undo()
             captured_at_last(session, CaptureOrder(base=True, generation=1, sequence=1))

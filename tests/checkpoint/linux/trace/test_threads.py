@@ -17,7 +17,7 @@ from checkpoint.errors import CaptureError, MismatchError, ProcessGoneError, Uns
 from checkpoint.linux.procfs import procfs
 from checkpoint.linux.procfs.tasks import thread_ids
 from checkpoint.linux.spawn.vessel import Birth, discard, spawn_program, spawn_vessel
-from checkpoint.linux.trace.tracee import Tracee
+from checkpoint.linux.trace.tracee import Tracee, no_stop
 from checkpoint.model import Snapshot
 from tests.checkpoint.round_trip import (
     ENGINE,
@@ -132,6 +132,13 @@ def test_a_thread_that_does_not_stop_is_let_go_later_and_nobody_else_waits_for_i
         session.capture(CaptureOrder(sequence=4))
         tracee.tell()
         expect_ok(tracee)
+
+
+def test_of_a_thread_that_does_not_stop_it_is_told_whether_it_is_ready_to_run(tmp_path: Path) -> None:
+    assert "the machine leaves it no processor" in str(no_stop(os.getpid(), 2.0))
+    with ended(start(["/bin/sleep", "600"], tmp_path)) as program:
+        program.wait_until(lambda: procfs.stat(program.pid).state == "S", "it to sleep")
+        assert "it waits inside the kernel" in str(no_stop(program.pid, 2.0))
 
 
 def test_a_program_killed_while_it_is_held_ends_for_its_parent(compiled: Compiled, tmp_path: Path) -> None:
