@@ -284,7 +284,12 @@ class Worker(Switchboard):
             self._own_troubles.append(f"the tasks of agent.toml are not on the schedule: {error}")
 
     async def _give_signs(self) -> None:
-        """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended."""
+        """While a program runs here, or a checkpoint of one comes here: after a power cut the next life knows when that ended.
+
+        The very first sign comes before any program: it may be cut off within a second.
+        """
+        if not self._alive.before_ns:
+            await asyncio.to_thread(self._alive.sign)
         while True:
             if any(one.component is not None or one.figures.spec is not None for one in self.supervisors.values()):
                 await asyncio.to_thread(self._alive.sign)
