@@ -32,6 +32,7 @@ from tests.failover.boards.conftest import place as place
 from tests.failover.boards.programs import ROOT
 
 PATIENCE_S = 60
+AGAIN_S = 5
 MESSAGE = struct.Struct("<BIQ")
 """Source: Foxglove WebSocket protocol, *Message Data*: opcode 1, subscription, log time."""
 
@@ -59,9 +60,9 @@ class Looker:
         self.channels: dict[str, dict[str, Any]] = {}
         self.gone: list[int] = []
 
-    def hear(self) -> tuple[str, int, Any] | None:
+    def hear(self, patience_s: float = PATIENCE_S) -> tuple[str, int, Any] | None:
         """The next message: topic, log time, JSON; None: it was an advertisement or the like."""
-        said = self._link.recv(PATIENCE_S)
+        said = self._link.recv(patience_s)
         if isinstance(said, bytes):
             opcode, subscription, log_ns = MESSAGE.unpack_from(said)
             assert opcode == 1
@@ -75,9 +76,18 @@ class Looker:
         return None
 
     def until(self, topic: str) -> tuple[int, Any]:
-        """The next message of a channel."""
+        """The next message of a channel.
+
+        The SDK advertises a channel before it knows it itself: who subscribes in the same millisecond is not heard.
+        """
+        until = time.monotonic() + PATIENCE_S
         while True:
-            heard = self.hear()
+            try:
+                heard = self.hear(AGAIN_S)
+            except TimeoutError:
+                assert time.monotonic() < until, f"nothing of {topic}"
+                self.subscribe(topic)
+                continue
             if heard is not None and heard[0] == topic:
                 return heard[1:]
 

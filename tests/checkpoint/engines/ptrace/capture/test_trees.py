@@ -28,6 +28,7 @@ from checkpoint.model import ProcessState, Resource, Snapshot
 from checkpoint.resources.events import pidfd
 from checkpoint.resources.open_file import OpenFile, Surroundings
 from checkpoint.snapshot import process_tree
+from tests.checkpoint.linux.trace.test_threads import open_descriptors
 from tests.checkpoint.round_trip import (
     ENGINE,
     Program,
@@ -249,7 +250,7 @@ def tracers(pids: Iterable[int]) -> Iterator[int]:
 def test_captures_that_race_with_births_and_ends_of_processes_lose_nothing(tmp_path: Path) -> None:
     loop = "i=0; while :; do i=$((i+1)); (:); /bin/true; echo $i | cat >> lines & wait; done"
     program = start(["/bin/sh", "-c", loop], tmp_path, isolate=True)
-    before = sorted(os.listdir("/proc/self/fd"))
+    before = open_descriptors()
     with ended(program):
         with protected(program) as session:
             for sequence in range(1, CAPTURES + 1):
@@ -257,7 +258,7 @@ def test_captures_that_race_with_births_and_ends_of_processes_lose_nothing(tmp_p
                 if sequence % 2:
                     session.acknowledge(snapshot.position)
         now = {n: os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if os.path.lexists(f"/proc/self/fd/{n}")}
-        assert sorted(os.listdir("/proc/self/fd")) == before, {n: w for n, w in now.items() if n not in before}
+        assert open_descriptors() == before, {n: w for n, w in now.items() if n not in before}
         assert not any(tracers((program.pid, *everybody_below(program.pid))))
         size = (tmp_path / "lines").stat().st_size
         program.wait_until(lambda: (tmp_path / "lines").stat().st_size > size + 20, "that it goes on")
