@@ -14,7 +14,7 @@ import errno
 import itertools
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from msgspec import Struct
@@ -32,7 +32,7 @@ from checkpoint.linux.procfs.procfs import MapsLine
 from checkpoint.linux.spawn import vdso
 from checkpoint.linux.trace.remote_syscalls import BATCH_TIMEOUT_S, BorrowedPages
 from checkpoint.linux.trace.syscall_batch import ABANDONED, CODE_SIZE, MAGIC, SIZE, TABLE_SIZE, Batch
-from checkpoint.linux.trace.syscall_desk import Guest, give_back, patience_ns, resumed
+from checkpoint.linux.trace.syscall_desk import STOPPED_TIMEOUT_NS, TIMEOUT, Guest, give_back, patience_ns, resumed
 from checkpoint.linux.trace.tracee import Tracee, rest
 
 FAULTS_FLAGS: Final = abi.O_CLOEXEC | abi.O_NONBLOCK
@@ -90,8 +90,9 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     tracee.set_registers(arch.encode_registers(there))
     tracee.set_signal_mask(abi.ALL_SIGNALS)
     tracee.cont()
+    longer = TIMEOUT.pack(*divmod(STOPPED_TIMEOUT_NS, 10**9))  # a stub begins with how long it waits
     try:
-        _wait_in_call(tracee.pid, "rt_sigtimedwait")
+        _wait_in_call(tracee, "rt_sigtimedwait", lambda: tracee.memory.poke(place, longer))
     finally:
         found = give_back(guest, range(place, place + len(stub)).__contains__)
     code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)
@@ -138,20 +139,25 @@ def _entry_calls(hole: int) -> EntryCalls:
     )
 
 
-def _wait_in_call(pid: int, name: str) -> None:
-    """Wait until the thread waits in this system call.
+def _wait_in_call(tracee: Tracee, name: str, lengthen: Callable[[], None]) -> None:
+    """Wait until the thread waits in this system call, also where a SIGSTOP comes first (`Tracee.run_on`).
 
     Source: proc_pid_syscall(5): the number is the first word.
     """
-    began = time.perf_counter()
+    pid, began = tracee.pid, time.perf_counter()
     wanted = str(arch.SYSCALLS[name])
-    while procfs.read_text(pid, "syscall").partition(" ")[0] != wanted:
+
+    def is_there() -> bool:
+        return procfs.read_text(pid, "syscall").partition(" ")[0] == wanted
+
+    while not is_there():
         waited = time.perf_counter() - began
         if waited > BATCH_TIMEOUT_S:
             raise CaptureError(
                 f"pid {pid} did not run for {BATCH_TIMEOUT_S:g} s while failover examined it: it is frozen by its cgroup, or "
                 "higher priorities leave it no processor; protect it again when it runs"
             )
+        tracee.run_on(is_there, lengthen)
         rest(waited)
 
 

@@ -66,8 +66,6 @@ from checkpoint.linux.trace.tracee import LOST_SIZE, Tracee, rest
 
 BATCH_TIMEOUT_S: Final = 1.0
 """How long a batch may take: its calls never wait, so only a machine that does not run the program at all exceeds this."""
-
-
 STOPPED_S: Final = 0.001
 """A batch that takes so long may have met a SIGSTOP."""
 

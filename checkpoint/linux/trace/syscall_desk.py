@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import operator
-import signal
 import struct
 import threading
 from collections.abc import Callable
@@ -24,7 +23,8 @@ BUSY_TIMEOUT_NS: Final = 900_000_000
 """How long a program waits for us on a machine that has once left us no processor for `arch.ENTRY_TIMEOUT_NS`."""
 STOPPED_TIMEOUT_NS: Final = 10_000_000_000
 """How long a program waits for us that was stopped by a signal: that we are late is no reason for it to run."""
-_TIMEOUT: Final = struct.Struct("<QQ")
+TIMEOUT: Final = struct.Struct("<QQ")
+"""Seconds and nanoseconds: struct timespec."""
 _of_clobbered: Final = operator.itemgetter(*map(arch.REGISTER_NAMES.index, arch.CLOBBERED))
 _OF_RESULT: Final = arch.CLOBBERED.index(arch.RESULT)
 
@@ -124,23 +124,15 @@ class Desk:
         return self._guest is not None and self._guest.is_here()
 
     def let_guest_run_on(self) -> None:
-        """Have a SIGSTOP take effect that came meanwhile: it cannot be blocked. The thread makes its calls all the same.
-
-        It then waits for us as long as any thread of a stopped program. One that has made its calls stays where it stands: it
-        would go on by itself.
-        """
-        guest = self._guest
-        stop = guest.peek() if guest is not None else None
-        is_ours = stop is not None and (stop.signal == signal.SIGSTOP if stop.is_delivery else not stop.is_within_a_call)
-        if guest is None or stop is None or not is_ours or self._is_done_now():
-            return
-        if stop.signal != signal.SIGTRAP:  # else its process was continued
-            self._memory.write(self._places.timeout, _TIMEOUT.pack(*divmod(STOPPED_TIMEOUT_NS, 10**9)))
-        guest.reported()
-        guest.cont(stop.signal if stop.is_delivery else 0)
+        """As `Tracee.run_on`, of the thread that was sent here last."""
+        if self._guest is not None:
+            self._guest.run_on(self._is_done_now, self._lengthen)
 
     def _is_done_now(self) -> bool:
         return self._memory.read(self._places.done, 8) == struct.pack("<Q", self._serial)
+
+    def _lengthen(self) -> None:
+        self._memory.write(self._places.timeout, TIMEOUT.pack(*divmod(STOPPED_TIMEOUT_NS, 10**9)))
 
     def _lay_lost(self, lost: bytes) -> None:
         """Write the registers that the kernel is to give back by the code's own frame, unless they stand there."""

@@ -14,6 +14,7 @@ import errno
 import os
 import signal
 import time
+from collections.abc import Callable
 from typing import Final
 
 from msgspec import Struct
@@ -266,8 +267,26 @@ class Tracee:
                 raise no_stop(self.pid, timeout_s)
             rest(waited)
 
+    def run_on(self, is_done: Callable[[], bool], lengthen: Callable[[], None]) -> None:
+        """Have a SIGSTOP take effect that came while it runs for us (it cannot be blocked), and let it run on all the same.
+
+        Args:
+            is_done: it has done what it was to do: then it stays where it stands, for it would go on by itself.
+            lengthen: have it wait for us as long as any thread of a stopped program.
+
+        Raises:
+            ProcessGoneError: it has ended.
+        """
+        stop = self.peek()
+        if stop is None or stop.is_within_a_call or (stop.is_delivery and stop.signal != signal.SIGSTOP) or is_done():
+            return
+        if stop.signal != signal.SIGTRAP:  # else its process was continued
+            lengthen()
+        self.reported()
+        self.cont(stop.signal if stop.is_delivery else 0)
+
     def has_stopped(self) -> bool:
-        """Whether it stands now, as `await_stop` would find it. Raises as `standing`."""
+        """Whether it stands now, as `await_stop` would find it. Raises as `_standing`."""
         stop = self._standing()
         return stop is not None and self._stays(stop)
 

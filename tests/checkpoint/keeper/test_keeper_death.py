@@ -243,8 +243,8 @@ def test_what_fails_while_the_program_makes_our_calls_leaves_it_undisturbed(
 def test_a_keeper_that_is_late_with_its_first_entry_does_no_harm_either(worker: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     wait_in_time = entry._wait_in_call
 
-    def wait_too_long(pid: int, name: str) -> None:
-        wait_in_time(pid, name)
+    def wait_too_long(*arguments: Any) -> None:
+        wait_in_time(*arguments)
         assert goes_on(worker)
 
     monkeypatch.setattr(entry, "_wait_in_call", wait_too_long)
@@ -345,6 +345,9 @@ def test_a_program_that_is_stopped_while_it_makes_calls_for_a_keeper_does_not_ru
     with protected(worker) as session:
         with monkeypatch.context() as patched:
             patched.setattr(cpu, "ENTRY_TIMEOUT_NS", 1_000_000)
+            patched.setattr(syscall_desk, "_busy", threading.Event())
+            patched.setattr(session_module, "RAN_ON_MAX", 1)
+            patched.setattr(process, "RAN_ON_MAX", 1)
             patched.setattr(Round, "start", stopped_first)
             patched.setattr(remote_syscalls, "_tables_when_done", wait_too_long)
             session.capture(CaptureOrder(base=True, generation=1, sequence=1))  # refused where it has run on
@@ -374,8 +377,8 @@ def test_a_program_that_is_stopped_stays_so_when_its_keeper_dies_until_it_is_con
     expect_undisturbed(worker)
 
 
-def _wait_and_die(wait: Callable[[int, str], None], pid: int, name: str) -> None:
-    wait(pid, name)
+def _wait_and_die(wait: Callable[..., None], *arguments: Any) -> None:
+    wait(*arguments)
     os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -69,9 +70,9 @@ def image_of(pid: int) -> bytes:
 def test_a_vdso_without_zeros_enough_lends_what_no_program_reads_of_it(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     before, meanwhile = image_of(program.pid), []
 
-    def look(pid: int, name: str) -> None:
-        WAIT(pid, name)
-        meanwhile.append(image_of(pid))
+    def look(*arguments: Any) -> None:
+        WAIT(*arguments)
+        meanwhile.append(image_of(program.pid))
 
     monkeypatch.setattr(entry, "vdso_rooms", few_zeros)
     monkeypatch.setattr(entry, "_wait_in_call", look)
@@ -103,8 +104,8 @@ def test_a_keeper_that_dies_in_there_leaves_a_program_that_goes_on_and_can_be_pr
     captured(program)
 
 
-def die_waiting(pid: int, name: str) -> None:
-    WAIT(pid, name)
+def die_waiting(*arguments: Any) -> None:
+    WAIT(*arguments)
     os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -9,6 +9,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -77,8 +78,8 @@ def test_who_goes_on_by_itself_because_its_keeper_is_late_has_them_all(holder: P
 def test_who_goes_on_by_itself_after_a_first_entry_has_them_all(holder: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     wait_in_time = entry._wait_in_call
 
-    def wait_too_long(pid: int, name: str) -> None:
-        wait_in_time(pid, name)
+    def wait_too_long(*arguments: Any) -> None:
+        wait_in_time(*arguments)
         await_all_by_themselves(holder)
 
     monkeypatch.setattr(entry, "_wait_in_call", wait_too_long)

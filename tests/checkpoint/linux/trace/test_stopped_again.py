@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,16 +16,18 @@ from typing import Any
 
 import pytest
 
-from checkpoint.engine import CaptureOrder
+from checkpoint.arch import cpu
+from checkpoint.engine import CaptureOrder, ProtectOrder
+from checkpoint.engines.ptrace.capture import process
 from checkpoint.linux.procfs import procfs
-from checkpoint.linux.trace import remote_syscalls
+from checkpoint.linux.trace import entry, remote_syscalls, syscall_desk
 from checkpoint.linux.trace.thread_dispatch import Round
 from checkpoint.linux.trace.threads import Threads
 from checkpoint.linux.trace.tracee import Tracee
 from tests.checkpoint.engines.ptrace.capture.test_trees import three_lives
 from tests.checkpoint.engines.ptrace.restore.families import PREAMBLE, goes_through_three_lives
 from tests.checkpoint.engines.ptrace.restore.test_tree_states import state_of
-from tests.checkpoint.round_trip import Program, ended, expect_ok, protected, start
+from tests.checkpoint.round_trip import ENGINE, Program, ended, expect_ok, protected, start
 
 pytestmark = pytest.mark.root
 
@@ -178,6 +182,39 @@ def test_a_stop_that_comes_while_a_thread_makes_calls_for_us_takes_effect_and_de
             monkeypatch.undo()
         assert stopped
         program.wait_until(lambda: state_of(program) == "T", "that it is stopped")
+        program.tell()
+        os.kill(program.pid, signal.SIGCONT)
+        expect_ok(program)
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_a_stop_that_comes_while_a_keeper_enters_takes_effect_and_delays_nothing(
+    is_late: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor does the program run where that keeper is late: it waits there for long, as any that is stopped."""
+    stub_for, wait = entry._stub, entry._wait_in_call
+
+    def stopped_first(*arguments: Any) -> tuple[int, bytes]:
+        os.kill(program.pid, signal.SIGSTOP)
+        return stub_for(*arguments)
+
+    def wait_long(*arguments: Any) -> None:
+        wait(*arguments)
+        time.sleep(0.05 if is_late else 0)
+
+    act = 'print("ready", flush=True)\nwait_for_go()\nprint("ok", flush=True)\n'
+    with ended(start([sys.executable, "-c", PREAMBLE + act], tmp_path)) as program:
+        program.wait_for_line("ready")
+        with monkeypatch.context() as patched:
+            patched.setattr(entry, "_stub", stopped_first)
+            patched.setattr(entry, "_wait_in_call", wait_long)
+            patched.setattr(entry, "BATCH_TIMEOUT_S", PATIENCE_S)
+            patched.setattr(cpu, "ENTRY_TIMEOUT_NS", 1_000_000)
+            patched.setattr(syscall_desk, "_busy", threading.Event())
+            patched.setattr(process, "RAN_ON_MAX", 1)
+            session = ENGINE.protect(program.pid, ProtectOrder("/test/stopped"))
+        with contextlib.closing(session):
+            program.wait_until(lambda: state_of(program) == "T", "that it is stopped")
         program.tell()
         os.kill(program.pid, signal.SIGCONT)
         expect_ok(program)
