@@ -22,6 +22,7 @@ TESTS = (
     ("tests/checkpoint/arch/test_processors.py", ""),
     ("tests/checkpoint/test_tracees.py", "heap or registers or mappings or advice or rseq or sigwait or sigsuspend"),
     ("tests/checkpoint/linux/trace/test_syscall_reentry.py", ""),
+    ("tests/checkpoint/linux/trace/test_stopped_again.py", "takes_effect or keeper_enters or no_call"),
     ("tests/checkpoint/engines/ptrace/capture/test_eintr_syscalls.py", "relative_sleep or epoll-thread or inline or bytes"),
     ("tests/checkpoint/test_programs.py", "computes_the_same and bc"),
 )
