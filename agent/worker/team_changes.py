@@ -272,7 +272,10 @@ class TeamChanges:
         await self._tell_who_is_behind()
         while waits := _waits(before, after, await self._grants_of_all(before, after, removed)):
             if clock.now_ns() - asked_ns > AWARE_PATIENCE_NS:
-                raise RefusedError(f"cannot change the team: {waits}; nothing has changed. Try again")
+                raise RefusedError(
+                    f"cannot change the team: {waits}; nothing has changed. Try again; if it stays so, restart the robot at "
+                    "which failover status shows that component held still"
+                )
             await asyncio.sleep(LOOK_S)
         return asked_ns
 
