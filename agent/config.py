@@ -454,10 +454,15 @@ def _check_keys(path: Path, config: Config, members: Team) -> None:
         )
 
 
+def is_by_pair(rule: str, members: int) -> bool:
+    """Whether so many members of a site elect nothing: by the rule that is given, or because they are two at most."""
+    return rule == "pair" or (rule == "auto" and members <= 2)
+
+
 def _check_rule(path: Path, config: Config, members: Team, site: Mapping[str, Robot]) -> None:
     """Servers and witnesses are there to vote; a witness that has a site of its own keeps sealed copies alone."""
     voters = sorted(name for name, member in site.items() if member.role != "robot")
-    by_pair = config.rule == "pair" or (config.rule == "auto" and len(site) <= 2)
+    by_pair = is_by_pair(config.rule, len(site))
     keeps_copies_alone = config.rule == "auto" and [(one.role, bool(one.site)) for one in site.values()] == [("witness", True)]
     if voters and by_pair and not keeps_copies_alone:
         raise ConfigError(f'{path}: {", ".join(voters)} would have no vote; set rule = "majority" on every member of the team')

@@ -9,7 +9,7 @@ from typing import Final
 from msgspec import msgpack
 from msgspec.structs import replace
 
-from agent.config import ComponentConfig, Config, Settings
+from agent.config import ComponentConfig, Config, Settings, is_by_pair
 from agent.task_config import TaskConfig
 from checkpoint.device_rules import arrived, merged, travelling
 from checkpoint.engine import Carry, Terms
@@ -121,7 +121,7 @@ def _grace_ms(config: Config) -> int:
 def _rule(settings: Settings) -> Rule:
     if settings.config.rule == "auto":
         alone_with_copies = settings.me.role == "witness" and len(settings.near) == 1
-        return Rule.MAJORITY if len(settings.near) > 2 or alone_with_copies else Rule.PAIR
+        return Rule.PAIR if is_by_pair("auto", len(settings.near)) and not alone_with_copies else Rule.MAJORITY
     return Rule(settings.config.rule)
 
 

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import msgspec
 
-from agent.config import Settings, check_team
+from agent.config import Settings, check_team, is_by_pair
 from agent.errors import AgentError, RefusedError
 from agent.main_loop.messages import Told
 from agent.system import clock
@@ -56,9 +56,6 @@ CONNECT_PATIENCE_S: Final = 10.0
 
 AWARE_PATIENCE_NS: Final = 3_000_000_000
 """For members to hear of an election that a change must wait for: a heartbeat tells it."""
-
-PAIR_SIZE: Final = 2
-"""So few members elect nothing, unless the rule is given."""
 
 UNHEARD_NS: Final = 10_000_000_000
 """A member that was not heard since this agent's start counts as one that lives for so long: it may be starting, too."""
@@ -593,7 +590,7 @@ def _waits(before: Team, after: Team, told: Mapping[str, Answer]) -> str:
         members, voters = before.at_site(site), after.at_site(site)
         answers = {name: answer for name, answer in told.items() if name in members}
         rule = next((answer.rule for answer in answers.values() if answer.rule), "auto")
-        if rule == "pair" or (rule == "auto" and len(voters) <= PAIR_SIZE):
+        if is_by_pair(rule, len(voters)):
             continue
         known = {name: answer.elections for name, answer in answers.items()}
         for component, (epoch, lacking) in unaware(members, voters, known, with_etcd=rule == "etcd").items():

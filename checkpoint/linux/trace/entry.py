@@ -32,7 +32,7 @@ from checkpoint.linux.procfs.procfs import MapsLine
 from checkpoint.linux.spawn import vdso
 from checkpoint.linux.trace.remote_syscalls import BATCH_TIMEOUT_S, BorrowedPages
 from checkpoint.linux.trace.syscall_batch import ABANDONED, CODE_SIZE, MAGIC, SIZE, TABLE_SIZE, Batch
-from checkpoint.linux.trace.syscall_desk import STOPPED_TIMEOUT_NS, TIMEOUT, Guest, give_back, patience_ns, resumed
+from checkpoint.linux.trace.syscall_desk import STOPPED_TIMEOUT, Guest, give_back, patience_ns, resumed
 from checkpoint.linux.trace.tracee import Tracee, rest
 
 FAULTS_FLAGS: Final = abi.O_CLOEXEC | abi.O_NONBLOCK
@@ -90,9 +90,8 @@ def enter(tracee: Tracee, maps: Sequence[MapsLine], registers: bytes, mask: int)
     tracee.set_registers(arch.encode_registers(there))
     tracee.set_signal_mask(abi.ALL_SIGNALS)
     tracee.cont()
-    longer = TIMEOUT.pack(*divmod(STOPPED_TIMEOUT_NS, 10**9))  # a stub begins with how long it waits
     try:
-        _wait_in_call(tracee, "rt_sigtimedwait", lambda: tracee.memory.poke(place, longer))
+        _wait_in_call(tracee, "rt_sigtimedwait", lambda: tracee.memory.poke(place, STOPPED_TIMEOUT))  # a stub begins with that
     finally:
         found = give_back(guest, range(place, place + len(stub)).__contains__)
     code, table, inside = (ctypes.c_int64(found[name]).value for name in arch.ENTRY_REGISTERS)

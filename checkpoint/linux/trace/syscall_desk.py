@@ -23,8 +23,8 @@ BUSY_TIMEOUT_NS: Final = 900_000_000
 """How long a program waits for us on a machine that has once left us no processor for `arch.ENTRY_TIMEOUT_NS`."""
 STOPPED_TIMEOUT_NS: Final = 10_000_000_000
 """How long a program waits for us that was stopped by a signal: that we are late is no reason for it to run."""
-TIMEOUT: Final = struct.Struct("<QQ")
-"""Seconds and nanoseconds: struct timespec."""
+STOPPED_TIMEOUT: Final = struct.pack("<QQ", *divmod(STOPPED_TIMEOUT_NS, 10**9))
+"""The same as code of ours reads it: struct timespec."""
 _of_clobbered: Final = operator.itemgetter(*map(arch.REGISTER_NAMES.index, arch.CLOBBERED))
 _OF_RESULT: Final = arch.CLOBBERED.index(arch.RESULT)
 
@@ -74,6 +74,7 @@ class Desk:
         self._places = places_in(table, plan)
         self._code_key: tuple[Call, ...] | None = None
         self._serial = 0
+        self._done_word = b""
         self._lost: bytes | None = None
         self._guest: Tracee | None = None
         self._head = Place(memory, table, HEAD_SIZE)
@@ -109,6 +110,7 @@ class Desk:
             self._code_key = key
         self._lay_lost(guest.lost)
         self._serial += 1
+        self._done_word = struct.pack("<Q", self._serial)
         self.is_known_idle = False
         tracee, registers, mask, _ = guest
         self._guest = tracee
@@ -129,10 +131,10 @@ class Desk:
             self._guest.run_on(self._is_done_now, self._lengthen)
 
     def _is_done_now(self) -> bool:
-        return self._memory.read(self._places.done, 8) == struct.pack("<Q", self._serial)
+        return self._memory.read(self._places.done, 8) == self._done_word
 
     def _lengthen(self) -> None:
-        self._memory.write(self._places.timeout, TIMEOUT.pack(*divmod(STOPPED_TIMEOUT_NS, 10**9)))
+        self._memory.write(self._places.timeout, STOPPED_TIMEOUT)
 
     def _lay_lost(self, lost: bytes) -> None:
         """Write the registers that the kernel is to give back by the code's own frame, unless they stand there."""
@@ -145,7 +147,7 @@ class Desk:
     def is_done(self, table: bytes) -> bool:
         """Whether the calls have been made, by the table's bytes."""
         done = self._places.done - self.table
-        return table[done : done + 8] == struct.pack("<Q", self._serial)
+        return table[done : done + 8] == self._done_word
 
     def answers(self, table: bytes, batch: Batch) -> Answers:
         """The results of its calls, by the table's bytes."""
