@@ -167,7 +167,7 @@ class Invariants:
             self._count(world, *vote)
 
     def _count(self, world: World, component: str, epoch: int, primary: str) -> None:
-        """Whether a majority of the primary's own team, as that is now, has voted for it. Who is no member of it has no vote."""
+        """Note a robot as elected once a majority of its own team, as that is now, has voted for it. Others have no vote."""
         team = world.robots[primary].config
         votes = sum((name, component, epoch, primary) in self.cast for name in (primary, *team.peers))
         if world.coordination is not None:

@@ -282,7 +282,8 @@ def test_a_change_before_a_majority_of_the_next_team_knows_an_election_would_let
     world.power_off(acting)
     for name in after:
         take(world, name, after)
-        world.power_on(name) if name != acting else None
+        if name != acting:
+            world.power_on(name)
     with pytest.raises(Broken, match="epoch 2 of /team/part is"):
         world.run(world.now_ns + 3_000 * MS)
 

@@ -21,7 +21,7 @@ from agent.errors import RefusedError
 from agent.main_loop.messages import Told
 from agent.worker import team_changes
 from agent.worker.network.replication_link import new_keys, public_key_of
-from agent.worker.team_changes import TeamChanges, told_of
+from agent.worker.team_changes import Answer, TeamChanges, told_of
 from failover.config import members, team
 from failover.config.team import Robot, Role, Team
 from failover.core import acts, events
@@ -303,7 +303,7 @@ def test_an_older_change_that_comes_late_overwrites_no_newer_one(tmp_path: Path)
     asyncio.run(live())
 
 
-# --- What was elected ---------------------------------------------------------------------------------------------------
+# --- What was elected -------------------------------------------------------------------------------------------------
 
 
 def test_a_change_waits_until_the_members_after_it_know_what_was_elected(tmp_path: Path) -> None:
@@ -341,25 +341,36 @@ def test_a_change_that_waits_too_long_says_for_whom_and_frees_all_grants(tmp_pat
     assert town["a"].on_disk == ["a", "b", "c", "d"]
 
 
-def test_no_change_waits_for_a_component_that_has_ended_or_for_members_of_a_release_that_tells_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_change_waits_for_a_component_that_has_ended(tmp_path: Path) -> None:
     town = Town(tmp_path, "a", "b", "c", "d")
     for name, state, epoch in zip("abcd", ("finished", "standby", "standby", "released"), (3, 2, 2, 3), strict=True):
         town[name].runs = [view("/x", "", state=State(state), epoch=epoch)]
     asyncio.run(town["a"].change("remove", "d"))
     assert town["b"].on_disk == ["a", "b", "c"]
-    town["a"].runs = [view("/x", "a", epoch=4)]
-    granted = town["b"].changes._granted
+
+
+def answers_as_an_older_release(town: Town, name: str, monkeypatch: pytest.MonkeyPatch, *known: str) -> None:
+    """A member's grants tell these alone."""
+    granted = town[name].changes._granted
 
     async def by_the_release_before(peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
         answer = await granted(peer, arguments)
-        return {key: answer[key] for key in ("refusal", "sees", "members")}
+        return {key: answer[key] for key in known}
 
-    orders = {**town["b"].changes.orders(), "team_grant": by_the_release_before}
-    monkeypatch.setattr(town["b"].changes, "orders", lambda: orders)
-    asyncio.run(town["a"].change("add", "e", JOINING))
-    assert town["b"].on_disk == ["a", "b", "c", "e"]
+    orders = {**town[name].changes.orders(), "team_grant": by_the_release_before}
+    monkeypatch.setattr(town[name].changes, "orders", lambda: orders)
+
+
+def test_no_change_waits_for_a_member_whose_release_tells_no_elections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(team_changes, "AWARE_PATIENCE_NS", 0)
+    town = Town(tmp_path, "a", "b", "c", "d")
+    for name, epoch in (("a", 3), ("b", 2), ("c", 3), ("d", 2)):
+        town[name].runs = [view("/x", "a", epoch=epoch)]
+    with pytest.raises(RefusedError, match="b, d: not told yet"):
+        asyncio.run(town["a"].change("remove", "c"))
+    answers_as_an_older_release(town, "b", monkeypatch, "refusal", "sees", "members")
+    asyncio.run(town["a"].change("remove", "c"))
+    assert town["b"].on_disk == ["a", "b", "d"]
 
 
 def test_keys_are_replaced_without_a_wait_for_elections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -368,6 +379,9 @@ def test_keys_are_replaced_without_a_wait_for_elections(tmp_path: Path, monkeypa
     for name, epoch in (("a", 2), ("b", 3), ("c", 3)):
         town[name].runs = [view("/x", "b", epoch=epoch)]
     asyncio.run(town["a"].change("rotate", ""))
+    told = {name: Answer(True, rule="etcd", elections=Elections({"/x": epoch})) for name, epoch in (("a", 3), ("b", 2), ("c", 2))}
+    assert team_changes._waits(town.team, members.with_next_key(town.team, "a", new_keys()[0]), told) == ""
+    assert team_changes._waits(town.team, members.left(town.team, "c", "a"), told), "etcd and b would be a majority"
 
 
 @pytest.mark.parametrize("names", ["a b", "a"])
@@ -617,14 +631,7 @@ def test_a_member_whose_release_knows_no_sites_grants_no_change_of_a_team_that_h
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     town = Town(tmp_path, "a", "b")
-    granted = town["b"].changes._granted
-
-    async def by_the_release_before(peer: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        answer = await granted(peer, arguments)
-        return {"refusal": answer["refusal"], "sees": answer["sees"]}
-
-    orders = {**town["b"].changes.orders(), "team_grant": by_the_release_before}
-    monkeypatch.setattr(town["b"].changes, "orders", lambda: orders)
+    answers_as_an_older_release(town, "b", monkeypatch, "refusal", "sees")
     with pytest.raises(RefusedError, match="it has sites, and the release of b knows none"):
         asyncio.run(town["a"].change("add", "d", JOINING.at("hall")))
     assert town["a"].on_disk == town["b"].on_disk == ["a", "b"]

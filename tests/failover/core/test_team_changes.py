@@ -99,6 +99,8 @@ def test_no_change_waits_for_an_epoch_that_was_claimed_in_vain_but_for_the_one_b
 def test_what_has_ended_is_waited_for_nowhere_and_counts_as_known() -> None:
     four, after = ("a", "b", "c", "d"), ("b", "c", "d")
     assert unaware(four, after, {"a": know("x", x=3), "b": know(x=2), "c": know("x", x=2), "d": know("x", x=2)}) == {}
+    assert unaware(four, after, {"a": know("x", x=3), "b": know(x=2), "c": know(x=2), "d": know("x", x=3)}) == {}, "not for 3"
+    assert unaware(four, after, {"a": know(x=2), "b": know(x=2), "c": know("x", x=2), "d": know("x", x=2)}) == {}, "known"
     told = {"a": know(x=3, y=1), "b": know(x=3, y=1), "c": know(x=2, y=1), "d": know(x=2)}
     assert unaware(four, after, told) == {"x": (3, ["c", "d"])}, "each component by itself"
 
@@ -114,6 +116,9 @@ def test_etcd_counts_as_one_that_lacks_an_election_unless_there_is_a_single_memb
 
 def test_a_member_whose_release_tells_no_elections_holds_no_change_up() -> None:
     assert unaware(("a", "b", "c"), ("a", "b", "c", "d"), {"a": know(x=3), "b": None, "c": None}) == {}
+    four, told = ("a", "b", "c", "d"), {"a": know(x=3), "c": know(x=3), "d": know(x=2)}
+    assert unaware(four, ("a", "b", "d"), {**told, "b": know(x=2)}) == {"x": (3, ["b", "d"])}
+    assert unaware(four, ("a", "b", "d"), {**told, "b": None}) == {}
 
 
 def elections_in_all_histories(start: int, depth: int, wait: bool) -> str:
@@ -130,7 +135,8 @@ def elections_in_all_histories(start: int, depth: int, wait: bool) -> str:
         story = histories[state]
         if story.count(";") >= depth:
             continue
-        steps: list[tuple[str, Any]] = []
+        told = {str(name): know(x=epoch) for name, epoch in team}
+        steps: list[tuple[str, dict[str, Elections], Any]] = []
         for name, epoch in team:
             claimed = epoch + 1
             able = [other for other, known in team if other != name and known < claimed]
@@ -139,21 +145,17 @@ def elections_in_all_histories(start: int, depth: int, wait: bool) -> str:
                 after = tuple((one, claimed if one == name or one in asked else known) for one, known in team)
                 if asked and claimed in elected:
                     return f"{story} {name} is elected in {claimed} by {asked}"
-                steps.append(
-                    (f"{name} claims {claimed}, {asked} vote", (after, elected | {claimed} if asked else elected, following))
-                )
-        told = {str(name): know(x=epoch) for name, epoch in team}
+                reached = after, elected | {claimed} if asked else elected, following
+                steps.append((f"{name} claims {claimed}, {asked} vote", told, reached))
         if following < start + 2:
-            steps.append((f"{following} joins", ((*team, (following, 0)), elected, following + 1)))
+            steps.append((f"{following} joins", told, ((*team, (following, 0)), elected, following + 1)))
         for name, _ in team if len(team) > 3 else ():
-            steps += [
-                (f"{name} {way}", (tuple(one for one in team if one[0] != name), elected, following))
-                for way in ("leaves", "is lost")
-            ]
-        for step_of_it, reached in steps:
+            rest = tuple(one for one in team if one[0] != name), elected, following
+            without_it = {other: one for other, one in told.items() if other != str(name)}
+            steps += [(f"{name} leaves", told, rest), (f"{name} is lost", without_it, rest)]
+        for step_of_it, granting, reached in steps:
             members = [str(name) for name, _ in team]
             voters = [str(name) for name, _ in reached[0]]
-            granting = {name: one for name, one in told.items() if name in voters or "is lost" not in step_of_it}
             if wait and members != voters and unaware(members, voters, granting):
                 continue
             if reached not in histories:
