@@ -1,4 +1,4 @@
-"""Keeper, agent and both are killed, at instants spread over captures and restores: the program is unharmed.
+"""Keeper, agent and both are killed, at instants spread over captures and restores: the program is unharmed. Guards, too.
 
 Two robots of which one waits (``on_loss = "hold"``), so that an agent that is away for a second is a pause of the protection and
 not a takeover. FAILOVER_KILLS=200 kills each that often, at instants that FAILOVER_SEED chooses.
@@ -116,6 +116,18 @@ def test_whoever_is_killed_the_program_runs_on(pair: Pair, way: str) -> None:
         assert os.WTERMSIG(link.ask("stop", name="count")["exit_status"]) == signal.SIGTERM
     counted = numbers(robots.output(first, "count"))
     assert counted == list(range(len(counted)))
+
+
+def test_guards_that_die_together_cost_a_program_one_crash_and_nothing_that_was_acknowledged(pair: Pair) -> None:
+    first, second = pair
+    robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
+    robots.until(lambda: robots.checkpoints(second, "count") >= 3, "checkpoints at robot2")
+    robots.until(lambda: len(parts(first, "guard")) > 1, "a guard that waits")
+    kill(first, ("guard",))
+    robots.until(lambda: robots.component(first, "count").get("restores") == 1, "the program to be resumed")
+    decisions = [line for line in first.log.read_text().splitlines() if "saw it crash" in line or "could not resume" in line]
+    assert len(decisions) == 1 and "saw it crash, 1 in the window" in decisions[0], decisions
+    expect_checkpoints(second)
 
 
 def order_handover(source: RobotMachine, target: RobotMachine) -> None:

@@ -121,7 +121,10 @@ class ProcessPool:
             self._forking()
 
     async def guard(self) -> Dialogue:
-        """A guard that guards nothing yet.
+        """A guard that guards nothing yet, and that answers.
+
+        One that waited may have been killed together with the guard that it replaces, and its end not be seen yet. A restore
+        that fails by it would count as one more crash of the program; after some, an older checkpoint is resumed.
 
         Raises:
             GuardError: it cannot be started.
@@ -131,8 +134,8 @@ class ProcessPool:
         while self._guards:
             with contextlib.suppress(GuardError):
                 guard = await self._guards.popleft()
-                if guard.open:
-                    return guard
+                await guard.ask(messages.Describe())
+                return guard
         return await self._guard_born()
 
     async def keeper(self) -> KeeperLink:

@@ -18,7 +18,7 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from agent.core_config import begun_on
-from agent.errors import TROUBLE, AgentError, GuardError, KeeperLostError
+from agent.errors import TROUBLE, AgentError, GuardError, GuardLostError, KeeperLostError
 from agent.system import clock
 from agent.system.adopted_process import Guest
 from agent.system.crash import end_worker_on_mistake
@@ -512,7 +512,8 @@ class Supervisor:
             return
         self._cleared.clear()
         try:
-            await component.stop(signal.SIGKILL)
+            with contextlib.suppress(GuardLostError):  # the program ended with it
+                await component.stop(signal.SIGKILL)
             await component.forget()
         finally:
             self._cleared.set()

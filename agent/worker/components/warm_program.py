@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 from typing import Any, Final
 
-from agent.errors import TROUBLE, GuardError
+from agent.errors import TROUBLE, GuardError, GuardLostError
 from agent.system import clock
 from agent.system.crash import end_worker_on_mistake
 from agent.worker.components import launch
@@ -82,6 +82,8 @@ class Standby:
             began_ns = clock.now_ns()
             try:
                 why = await self._wait_here(program, owner, tell)
+            except GuardLostError as error:
+                why = str(error)
             except GuardError as error:
                 why = f"{error}; {CURE}"
             except TROUBLE as error:

@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from agent.errors import KeeperLostError
+from agent.guard.messages import Describe
 from agent.worker.components import process_pool
 from agent.worker.components.process_pool import KeeperLink, ProcessPool
 from checkpoint.keeper.messages import Release, Released
@@ -96,6 +97,20 @@ def test_a_guard_waits_for_each_component_that_may_be_taken_over(tmp_path: Path)
     async def story(process_pool: ProcessPool) -> None:
         process_pool.expect(2)
         await until(2, 1)
+
+    live(tmp_path, story)
+
+
+def test_guards_that_were_killed_while_they_waited_are_never_given(tmp_path: Path) -> None:
+    async def story(process_pool: ProcessPool) -> None:
+        process_pool.expect(3)
+        await asyncio.gather(*process_pool._guards)  # all are connected
+        for child in children():
+            if "agent.guard.server" in child.cmdline():
+                child.kill()
+        guard = await process_pool.guard()  # before the pool has heard of any end
+        await guard.ask(Describe())
+        guard.close()
 
     live(tmp_path, story)
 
