@@ -31,6 +31,8 @@ NAMESPACES: Final = (
     *("--propagation", "private"),
 )
 MISTAKE_LINES: Final = 40
+LAST_LINES: Final = 60
+TIME_SIZE: Final = len("23:59:59")
 FIRST_PROCESS: Final = '"$@"; exit $?'
 """A shell as PID 1 reaps what is left to it."""
 
@@ -65,11 +67,19 @@ def _wage(directory: Path, seed: str, faults: int, kinds: list[str]) -> bool:
         except (AssertionError, FailoverError) as error:
             print(f"seed {seed}: {type(error).__name__} at fault {len(campaign.blows) + 1}: {error}", flush=True)
             campaign.evidence()
+            print(*_last_lines(house), sep="\n", flush=True)
             return False
         except KeyboardInterrupt:
             print("called off; until then:", flush=True)
         print(campaign.figures(), flush=True)
         return not any(_is_mistaken(member.directory / "agent.log") for member in house.members)
+
+
+def _last_lines(house: House) -> list[str]:
+    """The newest lines about components of all agents' logs, in order: where the evidence is lost, they may say enough."""
+    logs = ((member.name, (member.directory / "agent.log").read_text(errors="replace")) for member in house.members)
+    about = [(line[:TIME_SIZE], name, line[TIME_SIZE:]) for name, log in logs for line in log.splitlines() if "/house/" in line]
+    return [f"{at} {name}{said}" for at, name, said in sorted(about, key=lambda one: one[0])[-LAST_LINES:]]
 
 
 def _is_mistaken(log: Path) -> bool:
