@@ -34,6 +34,10 @@ BIRTH_S: Final = 20.0
 """How long a guard may take until it listens; a tenth of a second is usual."""
 
 POLL_S: Final = 0.005
+
+ANSWER_S: Final = 1.0
+"""How long a guard that waits may take to answer; a tenth of a millisecond is usual. The next one is used then."""
+
 _PEER: Final = struct.Struct("3i")
 
 SPARES_MAX: Final = 8
@@ -134,8 +138,8 @@ class ProcessPool:
         while self._guards:
             with contextlib.suppress(GuardError):
                 guard = await self._guards.popleft()
-                await guard.ask(messages.Describe())
-                return guard
+                if await _answers(guard):
+                    return guard
         return await self._guard_born()
 
     async def keeper(self) -> KeeperLink:
@@ -302,6 +306,16 @@ def _call(path: Path) -> socket.socket:
 def _new_name() -> str:
     """Of a guard or keeper: one that none of an earlier agent's has."""
     return secrets.token_hex(4)
+
+
+async def _answers(guard: Dialogue) -> bool:
+    """Whether a guard that waited does; one that does not, in time, is hung up on."""
+    try:
+        await asyncio.wait_for(guard.ask(messages.Describe()), ANSWER_S)
+    except (GuardError, TimeoutError):
+        guard.close()
+        return False
+    return True
 
 
 def _lost(born: asyncio.Task[Dialogue]) -> bool:

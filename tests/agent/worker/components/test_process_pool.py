@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import signal
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -101,16 +103,25 @@ def test_a_guard_waits_for_each_component_that_may_be_taken_over(tmp_path: Path)
     live(tmp_path, story)
 
 
-def test_guards_that_were_killed_while_they_waited_are_never_given(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_guard_that_was_killed_or_stopped_while_it_waited_is_not_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    monkeypatch.setattr(process_pool, "ANSWER_S", 0.1)
+
     async def story(process_pool: ProcessPool) -> None:
         process_pool.expect(3)
+        await until(3, 1)
         await asyncio.gather(*process_pool._guards)  # all are connected
-        for child in children():
-            if "agent.guard.server" in child.cmdline():
-                child.kill()
+        lost = [child for child in children() if "agent.guard.server" in child.cmdline()]
+        for child in lost:
+            child.send_signal(number)
         guard = await process_pool.guard()  # before the pool has heard of any end
         await guard.ask(Describe())
         guard.close()
+        for child in lost:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                child.kill()
 
     live(tmp_path, story)
 
