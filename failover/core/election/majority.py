@@ -7,7 +7,8 @@
   Any two majorities share a member, and that member voted only after the lease it had granted was over: so there are never two
   valid leases.
 * *Pre-vote.* Members say in heartbeats whether they are free. No robot claims before a majority is free: a robot that is cut off
-  raises no epoch.
+  raises no epoch. A robot whose copy is held still, without a lease, says so, too: it gives that copy up to a claim by which
+  nothing is lost (`failover.core.election.votes`). Its followers stay bound: they may have granted it a part of a lease.
 * *Nothing acknowledged is lost.* A primary acknowledges a standby's position once a majority has noted that standby. Members vote
   for robots that hold as much; for others only when those were out of reach for ``patience_ms``, or by an operator's order.
 * *The robot with a valid lease is the primary.* It answers a later epoch that was claimed in vain by one above that. A robot
@@ -33,6 +34,7 @@ def look(component: Component, turn: Turn) -> None:
     """Note how this member would vote now; its next beat says so."""
     component.free = is_free(component, turn)
     component.open = component.free and _all_gone(component, turn)
+    component.free |= component.state is State.FROZEN and not leased(component, turn)
 
 
 def is_free(component: Component, turn: Turn) -> bool:
