@@ -13,6 +13,9 @@ BAD_STATES: Final = frozenset({"degraded", "failed"})
 OVER_STATES: Final = frozenset({"ended", "released"})
 """No robot is expected to run a component in one of these states any more."""
 
+STANDS_STILL: Final = "frozen"
+"""The state of a component that its robot holds still: it acts nowhere."""
+
 Sight = Mapping[str, Any]
 """One component, as one robot sees it."""
 
@@ -60,9 +63,9 @@ def is_unknown(component: Sight) -> bool:
 
 
 def is_unwell(component: Sight) -> bool:
-    """It runs nowhere, unprotected, degraded, or a robot that holds its checkpoints could not go on from them well."""
+    """It runs nowhere or stands still, unprotected, degraded, or a robot with its checkpoints could not go on from them well."""
     one = sight(component)
-    is_bad = one.get("state") in BAD_STATES or not one.get("standby") or is_unprotected(one) or is_unknown(one)
+    is_bad = one.get("state") in BAD_STATES | {STANDS_STILL} or not one.get("standby") or is_unprotected(one) or is_unknown(one)
     is_over = one.get("state") in OVER_STATES
     return (is_bad and not is_over) or any(
         seen.get("cold") or seen.get("unstored") or is_lacking(seen) for seen in sights(component)
@@ -72,8 +75,8 @@ def is_unwell(component: Sight) -> bool:
 def is_healthy(status: Mapping[str, Any]) -> bool:
     """Whether all that should be protected is, as far as any robot that answered knows.
 
-    No component is degraded, failed, unprotected, without a standby that can run it, or where no answer came from; no robot
-    counts a peer as dead, or has lately heard one say more than it may. Where etcd has a vote, it is reached.
+    No component is degraded, failed, held still, unprotected, without a standby that can run it, or where no answer came from; no
+    robot counts a peer as dead, or has lately heard one say more than it may. Where etcd has a vote, it is reached.
     """
     unwell = any(map(is_unwell, status["components"]))
     unwell |= any(peer.get("doubted") for peer in status["peers"]) or any((status.get("doubted_elsewhere") or {}).values())

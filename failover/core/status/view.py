@@ -35,7 +35,7 @@ def status(components: dict[str, Component], turn: Turn, boot: int, testimony: T
         replace(peer, refused=testimony.told(peer.robot, turn.now_ns), doubted=testimony.is_recent(peer.robot, turn.now_ns))
         for peer in turn.team.views(turn.now_ns)
     )
-    bad = any(view.protection is Protection.DEGRADED or view.state is State.FAILED for view in views)
+    bad = any(view.protection is Protection.DEGRADED or view.state in (State.FAILED, State.FROZEN) for view in views)
     bad = bad or any(view.cold or view.unstored for view in views) or any(one.is_exhausted for one in components.values())
     bad = bad or bool(turn.team.at_odds(turn.now_ns)) or any(peer.unread or peer.doubted for peer in peers)
     lost = any(peer.state == "dead" for peer in peers)

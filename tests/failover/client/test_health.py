@@ -28,6 +28,7 @@ CASES: dict[str, tuple[dict[str, Any] | None, dict[str, Any] | None, bool]] = {
     "protected no longer": ({"protection": "stopped"}, {}, False),
     "degraded": ({"protection": "degraded", "state": "degraded"}, {}, False),
     "failed": ({"state": "failed"}, {"state": "failed"}, False),
+    "held still, before any peer counts as dead": ({"state": "frozen"}, {}, False),
     "others write to its file": ({"contested": ["a file"]}, {}, False),
     "refused by its standby": ({}, {"lacks": ["a disk"]}, False),
     "not stored at its standby": ({}, {"unstored": "no space"}, False),
