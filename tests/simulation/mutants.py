@@ -619,16 +619,10 @@ def trusts_etcds_clock() -> Any:
     return patch.object(Arbiter, "_silent_ns", lambda self, robot: 0 if robot in self._leased else 1 << 60)
 
 
-def shares_an_epoch() -> Any:
-    """A copy that stands still waits for votes that its own epoch cannot have any more."""
-    return patch.object(votes, "_heard_spent_vote", lambda *_: None)
-
-
 ETCD_MUTANTS: tuple[tuple[Mutant, int], ...] = (
     (lease_from_the_answer, 40),
     (no_fence_at_the_end, 37),
     (trusts_etcds_clock, 94),
-    (shares_an_epoch, 237),
 )
 """Mistakes that lives with etcd catch, and the seed that caught each last."""
 

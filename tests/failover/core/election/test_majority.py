@@ -245,6 +245,25 @@ def test_a_primary_that_nobody_hears_stands_still() -> None:
     assert talk.orders(acts.Freeze)
 
 
+def test_a_copy_that_is_held_still_without_a_lease_would_give_way_and_says_so() -> None:
+    talk = running()
+    talk.hear("witness1", entry(State.STANDBY, 1, "robot1"))
+    talk.tick(20)
+    assert not talk.said()[-1].flags & FREE
+    talk.tick(ROBOT.lease_ms)
+    assert talk.orders(acts.Freeze) and talk.said()[-1].flags & FREE
+
+
+def test_a_copy_that_is_held_still_goes_above_an_epoch_in_which_a_vote_that_it_needs_is_spent() -> None:
+    talk = running()
+    talk.tick(4 * ROBOT.lease_ms)  # robot2 is lost, and had claimed it
+    for epoch in (2, 3):
+        for _ in range(ROBOT.retry_ms // 20 + 1):
+            talk.hear("witness1", entry(State.STANDBY, epoch, "robot2"))
+            talk.tick(20)
+        assert talk.vote() == (epoch + 1, "robot1")
+
+
 def test_a_robot_claims_when_the_others_would_vote_for_it_by_what_they_have_noted() -> None:
     """It gave its copy up to robot2's claim of epoch 3; robot2 is back with a new disk; nobody else has heard of that claim."""
     record = Record(NAME, 3, "robot2", State.STANDBY, spec=SPEC)
