@@ -28,7 +28,7 @@ from checkpoint.model import Position
 from failover.core.election.consent import STATES, state_of
 from failover.core.types import COORDINATOR, ENDED, HOLDING, MS, Config, State
 from failover.core.wire.codec import is_sound_entry
-from failover.core.wire.messages import FREE, FRESH, OPEN, ORDERED, RULES, Beat, Echo, Entry
+from failover.core.wire.messages import BARE, FREE, FRESH, OPEN, ORDERED, RULES, Beat, Echo, Entry
 from failover.errors import RulesError
 
 ROUNDS_IN_LEASE: Final = 8
@@ -325,7 +325,8 @@ class Arbiter:
 
     def _is_eligible(self, entry: Entry, seat: Seat) -> bool:
         """Whether nothing that was acknowledged is lost if this robot goes on from its newest checkpoint."""
-        sure = [robot for robot in (seat.primary, seat.standby) if robot]
+        lost = self._me if entry.flags & BARE else ""
+        sure = [robot for robot in (seat.primary, seat.standby) if robot not in ("", lost)]
         if STATES[seat.state] in ENDED or self._me in sure or self._all_lost(entry.name, sure):
             return True
         if entry.flags & FRESH and seat.standby in ("", self._me):
@@ -336,7 +337,8 @@ class Arbiter:
 
     def _position_at(self, component: str, robot: str) -> Position | None:
         entry = self._words[robot][0].entry(component) if robot in self._words else None
-        return entry.position if entry is not None and self._silent_ns(robot) < self._loyalty_ns else None
+        is_known = entry is not None and not entry.flags & BARE and self._silent_ns(robot) < self._loyalty_ns
+        return entry.position if entry is not None and is_known else None
 
     def _all_lost(self, component: str, sure: list[str]) -> bool:
         """Whether those that hold all that was acknowledged were waited for long enough, or are back without it."""
@@ -347,7 +349,8 @@ class Arbiter:
         if silent_ns >= self._loyalty_ns or robot not in self._words:
             return silent_ns >= self._patience_ns
         entry = self._words[robot][0].entry(component)
-        return entry is None or (entry.position is None and state_of(entry) not in _BOUND)
+        has_none = entry is None or entry.position is None or bool(entry.flags & BARE)
+        return has_none and (entry is None or state_of(entry) not in _BOUND)
 
     def _entries(self, word: Word) -> Iterator[Entry]:
         """The seats, as a witness would tell of them."""

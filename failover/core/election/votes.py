@@ -167,12 +167,15 @@ def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     if entry.epoch < component.epoch or (component.state in ENDED and entry.epoch == component.epoch):
         return
+    is_news = component.epoch == 0
     if (entry.epoch, sender) != (component.epoch, component.primary):
         if not majority.may_follow(component, turn, sender, entry):
             return
         archived.void(component)
         accept(component, turn, sender, entry.epoch)
     component.entrusted = (entry.standby,) if entry.standby else ()
+    if is_news:
+        archived.recall(component, turn)
     follow(component, turn, sender, entry)
 
 
@@ -287,9 +290,12 @@ def _needs_the_vote(component: Component, turn: Turn) -> bool:
 
 def _adopt(component: Component, turn: Turn, entry: Entry) -> None:
     archived.void(component)
-    if component.state in ENDED:
+    had_ended, is_news = component.state in ENDED, component.epoch == 0
+    if had_ended:
         drop(component, turn, "it runs anew")
     accept(component, turn, entry.primary, entry.epoch)
     component.entrusted = (entry.standby,) if entry.standby else ()
-    if component.state is State.ABSENT or component.state in ENDED:
+    if is_news:
+        archived.recall(component, turn)
+    if component.state is State.ABSENT or had_ended:
         component.move(Cause.FOLLOW)

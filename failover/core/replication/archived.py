@@ -56,13 +56,14 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
     if component.state is State.ABSENT:
         component.move(Cause.FOLLOW)
     had_none = not component.held
+    has_lost = component.bare or (had_none and component.has_begun and _is_to_hold_all(component, turn.me))
     component.held = [*component.held, event.position][-KEPT:]
     component.spec, component.keeps_state = event.spec, event.keeps_state
     component.stored_ns = turn.now_ns
     component.fetched = event.position, turn.now_ns - event.age_ns
     component.lags = component.lags and not event.begun_ns
     if turn.config.coordinator:
-        component.bare = component.bare and (component.vouched is None or event.position < component.vouched)
+        component.bare = has_lost and (component.vouched is None or event.position < component.vouched)
     else:
         component.bare = component.bare or had_none
     component.unable, component.tries, component.unstored = "", 0, ""
@@ -77,6 +78,19 @@ def remember(component: Component, config: Config) -> None:
         component.bare = True
 
 
+def recall(component: Component, turn: Turn) -> None:
+    """Others told of a component that was on no record here: what is held of it came from the archive.
+
+    Where voters count on this robot to hold all of it, it has lost that.
+    """
+    component.bare |= turn.config.copies_ms > 0 and bool(component.held) and _is_to_hold_all(component, turn.me)
+
+
+def _is_to_hold_all(component: Component, me: str) -> bool:
+    """Whether voters count on this robot to hold all that was acknowledged."""
+    return me in (component.primary, *component.entrusted)
+
+
 def has_newer(component: Component, event: Stored) -> bool:
     """Whether a copy from the archive came before an older checkpoint that a server, or a standby, gave back meanwhile."""
     is_given_back = component.bare and event.sender != component.primary
@@ -89,7 +103,7 @@ def damaged(component: Component, turn: Turn, event: Damaged) -> None:
         return
     component.begun = component.has_begun
     component.held = [position for position in component.held if position != event.position]
-    if not component.held and turn.me in (component.primary, *component.entrusted):
+    if not component.held and _is_to_hold_all(component, turn.me):
         component.bare = component.begun
     if gave(component, event.position):
         component.fetched = None

@@ -38,6 +38,9 @@ CONFIG = Config(
 DECLARED = msgspec.structs.replace(CONFIG, components=(SPEC,))
 
 
+STANDBY = VoteRecord((Record(NAME, 1, "robot1", State.STANDBY, entrusted=("robot2",), spec=SPEC),))
+
+
 def position(epoch: int, sequence: int) -> Position:
     return Position(epoch * (PEERS_MAX + 1), sequence, b"d")
 
@@ -155,12 +158,17 @@ def test_where_the_archive_does_not_answer_it_waits_for_the_patience_and_no_long
     assert robot.claims()
 
 
+def standby() -> Lonely:
+    """robot2 holds what robot1 had acknowledged."""
+    robot = Lonely(record=STANDBY, held=(position(1, 5),))
+    robot.standby = "robot2"
+    robot.live(100)
+    return robot
+
+
 def test_a_standby_that_heard_its_primary_waits_for_no_patience_once_it_has_looked() -> None:
     """etcd names it as the standby: it has all that was acknowledged, and the archive may still have more."""
-    robot = Lonely()
-    robot.standby = "robot2"
-    robot.fetched(1, 5)
-    robot.live(100)
+    robot = standby()
     robot.flags = FREE
     robot.live(5_000)
     assert not robot.claims(), "it did not hear its primary lately: the archive may have something newer"
@@ -171,7 +179,7 @@ def test_a_standby_that_heard_its_primary_waits_for_no_patience_once_it_has_look
 
 def robot2_with_an_empty_disk() -> Lonely:
     """It was the standby, so it had all that was acknowledged; robot1, the primary, is silent. The archive has a copy."""
-    robot = Lonely(record=VoteRecord((Record(NAME, 1, "robot1", State.STANDBY, entrusted=("robot2",), spec=SPEC),)))
+    robot = Lonely(record=STANDBY)
     robot.standby, robot.flags = "robot2", FREE
     robot.live(100)
     robot.step(Looked(robot.now_ns, (NAME,)))
@@ -186,6 +194,21 @@ def test_a_standby_that_lost_its_disk_waits_for_the_primary_that_may_have_more_t
     robot.flags = FREE | OPEN
     robot.live(12_000)
     assert robot.claims()
+
+
+@pytest.mark.parametrize("comes_first", ["the copy", "the word"])
+def test_a_standby_that_lost_its_disk_and_its_record_waits_for_the_primary_too(comes_first: str) -> None:
+    robot = Lonely(seat="" if comes_first == "the copy" else "robot1")
+    robot.standby = "robot2"
+    robot.live(100)
+    robot.fetched(1, 5)
+    robot.seat = "robot1"
+    robot.live(100)
+    robot.flags = FREE
+    robot.live(100)
+    robot.step(Looked(robot.now_ns))
+    robot.live(20_000)
+    assert robot.record.records[0].entrusted == ("robot2",) and not robot.claims()
 
 
 def test_a_standby_whose_checkpoint_was_damaged_has_it_again_from_the_archive_and_waits_no_longer() -> None:
@@ -295,9 +318,7 @@ def test_a_program_of_this_robot_that_never_had_a_checkpoint_starts_again_while_
 
 @pytest.mark.parametrize("behind", [False, True])
 def test_a_standby_that_heard_its_primary_waits_for_a_newer_copy_that_it_knows_of(behind: bool) -> None:
-    robot = Lonely()
-    robot.standby = "robot2"
-    robot.fetched(1, 5)
+    robot = standby()
     for counter in range(1, 50):
         held = Entry(NAME, STATES.index(State.PRIMARY), 1, "robot1", 1 * (PEERS_MAX + 1), 5, b"d", standby="robot2")
         robot.step(Received(Beat("robot1", 1, counter, 1, total=1, entries=(held,), rule=RULES.index(Rule.ETCD)), "lan"))
