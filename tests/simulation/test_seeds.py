@@ -42,9 +42,10 @@ APART_ONCE_BROKEN = (330, 436, 821)
 ARCHIVE_ONCE_BROKEN = (99, 359, 607, 651)
 """What was acknowledged was lost to an older copy, after a restart and beside a server; what had ended ran again; none acted."""
 
-ETCD_ONCE_BROKEN = (590, 1061, 1565, 2859)
+ETCD_ONCE_BROKEN = (590, 1061, 1565, 2859, 1792)
 """An end came beside a claim; a robot with a new disk and an older copy of the archive counted as one that holds all that was
-acknowledged: its standby, or, heard of after that copy had come, its primary (2859)."""
+acknowledged: its standby, or, heard of after that copy had come, its primary (2859); a voter that learned that a component runs
+anew left what had ended there."""
 
 PAIR = TEAMS[0]
 VOTERS = tuple(team for team in TEAMS if team != PAIR)

@@ -297,5 +297,7 @@ def _adopt(component: Component, turn: Turn, entry: Entry) -> None:
     component.entrusted = (entry.standby,) if entry.standby else ()
     if is_news:
         archived.recall(component, turn)
-    if component.state is State.ABSENT or had_ended:
+    if had_ended:
+        clear_away(component, turn, component.epoch)  # a copy that ended here, and whose end was not agreed, may be left
+    elif component.state is State.ABSENT:
         component.move(Cause.FOLLOW)
