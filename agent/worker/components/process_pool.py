@@ -310,12 +310,15 @@ def _new_name() -> str:
 
 async def _answers(guard: Dialogue) -> bool:
     """Whether a guard that waited does; one that does not, in time, is hung up on."""
+    answered = False
     try:
-        await asyncio.wait_for(guard.ask(messages.Describe()), ANSWER_S)
-    except (GuardError, TimeoutError):
-        guard.close()
-        return False
-    return True
+        with contextlib.suppress(GuardError, TimeoutError):
+            await asyncio.wait_for(guard.ask(messages.Describe()), ANSWER_S)
+            answered = True
+    finally:  # also where the asker is cancelled
+        if not answered:
+            guard.close()
+    return answered
 
 
 def _lost(born: asyncio.Task[Dialogue]) -> bool:
