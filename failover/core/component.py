@@ -357,6 +357,10 @@ class Component(Struct):
         """Whether there is no later epoch that a beat could carry: no robot claims it before its record is mended."""
         return max(self.epoch, self.seen) + EPOCHS_LEFT_MIN >= EPOCH_MAX
 
+    def is_to_hold_all(self, robot: str) -> bool:
+        """Whether the others count on a robot to hold all that was acknowledged."""
+        return robot in (self.primary, *self.entrusted)
+
     @property
     def newest(self) -> Position | None:
         """Newest position that this robot can restore."""

@@ -303,7 +303,7 @@ class Node:
             elif found is not None and component.state not in ENDED:
                 component.state = State.STOPPING
                 turn.order(acts.Stop(component.name, component.epoch))
-            if found is None and not component.held and turn.me in (component.primary, *component.entrusted):
+            if found is None and not component.held and component.is_to_hold_all(turn.me):
                 component.bare = component.has_begun
         for stray in self._found.values():
             self._strays_ns = max(self._strays_ns, stray.lease_ns)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from checkpoint.model import Position
 from failover.core.component import Component
 from failover.core.membership import Peer
 from failover.core.types import State
-from failover.core.wire.messages import Entry
+from failover.core.wire.messages import BARE, Entry
 
 STATES = tuple(State)
 """A state's place in here is its number in a beat."""
@@ -14,6 +15,11 @@ STATES = tuple(State)
 def state_of(entry: Entry) -> State:
     """The state that an entry tells of; a number that is none reads as absent."""
     return STATES[entry.state] if 0 <= entry.state < len(STATES) else State.ABSENT
+
+
+def kept(entry: Entry) -> Position | None:
+    """The position from which the sender can restore; None if it has none, or has lost what it held: its own may be older."""
+    return None if entry.flags & BARE else entry.position
 
 
 def grants(component: Component, peer: Peer, me: str) -> bool:

@@ -25,7 +25,7 @@ import msgspec
 
 from checkpoint.errors import UNDECODABLE
 from checkpoint.model import Position
-from failover.core.election.consent import STATES, state_of
+from failover.core.election.consent import STATES, kept, state_of
 from failover.core.types import COORDINATOR, ENDED, HOLDING, MS, Config, State
 from failover.core.wire.codec import is_sound_entry
 from failover.core.wire.messages import BARE, FREE, FRESH, OPEN, ORDERED, RULES, Beat, Echo, Entry
@@ -337,8 +337,7 @@ class Arbiter:
 
     def _position_at(self, component: str, robot: str) -> Position | None:
         entry = self._words[robot][0].entry(component) if robot in self._words else None
-        is_known = entry is not None and not entry.flags & BARE and self._silent_ns(robot) < self._loyalty_ns
-        return entry.position if entry is not None and is_known else None
+        return kept(entry) if entry is not None and self._silent_ns(robot) < self._loyalty_ns else None
 
     def _all_lost(self, component: str, sure: list[str]) -> bool:
         """Whether those that hold all that was acknowledged were waited for long enough, or are back without it."""
@@ -349,8 +348,7 @@ class Arbiter:
         if silent_ns >= self._loyalty_ns or robot not in self._words:
             return silent_ns >= self._patience_ns
         entry = self._words[robot][0].entry(component)
-        has_none = entry is None or entry.position is None or bool(entry.flags & BARE)
-        return has_none and (entry is None or state_of(entry) not in _BOUND)
+        return entry is None or (kept(entry) is None and state_of(entry) not in _BOUND)
 
     def _entries(self, word: Word) -> Iterator[Entry]:
         """The seats, as a witness would tell of them."""

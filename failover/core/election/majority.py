@@ -21,10 +21,10 @@ from collections.abc import Iterator
 
 from checkpoint.model import Position
 from failover.core.component import Component, Turn
-from failover.core.election.consent import grants, state_of
+from failover.core.election.consent import grants, kept, state_of
 from failover.core.membership import Peer
 from failover.core.types import ENDED, HOLDING, MS, State
-from failover.core.wire.messages import BARE, FREE, FRESH, OPEN, ORDERED, STARTS, Entry
+from failover.core.wire.messages import FREE, FRESH, OPEN, ORDERED, STARTS, Entry
 
 _BOUND = HOLDING | {State.STOPPING}
 """States in which the robot's copy may still be there."""
@@ -173,7 +173,7 @@ def _position_at(component: Component, turn: Turn, robot: str) -> Position | Non
         return None if component.bare else component.newest
     peer = turn.team.peers.get(robot)
     entry = peer.entry(component.name) if peer is not None and turn.alive(robot) else None
-    return entry.position if entry is not None and not entry.flags & BARE else None
+    return kept(entry) if entry is not None else None
 
 
 def _all_gone(component: Component, turn: Turn) -> bool:
@@ -193,7 +193,7 @@ def is_lost(component: Component, turn: Turn, robot: str) -> bool:
     entry = peer.entry(component.name)
     if entry is None:
         return peer.complete
-    return (entry.position is None or bool(entry.flags & BARE)) and state_of(entry) not in _BOUND
+    return kept(entry) is None and state_of(entry) not in _BOUND
 
 
 def _would(component: Component, turn: Turn, peer: Peer, position: Position | None) -> bool:

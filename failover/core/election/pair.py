@@ -134,7 +134,7 @@ def _is_passed_over(component: Component, turn: Turn, peer: Peer) -> bool:
     under pair each robot is waited for. So is one that may hold the newest checkpoint, until it is dead.
     """
     robot = peer.robot
-    if not turn.config.by_majority or robot in (component.primary, *component.entrusted):
+    if not turn.config.by_majority or component.is_to_hold_all(robot):
         return False
     return turn.team.awaited_ns(robot, turn.now_ns) > 0 and _is_free_of(component, robot, peer)
 

@@ -167,15 +167,12 @@ def heard(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
 def _heard_holder(component: Component, turn: Turn, sender: str, entry: Entry) -> None:
     if entry.epoch < component.epoch or (component.state in ENDED and entry.epoch == component.epoch):
         return
-    is_news = component.epoch == 0
-    if (entry.epoch, sender) != (component.epoch, component.primary):
-        if not majority.may_follow(component, turn, sender, entry):
-            return
-        archived.void(component)
-        accept(component, turn, sender, entry.epoch)
-    component.entrusted = (entry.standby,) if entry.standby else ()
-    if is_news:
-        archived.recall(component, turn)
+    if (entry.epoch, sender) == (component.epoch, component.primary):
+        component.entrusted = (entry.standby,) if entry.standby else ()
+    elif majority.may_follow(component, turn, sender, entry):
+        _accept_word(component, turn, sender, entry)
+    else:
+        return
     follow(component, turn, sender, entry)
 
 
@@ -289,15 +286,21 @@ def _needs_the_vote(component: Component, turn: Turn) -> bool:
 
 
 def _adopt(component: Component, turn: Turn, entry: Entry) -> None:
-    archived.void(component)
-    had_ended, is_news = component.state in ENDED, component.epoch == 0
+    had_ended = component.state in ENDED
     if had_ended:
         drop(component, turn, "it runs anew")
-    accept(component, turn, entry.primary, entry.epoch)
-    component.entrusted = (entry.standby,) if entry.standby else ()
-    if is_news:
-        archived.recall(component, turn)
+    _accept_word(component, turn, entry.primary, entry)
     if had_ended:
         clear_away(component, turn, component.epoch)  # a copy that ended here, and whose end was not agreed, may be left
     elif component.state is State.ABSENT:
         component.move(Cause.FOLLOW)
+
+
+def _accept_word(component: Component, turn: Turn, primary: str, entry: Entry) -> None:
+    """Vote for that primary, and note the robot that it has entrusted, as the entry says."""
+    archived.void(component)
+    is_news = component.epoch == 0
+    accept(component, turn, primary, entry.epoch)
+    component.entrusted = (entry.standby,) if entry.standby else ()
+    if is_news:
+        archived.recall(component, turn)

@@ -56,7 +56,7 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
     if component.state is State.ABSENT:
         component.move(Cause.FOLLOW)
     had_none = not component.held
-    has_lost = component.bare or (had_none and component.has_begun and _is_to_hold_all(component, turn.me))
+    has_lost = component.bare or (had_none and component.has_begun and component.is_to_hold_all(turn.me))
     component.held = [*component.held, event.position][-KEPT:]
     component.spec, component.keeps_state = event.spec, event.keeps_state
     component.stored_ns = turn.now_ns
@@ -81,14 +81,9 @@ def remember(component: Component, config: Config) -> None:
 def recall(component: Component, turn: Turn) -> None:
     """Others told of a component that was on no record here: what is held of it came from the archive.
 
-    Where voters count on this robot to hold all of it, it has lost that.
+    Where the others count on this robot to hold all of it, it has lost that.
     """
-    component.bare |= turn.config.copies_ms > 0 and bool(component.held) and _is_to_hold_all(component, turn.me)
-
-
-def _is_to_hold_all(component: Component, me: str) -> bool:
-    """Whether voters count on this robot to hold all that was acknowledged."""
-    return me in (component.primary, *component.entrusted)
+    component.bare |= turn.config.copies_ms > 0 and bool(component.held) and component.is_to_hold_all(turn.me)
 
 
 def has_newer(component: Component, event: Stored) -> bool:
@@ -103,7 +98,7 @@ def damaged(component: Component, turn: Turn, event: Damaged) -> None:
         return
     component.begun = component.has_begun
     component.held = [position for position in component.held if position != event.position]
-    if not component.held and _is_to_hold_all(component, turn.me):
+    if not component.held and component.is_to_hold_all(turn.me):
         component.bare = component.begun
     if gave(component, event.position):
         component.fetched = None
