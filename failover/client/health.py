@@ -13,8 +13,8 @@ BAD_STATES: Final = frozenset({"degraded", "failed"})
 OVER_STATES: Final = frozenset({"ended", "released"})
 """No robot is expected to run a component in one of these states any more."""
 
-STANDS_STILL: Final = "frozen"
-"""The state of a component that its robot holds still: it acts nowhere."""
+UNWELL_STATES: Final = BAD_STATES | {"frozen"}
+"""With that of a component that its robot holds still: it acts nowhere."""
 
 Sight = Mapping[str, Any]
 """One component, as one robot sees it."""
@@ -65,7 +65,7 @@ def is_unknown(component: Sight) -> bool:
 def is_unwell(component: Sight) -> bool:
     """It runs nowhere or stands still, unprotected, degraded, or a robot with its checkpoints could not go on from them well."""
     one = sight(component)
-    is_bad = one.get("state") in BAD_STATES | {STANDS_STILL} or not one.get("standby") or is_unprotected(one) or is_unknown(one)
+    is_bad = one.get("state") in UNWELL_STATES or not one.get("standby") or is_unprotected(one) or is_unknown(one)
     is_over = one.get("state") in OVER_STATES
     return (is_bad and not is_over) or any(
         seen.get("cold") or seen.get("unstored") or is_lacking(seen) for seen in sights(component)
