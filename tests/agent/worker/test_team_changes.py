@@ -306,13 +306,19 @@ def test_an_older_change_that_comes_late_overwrites_no_newer_one(tmp_path: Path)
 # --- What was elected -------------------------------------------------------------------------------------------------
 
 
+def four_that_know(tmp_path: Path, *epochs: int) -> Town:
+    """a, b, c and d, each of which knows that a was elected to run /x in such an epoch."""
+    town = Town(tmp_path, "a", "b", "c", "d")
+    for name, epoch in zip("abcd", epochs, strict=True):
+        town[name].runs = [view("/x", "a", epoch=epoch)]
+    return town
+
+
 def test_a_change_waits_until_the_members_after_it_know_what_was_elected(tmp_path: Path) -> None:
     """Else they could elect another primary with the same epoch: those that elected the first one have left, or are lost."""
 
     async def live() -> None:
-        town = Town(tmp_path, "a", "b", "c", "d")
-        for name, epoch in (("a", 3), ("b", 2), ("c", 3), ("d", 2)):
-            town[name].runs = [view("/x", "a", epoch=epoch)]
+        town = four_that_know(tmp_path, 3, 2, 3, 2)
         asked = 0
 
         async def hear(_one: str, other: str, verb: str) -> None:
@@ -332,9 +338,7 @@ def test_a_change_waits_until_the_members_after_it_know_what_was_elected(tmp_pat
 
 def test_a_change_that_waits_too_long_says_for_whom_and_frees_all_grants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(team_changes, "AWARE_PATIENCE_NS", 0)
-    town = Town(tmp_path, "a", "b", "c", "d")
-    for name, epoch in (("a", 3), ("b", 2), ("c", 2), ("d", 3)):
-        town[name].runs = [view("/x", "a", epoch=epoch)]
+    town = four_that_know(tmp_path, 3, 2, 2, 3)
     with pytest.raises(RefusedError, match="b, c: not told yet which robot runs /x in epoch 3; nothing has changed"):
         asyncio.run(town["a"].change("remove", "d"))
     assert {member.changes._grants.proposer for member in town.members.values()} == {""}
@@ -363,9 +367,7 @@ def answers_as_an_older_release(town: Town, name: str, monkeypatch: pytest.Monke
 
 def test_no_change_waits_for_a_member_whose_release_tells_no_elections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(team_changes, "AWARE_PATIENCE_NS", 0)
-    town = Town(tmp_path, "a", "b", "c", "d")
-    for name, epoch in (("a", 3), ("b", 2), ("c", 3), ("d", 2)):
-        town[name].runs = [view("/x", "a", epoch=epoch)]
+    town = four_that_know(tmp_path, 3, 2, 3, 2)
     with pytest.raises(RefusedError, match="b, d: not told yet"):
         asyncio.run(town["a"].change("remove", "c"))
     answers_as_an_older_release(town, "b", monkeypatch, "refusal", "sees", "members")

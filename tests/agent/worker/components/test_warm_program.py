@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+import psutil
 import pytest
 from msgspec.structs import replace
 
@@ -99,6 +100,21 @@ def test_a_program_that_waits_goes_on_exactly_after_what_its_last_snapshot_carri
             numbers = [int(line) for line in output(component).splitlines()[:-1] if line.isdigit()]
             assert numbers == list(range(len(numbers)))
         captures.close()
+
+    live(tmp_path, story)
+
+
+def test_a_program_that_is_lost_with_its_guard_while_it_waits_says_so_and_asks_for_no_installation(tmp_path: Path) -> None:
+    async def story(places: Places) -> None:
+        waiting = Waiting(places)
+        waiting.warm(program(STEPS))
+        await waiting.ready()
+        for child in psutil.Process().children():
+            if "agent.guard.server" in child.cmdline():
+                child.kill()
+        await until(lambda: not waiting.told[-1][0], "its loss to be told")
+        assert waiting.told[-1][1] == f"the guard of {NAME} ended, and its program with it"
+        await waiting.standby.close()
 
     live(tmp_path, story)
 
