@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
+import psutil
 
 from agent.guard.messages import Describe, Described, Event, Exited, FrozenByLease, Reply, Start, Started
 from checkpoint.keeper.messages import Channel, ChannelClosedError, close_all
@@ -167,3 +168,15 @@ def lives(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except (FileNotFoundError, ProcessLookupError):
         return False
+
+
+def children(word: str) -> list[psutil.Process]:
+    """Our children that run and have this word in their command line; one that ended is none, reaped or not."""
+    return [child for child in psutil.Process().children() if word in _command(child)]
+
+
+def _command(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:  # also a zombie
+        return []

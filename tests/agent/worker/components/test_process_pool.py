@@ -18,6 +18,7 @@ from agent.guard.messages import Describe
 from agent.worker.components import process_pool
 from agent.worker.components.process_pool import KeeperLink, ProcessPool
 from checkpoint.keeper.messages import Release, Released
+from tests.agent.guards import children, lives
 
 PATIENCE_S = 60.0
 POLL_S = 0.01
@@ -34,14 +35,9 @@ def live(directory: Path, story: Callable[[ProcessPool], Coroutine[Any, Any, Non
     asyncio.run(whole())
 
 
-def children() -> list[psutil.Process]:
-    return [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-
-
 def waiting() -> tuple[int, int]:
     """How many of our children are guards, and fork keepers."""
-    found = [child.cmdline() for child in children()]
-    return sum("agent.guard.server" in words for words in found), sum("keepers" in words for words in found)
+    return len(children("agent.guard.server")), len(children("keepers"))
 
 
 async def until(guards: int, fork_servers: int) -> None:
@@ -52,7 +48,7 @@ async def until(guards: int, fork_servers: int) -> None:
 def fork_server(*keepers: KeeperLink) -> psutil.Process:
     """Our child that forks keepers; and not one of these, which are our children, too, once their fork server is lost."""
     but = [keeper.pid for keeper in keepers]
-    (found,) = (child for child in children() if "keepers" in child.cmdline() and child.pid not in but)
+    (found,) = (child for child in children("keepers") if child.pid not in but)
     return found
 
 
@@ -113,7 +109,7 @@ def test_a_guard_that_was_killed_or_stopped_while_it_waited_is_not_given(
         process_pool.expect(3)
         await until(3, 1)
         await asyncio.gather(*process_pool._guards)  # all are connected
-        lost = [child for child in children() if "agent.guard.server" in child.cmdline()]
+        lost = children("agent.guard.server")
         for child in lost:
             child.send_signal(number)
         guard = await process_pool.guard()  # before the pool has heard of any end
@@ -166,7 +162,7 @@ def test_a_fork_server_that_is_lost_while_nothing_is_asked_of_it_is_replaced(
         await until(1, 1)
         lost = fork_server()
         lost.kill()
-        while lost.pid in [child.pid for child in children()]:
+        while lives(lost.pid):
             await asyncio.sleep(POLL_S)
         await until(1, 1)
 
@@ -194,9 +190,9 @@ def test_the_fork_server_ends_when_its_keepers_have_ended(tmp_path: Path) -> Non
         server = fork_server()
         await process_pool.close()
         await asyncio.sleep(0.2)
-        assert server.status() != psutil.STATUS_ZOMBIE and await answers(keeper)
+        assert lives(server.pid) and await answers(keeper)
         keeper.end()
-        while server.is_running() and server.status() != psutil.STATUS_ZOMBIE:
+        while lives(server.pid):
             await asyncio.sleep(POLL_S)
 
     live(tmp_path, story)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-import psutil
 import pytest
 from msgspec.structs import replace
 
@@ -24,7 +23,7 @@ from agent.worker.components.paths import Places, guard_sockets
 from agent.worker.components.warm_program import Standby
 from checkpoint.linux.spawn.vessel import Born
 from checkpoint.segment.task_messages import TAKEN_OVER
-from tests.agent.guards import PATIENCE_S, lives
+from tests.agent.guards import PATIENCE_S, children, lives
 from tests.agent.worker.components.test_component import Captures, live, output, piece_of, until
 from tests.agent.worker.components.test_cooperative_component import (
     BEGIN,
@@ -109,9 +108,8 @@ def test_a_program_that_is_lost_with_its_guard_while_it_waits_says_so_and_asks_f
         waiting = Waiting(places)
         waiting.warm(program(STEPS))
         await waiting.ready()
-        for child in psutil.Process().children():
-            if "agent.guard.server" in child.cmdline():
-                child.kill()
+        for guard in children("agent.guard.server"):
+            guard.kill()
         await until(lambda: not waiting.told[-1][0], "its loss to be told")
         assert waiting.told[-1][1] == f"the guard of {NAME} ended, and its program with it"
         await waiting.standby.close()
