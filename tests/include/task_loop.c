@@ -1,5 +1,6 @@
-/* A task as the arguments say: NAME PERIOD PHASE DEADLINE OVERRUN AFTER|- COUNT WORK (ns). Each activation is a line: number, due, missed,
- * begun, ended. COUNT 0: until there is none. A period of 0: it runs once, 1 ms from now. PERIOD "-": it is declared already. */
+/* A task as the arguments say: NAME PERIOD PHASE DEADLINE OVERRUN AFTER|- COUNT WORK [EARLY] (ns). Each activation is a line: number, due,
+ * missed, begun, ended; then how early it wakes. COUNT 0: until there is none. A period of 0: it runs once, 1 ms from now. PERIOD "-": it
+ * is declared already. */
 #include "failover_task.h"
 
 static int64_t clock_ns(void)
@@ -16,7 +17,7 @@ int main(int count, char **words)
     ft_task *task;
     int64_t most, work;
     int outcome = 0;
-    if (count != 9)
+    if (count != 9 && count != 10)
         return 2;
     memset(&terms, 0, sizeof terms);
     terms.period_ns = atoll(words[2]);
@@ -26,6 +27,7 @@ int main(int count, char **words)
     terms.at_ns = terms.period_ns != 0 ? 0 : clock_ns() + 1000000;
     if (strcmp(words[6], "-") != 0)
         terms.after[0] = words[6];
+    terms.early_ns = count == 10 ? atoll(words[9]) : FT_LEARN;
     most = atoll(words[7]);
     work = atoll(words[8]);
     task = ft_begin(NULL, words[1], strcmp(words[2], "-") == 0 ? NULL : &terms);
@@ -47,7 +49,7 @@ int main(int count, char **words)
         fflush(stdout);
         ft_end(task);
     }
-    printf("over %d\n", outcome);
+    printf("over %d\nearly %lld\n", outcome, (long long)ft_early_(task));
     ft_close(task);
     return 0;
 }

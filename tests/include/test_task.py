@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -99,6 +99,17 @@ def test_a_task_in_c_keeps_to_the_origin_and_python_reads_its_row(place: Path) -
         assert layout.read_terms(file.table, row)[1].deadline_ns == 5 * MS
         file.close()
     assert not place.exists()
+
+
+@pytest.mark.parametrize(("early", "possible"), [(0, range(1, 5 * MS // 50 + 1)), (-1, [0]), (MS, [MS])])
+def test_a_task_in_c_wakes_as_early_as_it_is_told_or_has_learnt_and_begins_at_no_instant_too_soon(
+    place: Path, early: int, possible: Container[int]
+) -> None:
+    with loop("c", 5 * MS, 0, 0, 0, "-", 20, 0, early) as process:
+        ticks = [line(process) for _ in range(20)]
+        assert all(int(begun) >= int(due) for _, due, _, begun, _ in ticks)
+        assert line(process) == ["over", "0"]
+        assert int(line(process)[1]) in possible
 
 
 def test_on_a_robot_without_a_board_c_and_python_share_the_agents_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,6 +240,7 @@ def test_a_change_reaches_a_task_in_c_that_sleeps_and_a_removal_ends_it(place: P
         ("c", (10 * MS, 0, 20 * MS, 0, "-"), "longer than its period"),
         ("c", (10 * MS, 0, 0, 7, "-"), "overrun 7"),
         ("c", (10 * MS, 0, 0, 0, "c"), "its predecessor c cannot be"),
+        ("c", (10 * MS, 0, 0, 0, "-", 2 * MS), "early_ns 2000000; 1 to 1000000"),
         ("keep", (2000 * MS, 0, 0, 0, "-"), "is run by pid"),
         ("nothing", ("-", 0, 0, 0, "-"), "has no task nothing"),
         ("free", (1000 * MS, 0, 0, 0, "later"), "free after later"),
@@ -238,7 +250,7 @@ def test_a_mistake_is_one_sentence_and_changes_nothing(place: Path, name: str, n
     with failover.scheduled("keep", period=1), failover.scheduled("later", period=1, after="free"):
         file = opened(place)
         before = {index: row for index, row in file.rows().items() if row.terms is not None}
-        with loop(name, *numbers, 1, 0) as process:
+        with loop(name, *numbers[:5], 1, 0, *numbers[5:]) as process:
             words = line(process)
             assert words[0] == "error" and said in " ".join(words)
         assert {index: row for index, row in file.rows().items() if row.terms is not None} == before
