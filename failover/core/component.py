@@ -150,7 +150,7 @@ class Component(Struct):
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         restart_ns: its program has ended, and is started anew at this instant; 0: it is not. restarts: when that was ordered, the
             last times; restarted: how often in this life of the agent. ended_how: the program, or a start that failed.
-            said: by the program that has ended.
+            said: by the program that has ended. unresumed: restores that failed since it crashed; then it is resumed instead.
         safe: on a primary, the newest position that counts as acknowledged and is not here alone. vouched: on any other member,
             the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
@@ -264,6 +264,7 @@ class Component(Struct):
     restarts: deque[int] = field(default_factory=lambda: deque(maxlen=RESTARTS_MAX))
     restarted: int = 0
     ended_how: str = ""
+    unresumed: int = 0
     said: str = ""
     handing: Handing | None = None
     ending: bool = False
@@ -325,7 +326,7 @@ class Component(Struct):
 
     @property
     def is_settled(self) -> bool:
-        """Whether its copy is here, or is to be started anew after an end: it goes on above an epoch that came to nothing."""
+        """Whether its copy is here, or begins again after an end: it goes on above an epoch that came to nothing."""
         return self.state in (State.PRIMARY, State.FROZEN) or self.restart_ns > 0
 
     @property

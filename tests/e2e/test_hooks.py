@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pwd
 import signal
 import subprocess
@@ -137,6 +138,18 @@ def test_a_program_that_must_be_prepared_does_not_run_where_it_is_not(tmp_path: 
         assert robots.component(second, "count")["state"] != "running"
         (tmp_path / "refuse-robot2").unlink()
         robots.until(lambda: robots.component(second, "count")["state"] == "running", "another try")
+
+
+def test_a_program_that_crashes_where_it_cannot_be_prepared_again_resumes_at_the_other_robot(tmp_path: Path) -> None:
+    with pair_with(tmp_path, "must_prepare = true") as (first, second):
+        robots.run(first, "count", "/usr/bin/python3", "-S", "-c", COUNT)
+        robots.until_protected(first)
+        (tmp_path / "refuse-robot1").touch()
+        os.kill(robots.host_pid(first, robots.component(first, "count")["pid"]), signal.SIGKILL)
+        robots.until_protected(second)
+        assert robots.component(second, "count")["standby"] == "robot1"
+        story = robots.failover(first, "why", "count").stdout
+        assert story.count("robot1 could not resume it: ") == 2, story
 
 
 def test_a_snapshot_is_taken_whatever_becomes_of_the_hook_before_it_and_that_is_said(tmp_path: Path) -> None:

@@ -172,6 +172,10 @@ class Deeds:
         if act.position not in robot.store.get(act.component, []):
             self._world.feed(robot, ActFailed(act.component, act.epoch, f"{act.position} is not in the store"))
             return
+        if robot.failing:
+            robot.failing -= 1
+            self._world.feed(robot, ActFailed(act.component, act.epoch, "there is no memory"))
+            return
         program = Program(act.epoch, robot.leases[act.component], self._world.values[act.position], since_ns=self._world.now_ns)
         robot.programs[act.component] = program
         self._world.note(f"{robot.name}: {act.component} goes on from {act.position.generation}/{act.position.sequence}")

@@ -102,6 +102,7 @@ class Robot:
     slow: float = 1
     broken_store: bool = False
     refuses: bool = False
+    failing: int = 0
     lacks: tuple[str, ...] | None = ()
     pending: VoteRecord | None = None
     lie: Lie | None = None

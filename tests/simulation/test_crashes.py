@@ -8,7 +8,8 @@ import pytest
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State
+from failover.core.events import Stop
+from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State, WhenAlone
 from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.teams import coordinated, elective, pair
 from tests.simulation.world import World
@@ -141,3 +142,94 @@ def test_a_program_that_refuses_its_state_when_it_is_resumed_in_place_goes_one_c
     (_, newest), (_, older) = fate.resumed[:2]
     assert older < newest
     assert state_at(fate.world, "robot1", PART) in (State.PRIMARY, State.FAILED)
+
+
+def alone(rules: Rules) -> Fate:
+    """robot2 is lost: of the pair's rule, for robot1 must hear a majority by the others."""
+    fate = team(Rule.PAIR, rules)
+    fate.world.power_off("robot2")
+    fate.after(1_000)
+    assert fate.world.acting(PART) == ["robot1"]
+    return fate
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_restore_that_fails_once_is_no_crash_and_the_next_is_from_the_same_checkpoint_at_once(rule: Rule) -> None:
+    fate = team(rule, Rules(crash_limit=1))
+    newest = fate.positions()[-1]
+    fate.world.robots["robot1"].failing = 1
+    fate.crash()
+    assert fate.resumed == [("robot1", newest)] * 2 and fate.world.acting(PART) == ["robot1"]
+    node = fate.world.robots["robot1"].node
+    assert node is not None and len(node._components[PART].crashes) == 1
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_where_a_restore_fails_twice_a_robot_that_holds_all_that_was_acknowledged_resumes_it(rule: Rule) -> None:
+    fate = team(rule, Rules(crash_limit=1))
+    acknowledged = seen_at(fate.world, "robot2", PART).positions[0]
+    fate.world.robots["robot1"].failing = 99
+    fate.crash()
+    fate.after(1_000)
+    assert [robot for robot, _ in fate.resumed] == ["robot1", "robot1", "robot2"] and fate.world.acting(PART) == ["robot2"]
+    assert fate.resumed[-1][1] >= acknowledged
+    fate.after(2_000)
+    assert seen_at(fate.world, "robot2", PART).standby == "robot1", "which keeps checkpoints all the same"
+
+
+def test_a_robot_that_is_alone_tries_to_resume_it_after_pauses_and_from_no_older_checkpoint() -> None:
+    fate = alone(Rules(crash_limit=1))
+    newest = fate.positions()[-1]
+    fate.world.robots["robot1"].failing = 3
+    fate.crash()
+    assert fate.resumed == [("robot1", newest)] * 3, "after 0, 0 and 0.2 s"
+    assert "robot1 could not resume it: there is no memory; it is resumed in 2.0 s; failover stop ends that" in fate.notes()
+    fate.after(1_500)
+    assert fate.resumed == [("robot1", newest)] * 3
+    fate.after(700)
+    assert fate.resumed == [("robot1", newest)] * 4 and fate.world.acting(PART) == ["robot1"]
+
+
+def test_one_that_no_robot_can_resume_has_failed_with_the_reason_and_loses_no_checkpoint() -> None:
+    fate = alone(Rules())
+    held = fate.positions()
+    fate.world.robots["robot1"].failing = 99
+    fate.crash()
+    fate.after(15_000)
+    assert state_at(fate.world, "robot1", PART) is State.FAILED and fate.resumed == [("robot1", held[-1])] * 4
+    assert "robot1 could not resume it: there is no memory; look at its logs" in fate.notes()
+    assert fate.positions() == held
+
+
+def test_a_robot_that_holds_less_than_was_acknowledged_does_not_resume_what_the_primary_could_not() -> None:
+    """robot1 wrote more while it was alone; robot2 comes back as the restore fails."""
+    fate = alone(Rules())
+    newest = fate.positions()[-1]
+    fate.world.robots["robot1"].failing = 2
+    fate.world.program_ends("robot1", PART, CRASH)
+    fate.world.power_on("robot2")
+    fate.after(4_000)
+    assert fate.resumed[:3] == [("robot1", newest)] * 3 and fate.world.acting(PART) == ["robot1"]
+
+
+def test_while_it_waits_to_be_resumed_an_operator_may_stop_it() -> None:
+    fate = alone(Rules())
+    fate.world.robots["robot1"].failing = 99
+    fate.crash()
+    fate.world.command("robot1", Stop(fate.world.request(), PART))
+    fate.after(15_000)
+    assert state_at(fate.world, "robot1", PART) is State.FINISHED and len(fate.resumed) == 3
+
+
+def test_one_that_waits_is_resumed_only_where_it_may_act() -> None:
+    """Its robot is cut off while the restore is under way: the other one has it soon."""
+    fate = team(Rule.PAIR, Rules(when_alone=WhenAlone.FREEZE))
+    fate.world.robots["robot1"].failing, fate.world.robots["robot1"].slow = 99, 20
+    fate.world.network.cuts |= {("robot1", "robot2"), ("robot2", "robot1")}
+    fate.crash()
+    fate.after(15_000)
+    assert [robot for robot, _ in fate.resumed] == ["robot1", "robot2"] and fate.world.acting(PART) == ["robot2"]
+    assert "it is resumed as soon as another robot hears this one" in fate.notes()
+    fate.world.network.cuts.clear()
+    fate.after(2_000)
+    assert fate.world.acting(PART) == ["robot2"] and state_at(fate.world, "robot1", PART) is State.STANDBY

@@ -10,7 +10,7 @@ from failover.core import acts
 from failover.core.component import Cause, Component, Turn
 from failover.core.election import lease
 from failover.core.election.consent import state_of
-from failover.core.election.pair import refuse_request, restart_line
+from failover.core.election.pair import living_entries, refuse_request, restart_line
 from failover.core.events import ActFailed, Exited
 from failover.core.membership import Peer
 from failover.core.transitions import restarts
@@ -22,6 +22,9 @@ TRIES_MAX = 3
 
 PAUSES = (1, 10, 10)
 """Of ``retry_ms``, before a takeover that failed is tried again: an obstacle met once may be gone at once."""
+
+RESUME_PAUSES = (0, *PAUSES[:2])
+"""The same after a crash, before this robot tries again to resume it; one more failure is the end."""
 
 UNDECLARED_CURE = "look at its logs, then run it again, or release it to forget it"
 
@@ -87,8 +90,7 @@ def failed(component: Component, turn: Turn, event: ActFailed) -> None:
             component.spec = component.former
             _record(component, turn, Cause.RELEASE, 0, event.message)
     elif component.state is State.RECOVERING:
-        turn.say(component, f"{turn.me} could not resume it: {event.message}")
-        _recover(component, turn, component.status)
+        _not_resumed(component, turn, f"{turn.me} could not resume it: {event.message}", event.message)
     elif component.state is State.TAKING_OVER:
         cannot(component, turn, event.message)
 
@@ -105,8 +107,8 @@ def cannot(component: Component, turn: Turn, why: str) -> None:
 
 def overdue(component: Component, turn: Turn) -> None:
     """A start or a restore that says nothing has failed; a Stop that says nothing is ordered again."""
-    if restarts.waits(component):
-        restarts.advance(component, turn)
+    if restarts.is_due(component, turn):
+        (_resume if component.unresumed else restarts.start)(component, turn)
     if turn.now_ns < component.until_ns:
         return
     if component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING):
@@ -149,13 +151,17 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     while component.crashes and component.crashes[0] <= turn.now_ns - window_ns:
         component.crashes.popleft()
     component.crashes.append(turn.now_ns)
-    component.status = status
-    count, limit = len(component.crashes), component.rules.crash_limit
-    back = 1 if count <= limit else 2
-    if count > limit + 1 or len(component.held) < back:
-        why = "no checkpoint to resume it from" if len(component.held) < back else f"{count} crashes in {window_ns // 10**9} s"
-        why = f"it died by {restarts.how(status)}; {why}" if restarts.is_declared(component) else f"{why}; {UNDECLARED_CURE}"
-        _end(component, turn, Cause.FAIL, status, why)
+    component.status, component.unresumed = status, 0
+    _resume(component, turn)
+
+
+def _resume(component: Component, turn: Turn) -> None:
+    """From the newest checkpoint, or from the one before where it crashed too often; or there is none, and this is its end."""
+    count, rules = len(component.crashes), component.rules
+    back = 1 if count <= rules.crash_limit else 2
+    if count > rules.crash_limit + 1 or len(component.held) < back:
+        crashes = f"{count} crashes in {rules.crash_window_ms // 1000} s"
+        _fail(component, turn, "no checkpoint to resume it from" if len(component.held) < back else crashes)
         return
     position = component.held[-back]
     component.move(Cause.CRASH)
@@ -166,7 +172,38 @@ def _recover(component: Component, turn: Turn, status: int) -> None:
     why = component.resumption
     spec, lease_ns, generation = component.spec, component.lease_ns, component.generation
     turn.order(acts.Restore(component.name, component.epoch, position, spec, lease_ns, why, generation))
-    turn.say(component, f"{turn.me} saw it crash, {count} in the window, and resumes it from {position.sequence}")
+    again = f"saw it crash, {count} in the window, and resumes it" if not component.unresumed else "tries again to resume it"
+    turn.say(component, f"{turn.me} {again} from {position.sequence}")
+
+
+def _not_resumed(component: Component, turn: Turn, sentence: str, why: str) -> None:
+    """A restore that failed is no crash of the program: the next one is from the same checkpoint.
+
+    The first one follows at once. Then a robot that holds all that was acknowledged resumes it; where there is none, this robot
+    tries again after pauses.
+    """
+    turn.say(component, sentence)
+    component.unresumed += 1
+    if component.unresumed > len(RESUME_PAUSES):
+        _fail(component, turn, sentence)
+    elif component.unresumed > 1 and _may_resume_elsewhere(component, turn):
+        cannot(component, turn, why)
+    else:
+        restarts.resume_in(RESUME_PAUSES[component.unresumed - 1] * turn.config.retry_ms, component, turn, sentence)
+
+
+def _may_resume_elsewhere(component: Component, turn: Turn) -> bool:
+    """Whether a living robot holds all that was acknowledged, and runs it where this one does not."""
+    needed = component.acked or component.newest
+    others = (entry.position for robot, entry in living_entries(component, turn) if turn.config.runs(robot))
+    return not component.waits and needed is not None and any(position is not None and needed <= position for position in others)
+
+
+def _fail(component: Component, turn: Turn, why: str) -> None:
+    """It is not resumed again."""
+    status = component.status
+    why = f"it died by {restarts.how(status)}; {why}" if restarts.is_declared(component) else f"{why}; {UNDECLARED_CURE}"
+    _end(component, turn, Cause.FAIL, status, why)
 
 
 def _end_handover(component: Component, turn: Turn, why: str) -> None:
