@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from failover.drivers.keeping import Keeping
 
 T = TypeVar("T")
+S = TypeVar("S", bound="Serving")
 
 TURN_MAX: Final = 256
 """Messages taken in between two that are carried out."""
@@ -117,8 +118,7 @@ def run(cls: type[T]) -> T:
         DriverError: it cannot take messages.
         NameFormatError: its path belongs to another robot.
     """
-    serving = Serving(cls)
-    with stopped_by_signals(serving), serving:
+    with stopped_by_signals(lambda: Serving(cls)) as serving, serving:
         for line in serving.addresses_told():
             print(line, file=sys.stderr, flush=True)
         serving.serve()
@@ -562,16 +562,27 @@ class Serving:
 
 
 @contextlib.contextmanager
-def stopped_by_signals(serving: Serving) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end the driver after the message in hand, also where they come right before the wait for one."""
+def stopped_by_signals(make: Callable[[], S]) -> Iterator[S]:
+    """SIGTERM and Ctrl-C end the driver after the message in hand, also where they come right before the wait for one.
+
+    Callers may reach it before ``make`` has returned: until then they end the process, with status 0.
+    """
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield make()
         return
+    made: list[S] = []
+
+    def heed(*_: object) -> None:
+        if not made:
+            raise SystemExit(0)
+        made[0].stop()
+
     with told_of_signals() as heard:
-        serving._wait_for(heard.fileno(), functools.partial(_discard, heard))
-        before = {number: signal.signal(number, lambda *_: serving.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        before = {number: signal.signal(number, heed) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            yield
+            made.append(make())
+            made[0]._wait_for(heard.fileno(), functools.partial(_discard, heard))
+            yield made[0]
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)

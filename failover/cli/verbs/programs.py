@@ -140,8 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
     directory = given if "/" in arguments.program or (given / packing.PROGRAM_FILE).exists() else None
     name = source_of_directory(directory).manifest.name if directory is not None else arguments.program
     place = Place(store, Path(arguments.directory), name, directory, arguments.beside)
-    hosting = Hosting(place, arguments.version or "")
-    with server.stopped_by_signals(hosting), hosting:
+    with server.stopped_by_signals(lambda: Hosting(place, arguments.version or "")) as hosting, hosting:
         for line in (*hosting.addresses_told(), *hosting.confinement_told()):
             print(line, file=sys.stderr, flush=True)
         hosting.serve()

@@ -78,3 +78,29 @@ def test_a_signal_that_does_not_end_the_wait_for_messages_ends_the_driver(
     command = [sys.executable, "-c", TOLD_ANOTHER_THREAD, str(int(number))]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert ran.stdout == "it has ended\n", ran.stderr
+
+
+ENDED_WHILE_MADE = """
+import os, sys
+import failover
+
+@failover.driver("University/Lab/Lamp")
+class Lamp:
+    def __init__(self) -> None:
+        os.kill(os.getpid(), int(sys.argv[1]))
+
+    @failover.command
+    def light(self) -> None: ...
+
+failover.run(Lamp)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_driver_that_is_ended_before_it_is_ready_ends_in_order(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot_alone(tmp_path, monkeypatch)
+    command = [sys.executable, "-c", ENDED_WHILE_MADE, str(int(number))]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
