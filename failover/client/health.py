@@ -13,8 +13,8 @@ BAD_STATES: Final = frozenset({"degraded", "failed"})
 OVER_STATES: Final = frozenset({"ended", "released"})
 """No robot is expected to run a component in one of these states any more."""
 
-UNWELL_STATES: Final = BAD_STATES | {"frozen", "restarting"}
-"""With those of a component that acts nowhere: its robot holds it still, or waits before it starts or resumes it."""
+UNWELL_STATES: Final = BAD_STATES | {"frozen"}
+"""With that of a component that its robot holds still: it acts nowhere."""
 
 Sight = Mapping[str, Any]
 """One component, as one robot sees it."""

@@ -22,6 +22,7 @@ from failover.core.wire.messages import (
     SAFE,
     STARTS,
     STOOD,
+    UNABLE,
     UNPROTECTED,
     WANTS,
     WARM,
@@ -46,7 +47,7 @@ def entry_of(component: Component) -> Entry:
     flags = NEEDS_BASE * component.needs_base | UNPROTECTED * component.unprotected
     flags |= HOLDS * component.waits | WARM * component.warm
     flags |= FREE * component.free | OPEN * component.open | ORDERED * component.ordered
-    flags |= WANTS * (component.wanted is not None)
+    flags |= WANTS * (component.wanted is not None) | UNABLE * bool(component.unable)
     flags |= STOOD * (component.holding and component.stood)
     flags |= SAFE * (component.holding and newest is not None and component.safe == newest)
     flags |= BEGUN * component.has_begun | FRESH * component.fresh

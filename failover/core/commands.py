@@ -93,7 +93,7 @@ def _why_not_run(component: Component, turn: Turn, verb: str) -> str:
         return f"cannot {verb} {name}: {votes}; start the others"
     if component.holding or component.state is State.STOPPING:
         how = "it runs here" if component.state is State.PRIMARY else f"here it is {component.state}"
-        how = f"it is {restarts.next_step(component)} in a moment" if restarts.waits(component) else how
+        how = "it is started anew in a moment" if restarts.waits(component) else how
         return f"cannot {verb} {name}: {how}; failover stop or release it first, or choose another name"
     if left_ns := turn.team.awaited_ns(component.primary, turn.now_ns):
         again_s = left_ns // (1_000 * MS) + 1
@@ -124,7 +124,7 @@ def _release(component: Component, turn: Turn, command: Release) -> None:
     elif component.holding or component.state is State.STOPPING or not _may_be_forgotten(component, turn):
         _elsewhere(component, turn, command.request, "release")
         return
-    waited = f"released: its program had ended, and is not {restarts.next_step(component)}"
+    waited = "released: its program had ended, and is not started anew"
     runs_on = waited if restarts.waits(component) else "released: it runs on, unprotected"
     component.reason = "" if component.state in ENDED else runs_on
     component.move(Cause.RELEASE)
@@ -141,9 +141,8 @@ def _may_be_forgotten(component: Component, turn: Turn) -> bool:
 
 def _stop(component: Component, turn: Turn, command: Stop) -> None:
     if restarts.waits(component):
-        sentence = f"{component.name} is not {restarts.next_step(component)}"
         exits.end_waiting(component, turn)
-        turn.order(acts.Answer(command.request, True, sentence))
+        turn.order(acts.Answer(command.request, True, f"{component.name} is not started anew"))
         return
     if component.state is State.STARTING:
         component.ending, component.end_signal = True, command.signal

@@ -34,6 +34,10 @@ LOST_MAX = 8
 """Generations that lost and are remembered; the agent moves their snapshots out of the chain long before."""
 
 
+NEVER_NS = 1 << 62
+"""An instant that does not come."""
+
+
 EPOCHS_LEFT_MIN = 3
 """An operator's claim leaves one epoch out, and its answer goes above it."""
 
@@ -150,7 +154,7 @@ class Component(Struct):
         crashed: wait status of a program that died while it was held still; it is resumed when it may act.
         restart_ns: its program has ended, and is started anew at this instant; 0: it is not. restarts: when that was ordered, the
             last times; restarted: how often in this life of the agent. ended_how: the program, or a start that failed.
-            said: by the program that has ended. unresumed: restores that failed since it crashed; then it is resumed instead.
+            said: by the program that has ended. unresumed: restores that failed since it crashed.
         safe: on a primary, the newest position that counts as acknowledged and is not here alone. vouched: on any other member,
             the newest position of which it was told so; ``shown``: the one up to which it lets readers see the output.
         took_ns: from the order of the last delta until it was a checkpoint, 0 if that was none; no other is taken meanwhile.
@@ -272,6 +276,7 @@ class Component(Struct):
     needs_base: bool = False
     admitted: tuple[str, int] = ("", 0)
     unable: str = ""
+    unusable: bool = False
     tries: int = 0
     retry_ns: int = 0
     reported: bool = False
@@ -326,7 +331,7 @@ class Component(Struct):
 
     @property
     def is_settled(self) -> bool:
-        """Whether its copy is here, or begins again after an end: it goes on above an epoch that came to nothing."""
+        """Whether its copy is here, or is to be started anew after an end: it goes on above an epoch that came to nothing."""
         return self.state in (State.PRIMARY, State.FROZEN) or self.restart_ns > 0
 
     @property
@@ -364,8 +369,8 @@ class Component(Struct):
 
     @property
     def newest(self) -> Position | None:
-        """Newest position that this robot can restore."""
-        return self.held[-1] if self.held and not self.unable else None
+        """Newest position that this robot holds, also where it cannot resume it now; none where that counts as lost."""
+        return self.held[-1] if self.held and not self.unusable else None
 
     def move(self, cause: Cause) -> None:
         """Follow an arrow of the table."""
@@ -374,6 +379,10 @@ class Component(Struct):
         self.state = TABLE[arrow]
         if cause is not Cause.RESTART:
             self.restart_ns = 0
+
+    def try_again(self) -> None:
+        """What this robot could not resume is not what it would resume now."""
+        self.unable, self.unusable, self.tries, self.retry_ns = "", False, 0, 0
 
     def hold(self, position: Position) -> None:
         """Remember a position that this robot's store can restore."""

@@ -270,11 +270,16 @@ class Restored(Struct, frozen=True):
 
 
 class ActFailed(Struct, frozen=True):
-    """Start or Restore came to nothing and left nothing behind. ``message`` says what to do about it."""
+    """Start or Restore came to nothing and left nothing behind. ``message`` says what to do about it.
+
+    Attributes:
+        damaged: the checkpoint, where it cannot be read: it is lost here.
+    """
 
     component: str
     epoch: int
     message: str
+    damaged: Position | None = None
 
 
 class Stopped(Struct, frozen=True):

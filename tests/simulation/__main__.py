@@ -35,6 +35,7 @@ def main() -> int:
         etcd=arguments.etcd,
         apart=arguments.apart,
         archive=arguments.archive,
+        failing=arguments.failing,
     ):
         faults += happened
         if story:
@@ -47,11 +48,18 @@ def main() -> int:
 
 
 def play(
-    seed: int, faults: int, liars: bool = False, etcd: bool = False, apart: bool = False, archive: bool = False
+    seed: int,
+    faults: int,
+    liars: bool = False,
+    etcd: bool = False,
+    apart: bool = False,
+    archive: bool = False,
+    failing: bool = False,
 ) -> tuple[int, str]:
     """One life: how many faults there were, and the story if it broke a promise."""
     try:
-        return life(seed, faults=faults, liars=liars, etcd=etcd, apart=apart, archive=archive).faults, ""
+        lived = life(seed, faults=faults, liars=liars, etcd=etcd, apart=apart, archive=archive, failing=failing)
+        return lived.faults, ""
     except AssertionError as story:
         return 0, str(story) or repr(story)
 
@@ -76,13 +84,13 @@ def _play_restarts(count: int, first: int) -> int:
 
 
 def _played(
-    seeds: range, faults: int, jobs: int, *, liars: bool, etcd: bool, apart: bool, archive: bool
+    seeds: range, faults: int, jobs: int, *, liars: bool, etcd: bool, apart: bool, archive: bool, failing: bool
 ) -> Iterator[tuple[int, tuple[int, str]]]:
     if jobs == 1:
-        yield from ((seed, play(seed, faults, liars, etcd, apart, archive)) for seed in seeds)
+        yield from ((seed, play(seed, faults, liars, etcd, apart, archive, failing)) for seed in seeds)
         return
     with ProcessPoolExecutor(jobs) as pool:
-        fixed = (itertools.repeat(value) for value in (faults, liars, etcd, apart, archive))
+        fixed = (itertools.repeat(value) for value in (faults, liars, etcd, apart, archive, failing))
         yield from zip(seeds, pool.map(play, seeds, *fixed, chunksize=8), strict=True)
 
 
@@ -98,6 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--etcd", action="store_true", help="robots that decide by the rule etcd, and an etcd with faults")
     parser.add_argument("--apart", action="store_true", help="such robots that never hear each other, and an archive with faults")
     parser.add_argument("--archive", action="store_true", help="a team that votes, goes on from an archive, and loses its disks")
+    parser.add_argument("--failing", action="store_true", help="beside these: restores fail, some of them several times in a row")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first that breaks")
     return parser

@@ -87,6 +87,7 @@ def life(
     etcd: bool = False,
     apart: bool = False,
     archive: bool = False,
+    failing: bool = False,
     restart: Restart = Restart.UNDECLARED,
     restarts: int = 0,
 ) -> World:
@@ -101,6 +102,7 @@ def life(
         etcd: the robots decide by the rule ``etcd``, and etcd has faults, too.
         apart: the same, and until all is healed they never hear each other: they have but etcd, and an archive with faults.
         archive: the team votes, and its robots go on from an archive with faults where none of them has a checkpoint any more.
+        failing: restores fail, too, some of them several times in a row.
     """
     random, engine = Random(seed ^ 0x5EED), Random(seed)
     specs = tuple(_spec(random, index, engine.choice(engines)) for index in range(random.choice((1, 1, 2, 3))))
@@ -121,7 +123,7 @@ def life(
     if restarts:
         configs = planned.with_grace(configs)
     with patch.object(beat_builder, "beat_size_max", size_max):
-        return _live(seed, random, configs, specs, faults, restarts, liars=liars, apart=apart)
+        return _live(seed, random, configs, specs, faults, restarts, liars=liars, apart=apart, failing=failing)
 
 
 def _live(
@@ -134,6 +136,7 @@ def _live(
     *,
     liars: bool,
     apart: bool,
+    failing: bool,
 ) -> World:
     votes = configs[0].rule is not Rule.PAIR
     safe = {spec.name for spec in specs if votes or spec.rules.when_alone is WhenAlone.FREEZE}
@@ -162,6 +165,8 @@ def _live(
         _let_one_lie(world, invariants, Random(seed ^ 0x11A2), trouble_ns)
     elif votes and random.random() < 0.3 and (world.archive is None or world.coordination is not None):
         _lose_a_disk(world, random)
+    if failing:
+        _let_restores_fail(world, Random(seed ^ 0xFA11), trouble_ns)
     world.run(trouble_ns)
     _heal(world)
     while True:
@@ -300,9 +305,19 @@ def _lose_disks(world: World, random: Random, until_ns: int) -> None:
         world.at(at_ns + place * apart_ns + random.randrange(10, 800) * MS, lambda name=name: world.power_on(name))
 
 
+def _let_restores_fail(world: World, random: Random, until_ns: int) -> None:
+    """At random instants the next restores of a robot come to nothing."""
+    robots = [robot for robot in world.robots.values() if robot.config.runs(robot.name)]
+    for _ in range(random.randrange(1, 3 * len(robots))):
+        robot, count = random.choice(robots), random.choice((1, 1, 2, 3))
+        world.at(random.randrange(until_ns), lambda robot=robot, count=count: setattr(robot, "failing", count))
+
+
 def _heal(world: World) -> None:
     world.note("healing")
     world.network.heal()
+    for robot in world.robots.values():
+        robot.failing = 0
     world.unchanged = 0.0  # forty captures in a row that find nothing look like a checkpoint that is too old (seed 2504)
     if world.coordination is not None:
         world.coordination.heal()

@@ -170,10 +170,11 @@ class Deeds:
 
     def _restored(self, robot: Robot, act: acts.Restore) -> None:
         if act.position not in robot.store.get(act.component, []):
-            self._world.feed(robot, ActFailed(act.component, act.epoch, f"{act.position} is not in the store"))
+            self._world.feed(robot, ActFailed(act.component, act.epoch, f"{act.position} is not in the store", act.position))
             return
         if robot.failing:
             robot.failing -= 1
+            self._world.faults += 1
             self._world.feed(robot, ActFailed(act.component, act.epoch, "there is no memory"))
             return
         program = Program(act.epoch, robot.leases[act.component], self._world.values[act.position], since_ns=self._world.now_ns)

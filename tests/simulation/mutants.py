@@ -680,6 +680,21 @@ ARCHIVE_MUTANTS: tuple[tuple[Mutant, int], ...] = ((as_good_as_before, 53), (wai
 """Mistakes that lives of voters with an archive catch, and the seed that caught each last."""
 
 
+def hides_what_it_could_not_resume() -> Any:
+    """A robot does not tell of a checkpoint that it could not resume: as if it were lost."""
+    honest = beat_builder.entry_of
+
+    def told(component: Component) -> Entry:
+        entry = honest(component)
+        return replace(entry, generation=0, sequence=0, digest=b"") if component.unable else entry
+
+    return patch.object(node, "entry_of", told)
+
+
+FAILING_MUTANTS: tuple[tuple[Mutant, int], ...] = ((hides_what_it_could_not_resume, 15),)
+"""Mistakes that lives in which restores fail catch, and the seed that caught each last."""
+
+
 SPOILERS: tuple[tuple[Mutant, str], ...] = (
     (as_good_as_before, "a_copy_of_the_archive_waits_for_the_standby_that_holds_more"),
     (keeps_its_loss_to_itself, "a_copy_of_the_archive_waits_for_the_standby_that_holds_more"),

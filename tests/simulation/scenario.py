@@ -18,6 +18,7 @@ A file is lines of ``AT ms VERB arguments``; ``#`` begins a comment. ``expect`` 
     900  tells robot1 witness1 ends runs   robot1 has refused words of witness1 for these reasons, and for no others
     600  stall robot1 300                  its loop gets no processor for 300 ms
     600  slow robot1 40                    its disk and its captures take so many times as long
+    600  fails robot1 2                    the next two restores there come to nothing
     600  refuses robot1                    a program that is resumed there ends at once: it cannot read its state;  takes: it can
     700  exit robot1 0                     its program ends with this wait status (11: crash)
     800  handover robot1                   an operator moves it to the standby
@@ -125,6 +126,8 @@ class Story:
                 self._expect(f"{robot} has refused words of {arguments[1]}:", str(sorted(found)), str(sorted(arguments[2:])))
             case "stall":
                 world.stall(robot, int(arguments[1]) * MS)
+            case "fails":
+                world.robots[robot].failing = int(arguments[1])
             case "refuses" | "takes":
                 world.robots[robot].refuses = verb == "refuses"
             case "slow":

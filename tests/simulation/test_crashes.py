@@ -8,8 +8,8 @@ import pytest
 
 from checkpoint.model import Position
 from failover.core import acts
-from failover.core.events import Stop
-from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State, WhenAlone
+from failover.core.events import Handover
+from failover.core.types import MS, ComponentSpec, Launch, OnCrash, Rule, Rules, State
 from tests.simulation.invariants import seen_at, state_at
 from tests.simulation.teams import coordinated, elective, pair
 from tests.simulation.world import World
@@ -43,7 +43,7 @@ class Fate:
         return "; ".join(seen_at(self.world, "robot1", PART).notes)
 
 
-def team(rule: Rule, rules: Rules) -> Fate:
+def team(rule: Rule, rules: Rules, robots: int = 2) -> Fate:
     specs = (ComponentSpec(PART, launch=Launch(("part",)), rules=rules),)
     resumed: list[tuple[str, Position]] = []
 
@@ -51,7 +51,11 @@ def team(rule: Rule, rules: Rules) -> Fate:
         if isinstance(what, acts.Restore):
             resumed.append((robot, what.position))
 
-    configs = {Rule.PAIR: pair(specs), Rule.MAJORITY: elective(2, specs, witnesses=1), Rule.ETCD: coordinated(2, specs)}
+    configs = {
+        Rule.PAIR: pair(specs, tuple(f"robot{number + 1}" for number in range(robots))),
+        Rule.MAJORITY: elective(robots, specs, witnesses=1),
+        Rule.ETCD: coordinated(robots, specs),
+    }
     world = World(1, configs[rule], (watch,))
     for name in world.robots:
         world.power_on(name)
@@ -177,28 +181,31 @@ def test_where_a_restore_fails_twice_a_robot_that_holds_all_that_was_acknowledge
     assert seen_at(fate.world, "robot2", PART).standby == "robot1", "which keeps checkpoints all the same"
 
 
-def test_a_robot_that_is_alone_tries_to_resume_it_after_pauses_and_from_no_older_checkpoint() -> None:
+def test_a_robot_that_is_alone_tries_to_resume_it_after_pauses_for_ever_and_from_no_older_checkpoint() -> None:
     fate = alone(Rules(crash_limit=1))
+    newest = fate.positions()[-1]
+    fate.world.robots["robot1"].failing = 99
+    fate.crash()
+    assert fate.resumed == [("robot1", newest)] * 3, "after 0, 0 and 0.2 s"
+    assert "robot1 cannot run it: there is no memory; robot1 tries again in 2 s" in fate.notes()
+    fate.after(1_500)
+    assert fate.resumed == [("robot1", newest)] * 3
+    fate.after(60_000)
+    assert fate.resumed == [("robot1", newest)] * 9, "then after 2, 2 and each 12 s"
+    assert fate.world.acting(PART) == [] and fate.positions()[-1] == newest
+    fate.world.robots["robot1"].failing = 0
+    fate.after(12_500)
+    assert fate.resumed == [("robot1", newest)] * 10 and fate.world.acting(PART) == ["robot1"]
+
+
+def test_an_operators_order_does_not_wait_for_the_next_try() -> None:
+    fate = alone(Rules())
     newest = fate.positions()[-1]
     fate.world.robots["robot1"].failing = 3
     fate.crash()
-    assert fate.resumed == [("robot1", newest)] * 3, "after 0, 0 and 0.2 s"
-    assert "robot1 could not resume it: there is no memory; it is resumed in 2.0 s; failover stop ends that" in fate.notes()
-    fate.after(1_500)
-    assert fate.resumed == [("robot1", newest)] * 3
-    fate.after(700)
+    fate.world.command("robot1", Handover(fate.world.request(), PART))
+    fate.after(200)
     assert fate.resumed == [("robot1", newest)] * 4 and fate.world.acting(PART) == ["robot1"]
-
-
-def test_one_that_no_robot_can_resume_has_failed_with_the_reason_and_loses_no_checkpoint() -> None:
-    fate = alone(Rules())
-    held = fate.positions()
-    fate.world.robots["robot1"].failing = 99
-    fate.crash()
-    fate.after(15_000)
-    assert state_at(fate.world, "robot1", PART) is State.FAILED and fate.resumed == [("robot1", held[-1])] * 4
-    assert "robot1 could not resume it: there is no memory; look at its logs" in fate.notes()
-    assert fate.positions() == held
 
 
 def test_a_robot_that_holds_less_than_was_acknowledged_does_not_resume_what_the_primary_could_not() -> None:
@@ -212,24 +219,48 @@ def test_a_robot_that_holds_less_than_was_acknowledged_does_not_resume_what_the_
     assert fate.resumed[:3] == [("robot1", newest)] * 3 and fate.world.acting(PART) == ["robot1"]
 
 
-def test_while_it_waits_to_be_resumed_an_operator_may_stop_it() -> None:
-    fate = alone(Rules())
-    fate.world.robots["robot1"].failing = 99
-    fate.crash()
-    fate.world.command("robot1", Stop(fate.world.request(), PART))
-    fate.after(15_000)
-    assert state_at(fate.world, "robot1", PART) is State.FINISHED and len(fate.resumed) == 3
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_robot_that_cannot_resume_what_it_took_over_sends_its_checkpoint_to_one_that_can(rule: Rule) -> None:
+    fate = team(rule, Rules(), robots=3)
+    standby = seen_at(fate.world, "robot1", PART).standby
+    (other,) = {"robot2", "robot3"} - {standby}
+    acknowledged = seen_at(fate.world, standby, PART).positions[0]
+    fate.world.robots[standby].failing = 99
+    fate.world.power_off("robot1")
+    fate.after(10_000)
+    assert fate.world.acting(PART) == [other] and fate.resumed[-1] == (other, acknowledged)
+    assert seen_at(fate.world, other, PART).standby == standby, "which keeps checkpoints all the same"
 
 
-def test_one_that_waits_is_resumed_only_where_it_may_act() -> None:
-    """Its robot is cut off while the restore is under way: the other one has it soon."""
-    fate = team(Rule.PAIR, Rules(when_alone=WhenAlone.FREEZE))
-    fate.world.robots["robot1"].failing, fate.world.robots["robot1"].slow = 99, 20
-    fate.world.network.cuts |= {("robot1", "robot2"), ("robot2", "robot1")}
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_robot_that_is_back_without_its_disk_begins_nothing_anew_of_which_another_one_holds_a_checkpoint(rule: Rule) -> None:
+    """That one could not resume it: once, or at all."""
+    for failing in (1, 99):
+        fate = team(rule, Rules())
+        acknowledged = seen_at(fate.world, "robot2", PART).positions[0]
+        fate.world.power_off("robot1")
+        fate.world.robots["robot2"].failing = failing
+        fate.after(300)
+        fate.world.new_disk("robot1", vote_record=True)
+        fate.world.power_on("robot1")
+        fate.after(10_000)
+        assert fate.world.acting(PART) == (["robot2"] if failing == 1 else ["robot1"])
+        assert all(position >= acknowledged for _, position in fate.resumed), fate.resumed
+
+
+@pytest.mark.parametrize("rule", list(Rule))
+def test_a_crash_whose_checkpoint_cannot_be_read_here_is_resumed_by_the_robot_that_holds_it_too(rule: Rule) -> None:
+    fate = team(rule, Rules())
+    newest = fate.positions()[-1]
+    fate.kept("robot1").remove(newest)
     fate.crash()
-    fate.after(15_000)
+    fate.after(700)
     assert [robot for robot, _ in fate.resumed] == ["robot1", "robot2"] and fate.world.acting(PART) == ["robot2"]
-    assert "it is resumed as soon as another robot hears this one" in fate.notes()
-    fate.world.network.cuts.clear()
-    fate.after(2_000)
-    assert fate.world.acting(PART) == ["robot2"] and state_at(fate.world, "robot1", PART) is State.STANDBY
+
+
+def test_a_checkpoint_that_no_robot_can_read_is_left_out() -> None:
+    fate = alone(Rules())
+    *_, older, newest = fate.positions()
+    fate.kept("robot1").remove(newest)
+    fate.crash()
+    assert fate.resumed == [("robot1", newest), ("robot1", older)] and fate.world.acting(PART) == ["robot1"]

@@ -18,6 +18,7 @@ from tests.simulation.mutants import (
     CAUGHT_BY,
     ELECTIVE_MUTANTS,
     ETCD_MUTANTS,
+    FAILING_MUTANTS,
     MUTANTS,
     Mutant,
     mistaken,
@@ -46,6 +47,8 @@ ETCD_ONCE_BROKEN = (590, 1061, 1565, 2859, 1792)
 """An end came beside a claim; a robot with a new disk and an older copy of the archive counted as one that holds all that was
 acknowledged: its standby, or, heard of after that copy had come, its primary (2859); a voter that learned that a component runs
 anew left what had ended there."""
+
+FAILING_KINDS = ("", "etcd", "archive", "apart")
 
 PAIR = TEAMS[0]
 VOTERS = tuple(team for team in TEAMS if team != PAIR)
@@ -133,6 +136,24 @@ def test_a_mistake_about_a_copy_of_the_archive_is_caught_by_some_seed(mutant: Mu
     with mistaken(mutant):
         for seed in sorted(range(SEEDS_TO_CATCH), key=lambda seed: (seed != first, seed)):
             if play(seed, 0, archive=True)[1]:
+                return
+    pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
+
+
+@pytest.mark.parametrize("kind", FAILING_KINDS)
+def test_every_promise_holds_where_restores_fail(kind: str) -> None:
+    for seed in range(SEEDS // len(FAILING_KINDS)):
+        _, story = play(seed, 0, failing=True, **({kind: True} if kind else {}))
+        again = f"python -m tests.simulation --failing {f'--{kind} ' if kind else ''}--first {seed} --seeds 1"
+        assert not story, f"seed {seed} (again: {again}): {story}"
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("mutant", "first"), FAILING_MUTANTS, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_mistake_about_what_could_not_be_resumed_is_caught_by_some_seed(mutant: Mutant, first: int) -> None:
+    with mistaken(mutant):
+        for seed in sorted(range(SEEDS_TO_CATCH), key=lambda seed: (seed != first, seed)):
+            if play(seed, 0, failing=True)[1]:
                 return
     pytest.fail(f"{SEEDS_TO_CATCH} seeds found nothing wrong with: {mutant.__doc__}")
 

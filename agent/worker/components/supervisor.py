@@ -310,11 +310,19 @@ class Supervisor:
                 guest = isinstance(act, acts.Start) and act.spec.launch.pid != 0
                 with contextlib.suppress(*TROUBLE):
                     await (self._let_go() if guest else self._stop())
-                if isinstance(act, acts.Restore) and isinstance(trouble, FormatError | ChainError):
-                    with contextlib.suppress(StoreError):  # it is known already
-                        await asyncio.to_thread(self.around.store.check, self.name, act.position)
+                damaged = None
+                if isinstance(act, acts.Restore) and isinstance(trouble, FormatError | ChainError | StoreError):
+                    damaged = await asyncio.to_thread(self._damaged, act.position, trouble)
                 self.figures.reasons = reasons
-                self.around.tell(events.ActFailed(self.name, act.epoch, message))
+                self.around.tell(events.ActFailed(self.name, act.epoch, message, damaged))
+
+    def _damaged(self, position: Position, trouble: Exception) -> Position | None:
+        """The checkpoint, if that is what is wrong with it; what was altered is offered no more."""
+        store = self.around.store
+        with contextlib.suppress(StoreError):  # it is known already
+            store.check(self.name, position)
+        is_read = not isinstance(trouble, FormatError | ChainError) and position in store.positions(self.name)
+        return None if is_read else position
 
     async def _at_once(self, act: acts.SetLease | acts.Freeze) -> None:
         component = self.component or self._coming

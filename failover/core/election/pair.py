@@ -24,7 +24,7 @@ from failover.core.election import lease
 from failover.core.election.consent import grants, state_of
 from failover.core.membership import Peer
 from failover.core.types import ENDED, EPOCH_MAX, HOLDING, MS, PEERS_MAX, Resumption, State
-from failover.core.wire.messages import BEGUN, HOLDS, ORDERED, SAFE, STOOD, UNPROTECTED, Entry
+from failover.core.wire.messages import BEGUN, HOLDS, ORDERED, SAFE, STOOD, UNABLE, UNPROTECTED, Entry
 from failover.core.wire.names import Weight, weight
 
 ACTS_FULLY = 2
@@ -42,7 +42,7 @@ def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns or not vacant(component, turn):
         return
-    if component.is_exhausted or not turn.config.runs(turn.me) or waits_after_boot_ns(component, turn):
+    if component.is_exhausted or component.unable or not turn.config.runs(turn.me) or waits_after_boot_ns(component, turn):
         return
     entries = living_entries(component, turn)
     best = max((position for _, entry in entries if (position := entry.position)), default=None)
@@ -154,8 +154,8 @@ def _is_not_ended(component: Component, turn: Turn) -> bool:
 def _takes(component: Component, robot: str, entry: Entry) -> bool:
     """Whether this word says that a robot holds the component, or that it has ended."""
     state = state_of(entry)
-    if state is State.FROZEN and component.elects and component.primary != robot:
-        return False  # it contends for the primacy with a copy that stands still: votes decide
+    if state in (State.FROZEN, State.RECOVERING) and component.elects and component.primary != robot:
+        return False  # it contends for the primacy with a copy that does not act: votes decide
     return state in HOLDING or (state in ENDED and entry.epoch >= component.epoch)
 
 
@@ -183,6 +183,7 @@ def claim(component: Component, turn: Turn, plan: Position | None, why: str, *, 
     component.ending, component.end_signal = False, 0
     component.ordered = False
     component.crashed, component.reason = 0, ""
+    component.unable, component.unusable, component.retry_ns = "", False, 0
     component.lease_ns = component.told_ns = component.inherited_ns = 0
     component.took_ns = component.freeze_us = component.still_us = 0
     component.cpu_us = component.cost_us = 0
@@ -305,7 +306,8 @@ def _has_none(component: Component, turn: Turn, robot: str, peer: Peer) -> bool:
 
 
 def first_of_equals(component: Component, turn: Turn, entries: list[tuple[str, Entry]], mine: Position) -> bool:
-    rivals = [robot for robot, entry in entries if entry.position == mine and turn.config.runs(robot)]
+    able = [(robot, entry) for robot, entry in entries if turn.config.runs(robot) and not entry.flags & UNABLE]
+    rivals = [robot for robot, entry in able if entry.position == mine]
     own = placing(component, turn, turn.me)
     return all(own < placing(component, turn, robot) for robot in rivals)
 
@@ -450,7 +452,7 @@ def accept(component: Component, turn: Turn, primary: str, epoch: int) -> None:
     component.elsewhere = -abs(component.elsewhere)
     component.entrusted, component.trusted = (), False
     component.ordered = component.claimed = False
-    component.unable, component.tries, component.retry_ns = "", 0, 0
+    component.try_again()
     component.needs_base = False
     turn.say(component, f"{turn.me} accepts {primary} as primary of epoch {epoch}")
 

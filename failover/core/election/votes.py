@@ -44,7 +44,7 @@ def consider(component: Component, turn: Turn) -> None:
     """Claim the component if it is vacant, a majority would agree, and this robot is the one to run it."""
     if component.state not in (State.ABSENT, State.STANDBY) or turn.now_ns < component.retry_ns:
         return
-    if component.is_exhausted or not turn.config.runs(turn.me) or not vacant(component, turn):
+    if component.is_exhausted or component.unable or not turn.config.runs(turn.me) or not vacant(component, turn):
         return
     mine = component.newest
     if archived.waits(component, turn):

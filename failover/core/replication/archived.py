@@ -66,7 +66,8 @@ def fetched(component: Component, turn: Turn, event: Fetched) -> None:
         component.bare = has_lost and (component.vouched is None or event.position < component.vouched)
     else:
         component.bare = component.bare or had_none
-    component.unable, component.tries, component.unstored = "", 0, ""
+    component.try_again()
+    component.unstored = ""
     turn.order(acts.Accept(component.name, component.epoch, event.position))
     turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
     turn.say(component, f"{turn.me} has its checkpoint {event.position.sequence} from the archive")
@@ -103,7 +104,7 @@ def damaged(component: Component, turn: Turn, event: Damaged) -> None:
     if gave(component, event.position):
         component.fetched = None
     component.lags, component.looked_ns, component.fresh = True, 0, False
-    component.unable, component.tries, component.retry_ns = "", 0, 0  # what failed was that checkpoint
+    component.try_again()  # what failed was that checkpoint
     turn.say(component, f"its checkpoint {event.position.sequence} is damaged on the disk of {turn.me}, which takes it again")
 
 

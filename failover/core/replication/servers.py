@@ -15,7 +15,10 @@ from failover.core.election.pair import admit, living_entries, placing, vacant
 from failover.core.events import ShipEnded
 from failover.core.membership import Peer
 from failover.core.types import MS, PEERS_MAX, State
-from failover.core.wire.messages import HOLDS, WANTS, Entry
+from failover.core.wire.messages import HOLDS, UNABLE, WANTS, Entry
+
+GIVEN_AWAY_TRIES = 2
+"""After so many takeovers that failed here a robot sends the checkpoint to another one."""
 
 _IDLE = (State.ABSENT, State.STANDBY)
 
@@ -90,20 +93,28 @@ def give_back(component: Component, turn: Turn) -> None:
 def _heir(component: Component, turn: Turn) -> str:
     """The robot that is to run it: the one that an operator chose, else its primary.
 
-    A server also turns to others, and waits for robots that may hold something newer.
+    A server, and a robot that could not resume it, turn to others, too, and wait for robots that may hold something newer.
     """
     chosen = next((robot for robot, entry in living_entries(component, turn) if entry.flags & WANTS), "")
     if chosen:
         return chosen
-    if turn.config.runs(turn.me):
+    if turn.config.runs(turn.me) and (component.waits or component.tries < GIVEN_AWAY_TRIES or not component.unable):
         return component.primary if component.waits else ""
-    sure = component.open or majority.holds_all(component, turn, turn.me, component.newest)
-    if not (sure and component.free and vacant(component, turn)):
+    if turn.config.by_majority or not turn.config.runs(turn.me):
+        sure = component.open or majority.holds_all(component, turn, turn.me, component.newest)
+        if not (sure and component.free):
+            return ""
+    if not vacant(component, turn):
         return ""
     able = [peer for peer in turn.team.living(turn.now_ns) if turn.config.runs(peer.robot)]
-    able = [peer for peer in able if peer.robot == component.primary or not component.waits]
+    able = [peer for peer in able if _is_able(component, peer) and (peer.robot == component.primary or not component.waits)]
     order = sorted(able, key=lambda peer: (peer.robot != component.primary, placing(component, turn, peer.robot)))
     return order[0].robot if order else ""
+
+
+def _is_able(component: Component, peer: Peer) -> bool:
+    entry = peer.entry(component.name)
+    return entry is None or not entry.flags & UNABLE
 
 
 def _lacks(component: Component, peer: Peer, mine: Position) -> bool:
@@ -139,4 +150,5 @@ def _returns(component: Component, turn: Turn, robot: str, entry: Entry, *, is_o
         return False
     if is_ordered or not turn.config.runs(robot):
         return True
-    return bool(entry.flags & HOLDS) and entry.primary == turn.me and entry.epoch == component.epoch
+    is_kept_for_us = bool(entry.flags & HOLDS) and entry.primary == turn.me and entry.epoch == component.epoch
+    return is_kept_for_us or bool(entry.flags & UNABLE)

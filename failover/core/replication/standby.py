@@ -365,7 +365,8 @@ def stored(component: Component, turn: Turn, event: Stored) -> None:
     component.vouched = (event.acknowledged or component.vouched) if turn.config.by_majority else event.position
     component.bare &= event.sender != component.primary
     component.spec, component.keeps_state, component.stored_ns = event.spec, event.keeps_state, turn.now_ns
-    component.needs_base, component.unable, component.tries, component.unstored = False, "", 0, ""
+    component.try_again()
+    component.needs_base, component.unstored = False, ""
     if event.position.sequence % HISTORY_MAX == 0:
         turn.order(acts.Prune(component.name, component.epoch, component.held[0]))
 

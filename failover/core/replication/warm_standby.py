@@ -57,7 +57,7 @@ def is_warm(component: Component, turn: Turn) -> bool:
 
 def _wanted(component: Component) -> ComponentSpec | None:
     """The program that should wait here: None where this robot would start none, or may not."""
-    stands_by = component.state is State.STANDBY and component.trusted and not component.waits
+    stands_by = component.state is State.STANDBY and component.trusted and not component.waits and not component.unable
     is_known = component.keeps_state or component.stored_ns >= 0  # no primary has said whether a program that ran here does
     return component.spec if stands_by and component.newest is not None and is_known else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from failover.core.component import Component, Turn
+from failover.core.component import NEVER_NS, Component, Turn
 from failover.core.election import pair, sites
 from failover.core.election.consent import state_of
 from failover.core.peer_claims import Testimony
@@ -285,7 +285,9 @@ def _notes(component: Component, turn: Turn) -> tuple[str, ...]:
     if component.cold:
         notes.append(f"its program does not wait at {turn.me}, so a takeover would take longer, or fail: {component.cold}")
     if component.unable:
-        notes.append(f"{turn.me} cannot run it: {component.unable}")
+        left_s = max(component.retry_ns - turn.now_ns, 0) / NS_PER_S
+        again = f"; {turn.me} tries again in {left_s:.0f} s" if component.retry_ns < NEVER_NS else ""
+        notes.append(f"{turn.me} cannot run it: {component.unable}{again}")
     if component.state is State.FROZEN:
         who = "no majority" if component.elects else "no robot entrusted with it"
         notes.append(f"held still: {who} hears this robot; it resumes when the peers are back")

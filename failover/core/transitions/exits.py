@@ -7,7 +7,7 @@ away.
 from __future__ import annotations
 
 from failover.core import acts
-from failover.core.component import Cause, Component, Turn
+from failover.core.component import NEVER_NS, Cause, Component, Turn
 from failover.core.election import lease
 from failover.core.election.consent import state_of
 from failover.core.election.pair import living_entries, refuse_request, restart_line
@@ -18,13 +18,10 @@ from failover.core.transitions.restarts import SIGNAL_BITS
 from failover.core.types import ENDED, MS, OnCrash, State
 
 TRIES_MAX = 3
-"""Takeovers that fail here, one after the other without a checkpoint in between, before this robot leaves it alone."""
+"""Takeovers whose program refuses its state here, one after the other, before this robot leaves it alone."""
 
-PAUSES = (1, 10, 10)
+PAUSES = (1, 10, 10, 60)
 """Of ``retry_ms``, before a takeover that failed is tried again: an obstacle met once may be gone at once."""
-
-RESUME_PAUSES = (0, *PAUSES[:2])
-"""The same after a crash, before this robot tries again to resume it; one more failure is the end."""
 
 UNDECLARED_CURE = "look at its logs, then run it again, or release it to forget it"
 
@@ -62,7 +59,7 @@ def _refused(component: Component, turn: Turn, event: Exited) -> None:
     if component.acked is None or component.acked.generation != component.generation:
         _end_handover(component, turn, f"{component.name} ended meanwhile")
         component.flight, component.crashed = None, 0
-        cannot(component, turn, event.refusal)
+        cannot(component, turn, event.refusal, unusable=True, once_more=component.tries + 1 < TRIES_MAX)
     else:
         turn.say(component, event.refusal)
         crashed(component, turn, event.status)
@@ -90,25 +87,31 @@ def failed(component: Component, turn: Turn, event: ActFailed) -> None:
             component.spec = component.former
             _record(component, turn, Cause.RELEASE, 0, event.message)
     elif component.state is State.RECOVERING:
-        _not_resumed(component, turn, f"{turn.me} could not resume it: {event.message}", event.message)
+        _not_resumed(component, turn, event)
     elif component.state is State.TAKING_OVER:
-        cannot(component, turn, event.message)
+        cannot(component, turn, event.message, unusable=event.damaged is not None)
 
 
-def cannot(component: Component, turn: Turn, why: str) -> None:
-    """This robot cannot run it; the checkpoint stays, for another robot or another try."""
-    component.unable, component.tries = why, component.tries + 1
+def cannot(component: Component, turn: Turn, why: str, *, unusable: bool = False, once_more: bool | None = None) -> None:
+    """This robot cannot run it; the checkpoint stays, for another robot or another try.
+
+    Args:
+        unusable: it cannot be read here, or its program refuses it: it counts as lost here. once_more: it is tried again all
+            the same; None: unless it is unusable.
+    """
+    component.unable, component.unusable, component.tries = why, unusable, component.tries + 1
     component.move(Cause.CANNOT)
     component.until_ns = turn.now_ns + turn.config.retry_ms * MS
-    component.retry_ns = turn.now_ns + PAUSES[min(component.tries, len(PAUSES)) - 1] * turn.config.retry_ms * MS
+    pause_ns = PAUSES[min(component.tries, len(PAUSES)) - 1] * turn.config.retry_ms * MS
+    component.retry_ns = turn.now_ns + pause_ns if (not unusable if once_more is None else once_more) else NEVER_NS
     turn.order(acts.Stop(component.name, component.epoch))
     turn.say(component, f"{turn.me} {Cause.CANNOT}: {why}")
 
 
 def overdue(component: Component, turn: Turn) -> None:
     """A start or a restore that says nothing has failed; a Stop that says nothing is ordered again."""
-    if restarts.is_due(component, turn):
-        (_resume if component.unresumed else restarts.start)(component, turn)
+    if restarts.waits(component):
+        restarts.advance(component, turn)
     if turn.now_ns < component.until_ns:
         return
     if component.state in (State.STARTING, State.TAKING_OVER, State.RECOVERING):
@@ -120,9 +123,9 @@ def overdue(component: Component, turn: Turn) -> None:
 
 
 def retry(component: Component, turn: Turn) -> None:
-    """Another try of a takeover that failed here, a few times."""
-    if component.unable and component.tries < TRIES_MAX and turn.now_ns >= component.retry_ns:
-        component.unable = ""
+    """Another try of a takeover that failed here."""
+    if component.unable and turn.now_ns >= component.retry_ns:
+        component.unable, component.unusable = "", False
 
 
 def report(component: Component, turn: Turn) -> None:
@@ -176,24 +179,25 @@ def _resume(component: Component, turn: Turn) -> None:
     turn.say(component, f"{turn.me} {again} from {position.sequence}")
 
 
-def _not_resumed(component: Component, turn: Turn, sentence: str, why: str) -> None:
-    """A restore that failed is no crash of the program: the next one is from the same checkpoint.
+def _not_resumed(component: Component, turn: Turn, event: ActFailed) -> None:
+    """A restore that failed is no crash of the program: the next one is from the same checkpoint, unless that cannot be read.
 
-    The first one follows at once. Then a robot that holds all that was acknowledged resumes it; where there is none, this robot
-    tries again after pauses.
+    The first one follows at once. Then this robot gives it away: another one that holds all that was acknowledged resumes it, or
+    this one does after a pause.
     """
-    turn.say(component, sentence)
+    turn.say(component, f"{turn.me} could not resume it: {event.message}")
     component.unresumed += 1
-    if component.unresumed > len(RESUME_PAUSES):
-        _fail(component, turn, sentence)
-    elif component.unresumed > 1 and _may_resume_elsewhere(component, turn):
-        cannot(component, turn, why)
-    else:
-        restarts.resume_in(RESUME_PAUSES[component.unresumed - 1] * turn.config.retry_ms, component, turn, sentence)
+    is_damaged = event.damaged is not None
+    if is_damaged and not _is_held_elsewhere(component, turn):
+        component.held = [position for position in component.held if position != event.damaged]
+    elif is_damaged or component.unresumed > 1:
+        cannot(component, turn, event.message, unusable=is_damaged)
+        return
+    _resume(component, turn)
 
 
-def _may_resume_elsewhere(component: Component, turn: Turn) -> bool:
-    """Whether a living robot holds all that was acknowledged, and runs it where this one does not."""
+def _is_held_elsewhere(component: Component, turn: Turn) -> bool:
+    """Whether a living robot that may run it holds all that was acknowledged."""
     needed = component.acked or component.newest
     others = (entry.position for robot, entry in living_entries(component, turn) if turn.config.runs(robot))
     return not component.waits and needed is not None and any(position is not None and needed <= position for position in others)

@@ -221,7 +221,7 @@ def _loss(component: Component, turn: Turn) -> str:
     if component.state is State.FROZEN:
         return f"{where}, where it is frozen"
     if restarts.waits(component):
-        return f"{where}, where it waits to be {restarts.next_step(component)}"
+        return f"{where}, where it waits to be started anew"
     best = _best(component, turn)
     if component.state is State.CLAIMING:
         best = (turn.me, component.plan) if component.plan else None

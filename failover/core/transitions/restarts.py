@@ -1,7 +1,5 @@
 """Starts a declared component anew after its program has ended: whether, after which pause, and how often.
 
-A component whose restore failed after a crash waits in the same way, and is resumed (`failover.core.transitions.exits`).
-
 Invariants: the primacy is held during the pause, so a robot that is lost meanwhile is replaced as ever; these rules start no
 program that an operator stopped; they look at ``restart_limit`` before each start.
 """
@@ -70,7 +68,6 @@ def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str)
     component.move(Cause.RESTART)
     component.restart_ns = turn.now_ns + pause_ms * MS
     component.status, component.reason = status, ""
-    component.unresumed = 0
     component.crashes.clear()
     component.ended = (component.generation, component.sequence)
     component.held = []  # of the program that has ended: a crash of the next one resumes from none of them. The store keeps them.
@@ -85,19 +82,10 @@ def begin(component: Component, turn: Turn, cause: Cause, status: int, why: str)
     return True
 
 
-def resume_in(pause_ms: int, component: Component, turn: Turn, why: str) -> None:
-    """Wait to resume it after a crash: the restore before failed."""
-    component.restart_ns = max(turn.now_ns + pause_ms * MS, 1)
-    component.ended_how = why
-
-
-def is_due(component: Component, turn: Turn) -> bool:
-    """Whether a pause is over, and this robot may act."""
-    return waits(component) and turn.now_ns >= component.restart_ns and lease.may_act(component, turn)
-
-
-def start(component: Component, turn: Turn) -> None:
-    """Start it anew."""
+def advance(component: Component, turn: Turn) -> None:
+    """The pause is over, and this robot may act: start it."""
+    if turn.now_ns < component.restart_ns or not lease.may_act(component, turn):
+        return
     assert component.spec is not None, f"{component.name}: waits for a start, and it is not known what to start"
     component.restart_ns, component.said = 0, ""
     component.until_ns = turn.now_ns + turn.config.restore_ms * MS
@@ -125,11 +113,9 @@ def note(component: Component, now_ns: int) -> str:
     rules, left_s = component.rules, (component.restart_ns - now_ns) / 10**9
     heard = "a majority hears" if component.elects else "another robot hears"
     when = f"in {left_s:.1f} s" if left_s > 0 else f"as soon as {heard} this one"
-    if component.unresumed:
-        return f"{component.ended_how}; it is {next_step(component)} {when}; failover stop ends that"
     limit = f" of {rules.restart_limit}" if rules.restart_limit else ""
     which = f"start {len(component.restarts)}{limit} in {rules.restart_window_ms / 1000:g} s"
-    return f"{component.ended_how}; it is {next_step(component)} {when}, {which}; failover stop ends that{component.said}"
+    return f"{component.ended_how}; it is started anew {when}, {which}; failover stop ends that{component.said}"
 
 
 def _may_once_more(component: Component) -> bool:
@@ -143,11 +129,6 @@ def _forget_old(component: Component, turn: Turn) -> None:
         component.restarts.popleft()
 
 
-def next_step(component: Component) -> str:
-    """What becomes of one that waits."""
-    return "resumed" if component.unresumed else "started anew"
-
-
 def waits(component: Component) -> bool:
-    """Whether its program has ended and is to be started or resumed after a pause."""
+    """Whether its program has ended and is to be started."""
     return component.state is State.RECOVERING and component.restart_ns > 0

@@ -54,7 +54,7 @@ class Entry(msgspec.Struct, frozen=True, array_like=True, gc=False):
         flags: ``NEEDS_BASE`` (standby), ``UNPROTECTED`` (primary has stopped protecting), ``HOLDS`` (on_loss is hold),
             ``WARM`` (standby: its program waits there, started already); ``WANTS`` (a checkpoint, to run it);
             ``SAFE`` (primary: its newest position is acknowledged); ``STOOD`` (primary of a pair); ``FREE``, ``OPEN``,
-            ``STARTS``, ``ORDERED``, ``BARE`` (majority); ``BEGUN``; ``FRESH`` (etcd).
+            ``STARTS``, ``ORDERED``, ``BARE`` (majority); ``BEGUN``; ``FRESH`` (etcd); ``UNABLE``.
         status: of a finished component, waitpid's.
         born: epoch under which the sender's copy was started or restored; 0 does not tell.
     """
@@ -114,6 +114,10 @@ FRESH = 4096
 
 BARE = 8192
 """The sender has lost what it held: a position that it tells of came from elsewhere since, and may be older than what it had."""
+
+
+UNABLE = 16384
+"""The sender holds the position that it tells of, and could not resume it: another robot may, and is sent it."""
 
 
 class Beat(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -402,7 +402,7 @@ def test_a_checkpoint_that_a_takeover_finds_damaged_is_offered_no_more(tmp_path:
 
     asyncio.run(run())
     (event,) = told
-    assert isinstance(event, events.ActFailed)
+    assert isinstance(event, events.ActFailed) and event.damaged == second.position
     assert store.positions(COMPONENT) == (first.position,)
     assert any(str(path) in notice for notice in store.notices)
     store.close()
