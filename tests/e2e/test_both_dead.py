@@ -122,3 +122,22 @@ def test_a_robot_that_comes_back_empty_gets_its_component_from_the_standby(tmp_p
         expect_to_go_on(second, "mission", 0)
         assert (first.status()["life"], second.status()["pid"]) == (2, before), "it is believed, and nobody had to be restarted"
         assert "its state directory is new" in first.log.read_text()
+
+
+REFUSES = """[components."/demo/robot1/count".hooks]
+before_resume = ["/bin/sh", "-c", 'test "$FAILOVER_ROBOT" != robot2']
+must_prepare = true
+"""
+
+
+def test_a_robot_that_comes_back_empty_gets_its_component_from_the_standby_that_could_not_resume_it(tmp_path: Path) -> None:
+    with teams.acting(tmp_path, {"robot1": "robot", "robot2": "robot"}, REFUSES) as stage:
+        begin(stage, tmp_path)
+        second = stage.members["robot2"]
+        kept = len(counted(second, "count"))
+        stage.cut_power("robot1")
+        robots.until(lambda: "robot2 cannot run it: " in " ".join(robots.component(second, "count")["notes"]), "robot2 to try")
+        first = stage.switch_on("robot1", empty=True)
+        expect_to_go_on(first, "count", kept)
+        robots.until_protected(first, "count")
+        assert "robot2 gives its checkpoint back to robot1" in robots.failover(second, "why", "count").stdout
