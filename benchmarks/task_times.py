@@ -27,7 +27,7 @@ BARE: Final = "clock_nanosleep in a bare loop"
 EARLY_S: Final = 0.0002
 EARLY: Final = f"{OURS}, early={EARLY_S}"
 ON_TIME: Final = f"{OURS}, early=0"
-"""Of Python alone: C has little to do after it has woken. Without ``early`` a task learns how early to wake."""
+"""Of Python alone. Without ``early`` a task, one in C as well, learns how early to wake."""
 
 
 def task_times(quick: bool, directory_: Path) -> Findings:
